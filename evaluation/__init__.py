@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .association_scores import Gospa as Gospa
     from .association_scores import gospa as gospa
     from .association_scores import landmark_identities as landmark_identities
+    from .association_scores import oracle_errors as oracle_errors
     from .association_scores import places_of as places_of
     from .association_scores import score_association as score_association
     from .consistency_report import ConsistencyReport as ConsistencyReport

@@ -1,6 +1,7 @@
 """How well readings without identity were associated, by their true landmarks.
 
-`score_association` counts the decisions of a run, and `gospa` scores its map.
+`score_association` counts the decisions of a run, `gospa` scores its map, and
+`oracle_errors` returns what even the true pose and map would assign wrongly.
 
 The identity of a mapped landmark is the true landmark of the reading that confirmed it,
 the one with which it entered the map.  Every reading counts once, by the decision that
@@ -26,6 +27,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array
 from ..estimator.interface import ScanDecisions
+from ..estimator.models.bearing_range import wrap_angle
 from ..estimator.support.argument_checks import as_floats
 
 CLUTTER = -1  # the true landmark of a reading that has none
@@ -124,6 +126,69 @@ def score_association(
     counts["map_size"] = len(in_map)
     counts["true_map_size"] = len(known_places(seen, confirm))
     return AssociationScores(**counts)
+
+
+def oracle_errors(
+    poses: Array,
+    scans: Sequence[Array],
+    true_ids: Sequence[ArrayLike],
+    landmark_ids: ArrayLike,
+    landmarks: ArrayLike,
+    measurement_std: Sequence[float],
+    *,
+    range_std_per_metre: float = 0.0,
+    places: Mapping[int, int] | None = None,
+) -> float:
+    """Return the share of readings that the true pose and map would assign wrongly.
+
+    Each reading of a landmark goes to the landmark at the least Mahalanobis distance
+    νᵀ Q⁻¹ ν, with the noise Q of the sensor.  The share is a bar for 1 − precision.
+
+    Parameters
+    ----------
+    poses : ndarray, shape (K, 3)
+        True pose of each scan; readings at an unknown one, nan, do not count.
+    scans : sequence of ndarray, shape (m, 2)
+        Rows (β, r) [rad, m].
+    true_ids, places
+        As in :func:`score_association`.
+    landmark_ids, landmarks : array_like, shapes (n,) and (n, 2)
+        The true landmarks.
+    measurement_std : (float, float)
+        (σβ, σr) [rad, m].
+    range_std_per_metre : float
+        Added to σr for each metre of range.
+
+    Returns
+    -------
+    float
+        nan if no reading is of a landmark.
+
+    Examples
+    --------
+    >>> readings = np.array([(0.0, 5.0), (0.3, 5.0)])
+    >>> world = [4, 8], [(5.0, 0.0), (5.0, 1.0)]
+    >>> oracle_errors(np.zeros((1, 3)), [readings], [[4, 4]], *world, (0.1, 0.1))
+    0.5
+    """
+    names, true = np.asarray(landmark_ids, np.int64), as_floats("landmarks", landmarks)
+    groups = np.array([_place(places, i) for i in names.tolist()])
+    wrong = count = 0
+    for pose, readings, ids in zip(poses, scans, true_ids, strict=True):
+        of = np.asarray(ids, dtype=np.int64)
+        z, of = readings[np.isin(of, names)], of[np.isin(of, names)]
+        if not len(z) or not np.isfinite(pose).all():
+            continue
+        dx, dy = (true - pose[:2]).T
+        distance = np.hypot(dx, dy)
+        turn = wrap_angle(np.arctan2(dy, dx) - pose[2] - z[:, :1])
+        along = np.maximum(measurement_std[1] + range_std_per_metre * distance, 1e-12)
+        squared = (turn / max(measurement_std[0], 1e-12)) ** 2
+        squared = squared + ((z[:, 1:] - distance) / along) ** 2
+        right = [_place(places, i) for i in of.tolist()]
+        wrong += int((groups[squared.argmin(axis=1)] != right).sum())
+        count += len(z)
+    return _share(wrong, count)
 
 
 def landmark_identities(

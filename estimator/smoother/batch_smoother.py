@@ -22,6 +22,7 @@ from ..support.argument_checks import LandmarkIds
 from .drive import Drive, path_between
 from .elimination import conditionals
 from .optimiser import KINDS, Estimate, Noise, Optimiser, Solution, factorised, start_of
+from .reassociation import reassociate
 
 ITERATIONS = 5  # of an update of the filter that gives the second start
 SCALES = {"huber": 1.345, "cauchy": 2.3849}  # 95 % efficient without outliers
@@ -36,6 +37,7 @@ def smooth(
     robust_scale: float | None = None,
     tolerance: float = 1e-9,
     iterations: int = 100,
+    associate: bool = False,
 ) -> SmoothedDrive:
     """Return the most likely poses and landmarks of a drive, with their covariances.
 
@@ -61,6 +63,10 @@ def smooth(
         The solution is found when no pose or landmark moves more [m, rad].
     iterations : int
         Most iterations.
+    associate : bool
+        Whether to repair the association of the readings before, see
+        `reassociation.reassociate`, which returns it, too.  The landmarks of the
+        solution have new identities.
 
     Raises
     ------
@@ -87,12 +93,16 @@ def smooth(
     """
     argument_checks.whole("iterations", iterations, 1)
     argument_checks.above("tolerance", tolerance, 0.0)
+    if associate:
+        poses = None if start is None or isinstance(start, Belief) else start
+        found = reassociate(drive, start=poses)
+        drive, start, landmarks = found.drive, found.poses, None
     noise = Noise(drive.rules, *robust_kernel(robust, robust_scale))
     arrays, order = drive.arrays()
     optimiser = Optimiser(arrays, noise)
     starts = _starts(drive, start, _places(landmarks or {}, order), order)
-    found = _best(optimiser, starts, tolerance, iterations)
-    return SmoothedDrive(optimiser, found, order.tolist(), drive)
+    solution = _best(optimiser, starts, tolerance, iterations)
+    return SmoothedDrive(optimiser, solution, order.tolist(), drive)
 
 
 def robust_kernel(robust: str | None, scale: float | None) -> tuple[float, float]:

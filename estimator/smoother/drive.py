@@ -6,6 +6,7 @@ A `Drive` is the input of the smoother, and `DriveArrays` is its form for kernel
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from copy import copy
 from itertools import chain
 from typing import NamedTuple
 
@@ -128,7 +129,12 @@ class Drive:
     @property
     def readings(self) -> int:
         """Number of readings."""
-        return sum(len(scan.ids) for scans in self._sightings for scan in scans)
+        return sum(len(scan.ids) for scan in self.scans)
+
+    @property
+    def scans(self) -> list[Sightings]:
+        """The scans, in their order; several ones may share a pose."""
+        return [scan for scans in self._sightings for scan in scans]
 
     @property
     def motions(self) -> Sequence[Motion]:
@@ -138,7 +144,7 @@ class Drive:
     @property
     def landmark_ids(self) -> tuple[int, ...]:
         """The landmarks that are read, in the order of their first reading."""
-        scans = [scan.ids for scans in self._sightings for scan in scans]
+        scans = [scan.ids for scan in self.scans]
         if not scans:
             return ()
         found, first = np.unique(np.concatenate(scans), return_index=True)
@@ -217,6 +223,17 @@ class Drive:
             kept = (~np.isin(scan.ids, gone) for scan in scans)
             pairs = zip(scans, kept, strict=True)
             scans[:] = [Sightings(z[keep], ids[keep]) for (z, ids), keep in pairs]
+
+    def with_scans(self, scans: Sequence[Sightings]) -> Drive:
+        """Return a drive of the same motions with other readings in its scans.
+
+        Readings of the landmark -1 are dropped.
+        """
+        made = copy(self)
+        made._motions, made._pending = list(self._motions), list(self._pending)
+        kept = iter([Sightings(z[ids >= 0], ids[ids >= 0]) for z, ids in scans])
+        made._sightings = [[next(kept) for _ in own] for own in self._sightings]
+        return made
 
     def sightings(self, pose: int) -> Sightings:
         """Return all readings of one pose."""

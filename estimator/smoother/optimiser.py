@@ -134,12 +134,14 @@ class Optimiser:
         freedom += int(self._drive.fixes.whiteners.any(axis=2).sum())
         return 0.6 * freedom + 6 * float(np.sqrt(freedom / 2)) + 1
 
-    def minimise(self, start: Estimate, tolerance: float, most: int) -> Solution:
+    def minimise(
+        self, start: Estimate, tolerance: float, most: int, *, strict: bool = True
+    ) -> Solution:
         """Iterate until no pose or landmark will move more than the tolerance [m, rad].
 
         If readings contradict each other, the steps may shrink slowly.  After ``most``
         iterations, the estimate is also a solution if the further decrease of its cost,
-        by the last two decreases, is insignificant.
+        by the last two decreases, is insignificant, and in any case unless ``strict``.
 
         Raises
         ------
@@ -157,7 +159,7 @@ class Optimiser:
                 return self._solution(state, first_cost, iteration)
             if self._varies and iteration < REWEIGHTED:
                 self._reweight(state)
-        if state.remaining < NOTHING:
+        if state.remaining < NOTHING or not strict:
             return self._solution(state, first_cost, most)
         raise np.linalg.LinAlgError(
             f"smoothing did not converge in {most} iterations: the last one moved a "

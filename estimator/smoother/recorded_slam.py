@@ -310,8 +310,9 @@ class SmoothingSlam(RecordedSlam):
         taken = accepted_options(find_estimator(name), settings)
         slam = make_estimator(name, **noise, **taken, **options)
         super().__init__(slam, **noise, **settings)
-        self._kernel: dict[str, Any] = {"robust": robust, "robust_scale": robust_scale}
+        self.kernel: dict[str, Any] = {"robust": robust, "robust_scale": robust_scale}
+        """The robust kernel, as keywords of `batch_smoother.smooth`."""
 
     def smoothed(self) -> SmoothedDrive:
         """Return the beliefs about all poses, given the drive until now."""
-        return smooth(self.recorded(), start=self.belief(), **self._kernel)
+        return smooth(self.recorded(), start=self.belief(), **self.kernel)

@@ -30,6 +30,11 @@ class SmoothOptions(options.Options):
     robust: str | None = options.declared(
         None, "huber|cauchy", "Give outliers less weight.", "all weigh the same"
     )
+    associate: bool = options.declared(
+        False,
+        "--associate",
+        "Repair the association of readings without identity by the whole drive.",
+    )
 
 
 @program.command
@@ -83,9 +88,9 @@ def replay(
 
 @program.command
 @options.takes(
-    "estimator motion_std measurement_std initial_pose_std robust gate_probability "
-    "range_std_per_metre noise_at_rest option_texts robot truth noise_from_file out "
-    "as_json"
+    "estimator motion_std measurement_std initial_pose_std robust associate "
+    "gate_probability range_std_per_metre noise_at_rest option_texts robot truth "
+    "noise_from_file out as_json"
 )
 def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
     """Smooth a log: estimate all poses and landmarks at once.
@@ -100,6 +105,7 @@ def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
     slamgym smooth data.txt
     slamgym smooth sensor.dat --motion-std .1,.1,.01 --measurement-std .1,.1
     slamgym smooth log.csv -e 'invariant[gate_probability=0.999]' --robust huber
+    slamgym smooth log.csv --associate
     """
     from ...estimator.registry import read_label
     from ..runs.filter_settings import SMOOTHER, noise_or_assumed, settings_for
@@ -125,7 +131,13 @@ def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
             reporter.progress("filtering") as tick,
             reporter.note_if_compiling("the smoother"),
         ):
-            smoothed = runs.smooth_log(drive, settings, progress=tick)
+            smoothed = runs.smooth_log(
+                drive,
+                settings,
+                associate=given.associate,
+                progress=tick,
+                repairing=tick,
+            )
         figures.save_figure(figures.smoothed_figure(smoothed), folder / "map.png")
         summary = write_summary(folder, runs.summarise_smoothing(smoothed, settings))
     options.note_noise(drive, settings, {*stds, *chosen}, reporter)

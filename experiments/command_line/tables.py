@@ -214,13 +214,15 @@ def smoothing_figures(summary: dict[str, Any]) -> Table:
     first, last = significant(cost["first"]), significant(cost["last"])
     ratio = significant(cost["per_degree"])
     sizes = "{readings} of {landmarks} landmarks, from {poses} poses"
-    return named_rows(
-        [
-            ("readings", sizes.format(**summary)),
-            ("cost", f"{first}, then {last} after {summary['iterations']} steps"),
-            ("misfit", f"{ratio} per degree of freedom; 1 is expected"),
-        ]
-    )
+    rows = [
+        ("readings", sizes.format(**summary)),
+        ("cost", f"{first}, then {last} after {summary['iterations']} steps"),
+        ("misfit", f"{ratio} per degree of freedom; 1 is expected"),
+    ]
+    if (repair := summary["repair"]) is not None:
+        scores = f"score {repair['first']:.1f}, then {repair['last']:.1f}"
+        rows.append(("association", f"{scores}; {repair['unused']} readings of none"))
+    return named_rows(rows)
 
 
 # --------------------------------------------------------------------------------------
@@ -260,6 +262,9 @@ def association_table(scores: dict[str, Any]) -> Table:
         ("map size", size),
         ("precision", shares),
     ]
+    if scores["oracle_errors"] is not None:
+        bar = f"{scores['oracle_errors']:.1%} of the readings would be wrong"
+        of_readings.append(("with the true pose and map", bar))
     return named_rows(of_readings + of_the_map, title)
 
 

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
 
 from ... import __version__
 from ...arrays import Array, IntArray
-from ...estimator.smoother import SmoothedDrive
+from ...estimator.interface import SlamEstimator
+from ...estimator.smoother import (
+    Drive,
+    Reassociation,
+    SmoothedDrive,
+    SmoothingSlam,
+    reassociate,
+    smooth,
+)
 from ...estimator.smoother.batch_smoother import smoother_in
+from ...estimator.smoother.drive import Sightings
 from ...evaluation import nees
 from ..logs.ground_truth import path_accuracy, true_landmarks_of, true_poses_of
 from ..logs.recording import predictions, steps_of
@@ -34,6 +44,9 @@ class SmoothedLog:
     scan_steps: IntArray
     """Step of each pose of the drive, shape (N,)."""
 
+    repair: Reassociation | None = None
+    """The repaired association, if that was asked for."""
+
     @property
     def log(self) -> SlamLog:
         """The log."""
@@ -41,7 +54,12 @@ class SmoothedLog:
 
 
 def smooth_log(
-    log: SlamLog, settings: FilterSettings, *, progress: Progress | None = None
+    log: SlamLog,
+    settings: FilterSettings,
+    *,
+    associate: bool = False,
+    progress: Progress | None = None,
+    repairing: Progress | None = None,
 ) -> SmoothedLog:
     """Filter a log, and smooth it with the associations of the filter.
 
@@ -51,13 +69,17 @@ def smooth_log(
         The log.
     settings : FilterSettings
         Of `SMOOTHER`; by ``management`` it associates readings without identity.
-    progress : callable, optional
-        Called with (steps done, steps) of the filter.
+    associate : bool
+        Whether to repair the associations of the filter by the whole drive, see
+        :func:`~slamgym.estimator.smoother.reassociate`.
+    progress, repairing : callable, optional
+        Called with (steps done, steps) of the filter, and of the repair.
 
     Raises
     ------
     ValueError
-        If the log has no scan, or the filter refuses a reading.
+        If the log has no scan, the filter refuses a reading, or it reports no
+        associations to repair.
     numpy.linalg.LinAlgError
         If the smoother does not converge.
     """
@@ -72,13 +94,53 @@ def smooth_log(
             "to smooth"
         )
     smoother = smoother_in(slam)  # of the hypothesis that is the best one now
+    repair, drive = None, None
     with one_blas_thread():
-        drive = None if smoother is None else smoother.smoothed()
+        recorder = getattr(slam, "filter", slam)
+        if associate and isinstance(recorder, SmoothingSlam):
+            repair = reassociate(
+                _with_all_readings(recorder.recorded(), log, slam),
+                start=filtered.trace.poses[_scan_steps(log)],
+                progress=repairing or _unwatched,
+            )
+            drive = smooth(repair.drive, start=repair.poses, **recorder.kernel)
+        elif smoother is not None:
+            drive = smoother.smoothed()
     if not isinstance(drive, SmoothedDrive):
         raise ValueError(f"estimator '{settings.estimator}' is not slamgym's smoother")
     readings = _readings_until(log)
     scan_steps = np.searchsorted(readings, drive.readings_until).astype(np.int64)
-    return SmoothedLog(filtered, drive, drive.path[readings], scan_steps)
+    return SmoothedLog(filtered, drive, drive.path[readings], scan_steps, repair)
+
+
+def _with_all_readings(drive: Drive, log: SlamLog, slam: SlamEstimator) -> Drive:
+    """Return a drive with the filter's associations of all readings of a log.
+
+    Readings that it has given to no landmark get an identity of their own.
+    """
+    made = getattr(slam, "decisions", None)
+    scans = [scan.measurements for scan in log.scans]
+    if made is None or len(made) != len(scans) or len(drive.scans) != len(scans):
+        raise ValueError("the filter reports no associations: give it a management")
+    own = count(
+        1 + max((i for m in made for i in m.row_ids if i is not None), default=0)
+    )
+    sightings = []
+    for z, decided in zip(scans, made, strict=True):
+        ids = [next(own) if i is None else i for i in decided.row_ids]
+        near = z[:, 1] >= drive.rules.min_range
+        sightings.append(Sightings(z[near], np.array(ids, dtype=np.int64)[near]))
+    return drive.with_scans(sightings)
+
+
+def _scan_steps(log: SlamLog) -> IntArray:
+    """Return the steps whose poses are those of a drive: the first, and all scans."""
+    scanned = [step.scan is not None for step in steps_of(log)]
+    return np.flatnonzero([True, *scanned[1:]])
+
+
+def _unwatched(done: int, steps: int) -> None:
+    """Watch nothing."""
 
 
 def summarise_smoothing(
@@ -93,7 +155,9 @@ def summarise_smoothing(
         ``steps`` and ``scans`` of the log; ``poses``, ``readings`` and ``landmarks``
         that were smoothed; ``cost``, half the sum of squares, at the ``first`` and the
         last estimate and ``per_degree`` (1 is expected without a robust kernel);
-        ``iterations``; ``ate``, ``landmark_rmse`` and ``nees`` (of the pose), each
+        ``iterations``; ``repair``: the scores ``first`` and ``last`` of the
+        association, its ``landmarks`` and ``unused`` readings, or None;
+        ``ate``, ``landmark_rmse`` and ``nees`` (of the pose), each
         of ``filter`` and ``smoother``, None if the truth is unknown.
     """
     log, trace, drive = smoothed.log, smoothed.filtered.trace, smoothed.drive
@@ -114,6 +178,7 @@ def summarise_smoothing(
             "per_degree": finite(drive.cost_per_degree),
         },
         "iterations": drive.iterations,
+        "repair": _repair_table(smoothed),
         "ate": {
             "filter": summary.rmse_table(path_accuracy(log, trace.t, trace.poses)),
             "smoother": summary.rmse_table(path_accuracy(log, trace.t, smoothed.poses)),
@@ -125,6 +190,19 @@ def summarise_smoothing(
             ),
         },
         "nees": {"filter": summary.nees_summary(trace), "smoother": _nees(smoothed)},
+    }
+
+
+def _repair_table(smoothed: SmoothedLog) -> dict[str, Any] | None:
+    found = smoothed.repair
+    if found is None:
+        return None
+    ids = np.concatenate(found.ids)
+    return {
+        "first": finite(found.first_score),
+        "last": finite(found.score),
+        "landmarks": len(found.drive.landmark_ids),
+        "unused": int((ids < 0).sum()),
     }
 
 

@@ -14,10 +14,16 @@ from ...arrays import Array
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation import nees
+from ...evaluation.association_scores import oracle_errors, places_of
 from ...evaluation.hypothesis_tests import chi_square_quantile
 from ...evaluation.trajectory_error import PositionAccuracy, position_accuracy
-from ..logs.ground_truth import hides_identities, path_accuracy
-from ..logs.slamlog import Scan
+from ..logs.ground_truth import (
+    hides_identities,
+    path_accuracy,
+    true_ids_of,
+    true_poses_of,
+)
+from ..logs.slamlog import Scan, SlamLog
 from .filter_settings import FilterSettings
 from .log_replay import Replay
 from .trace import RunTrace, TrueLandmarks, compare_association, finite
@@ -71,12 +77,14 @@ def summarise(
         "nees": nees_summary(trace),
         "ate": rmse_table(path_accuracy(log, trace.t, trace.poses)),
         "landmark_rmse": rmse_table(map_accuracy(trace)),
-        "association": association_summary(replay, resolution),
+        "association": association_summary(replay, resolution, settings),
         "warnings": run_warnings(replay),
     }
 
 
-def association_summary(replay: Replay, resolution: float) -> dict[str, Any] | None:
+def association_summary(
+    replay: Replay, resolution: float, settings: FilterSettings | None = None
+) -> dict[str, Any] | None:
     """Summarise how well readings without identity were associated.
 
     Returns
@@ -85,6 +93,8 @@ def association_summary(replay: Replay, resolution: float) -> dict[str, Any] | N
         ``correct``, ``wrong``, ``new_correct``, ``duplicate``, ``ghost``, ``missed``,
         ``clutter_used``, ``map_size`` and ``true_map_size``, numbers of
         :class:`~slamgym.evaluation.AssociationScores`; ``precision`` and ``recall``;
+        ``oracle_errors``, the share of readings that even the true pose and map would
+        assign wrongly under the noise of the settings;
         the ``resolution`` [m]; ``gospa`` of the map, ``raw`` and ``aligned``, with
         their parts, see :class:`~slamgym.evaluation.Gospa`, and the ``cutoff`` [m].
         Without true ids all but ``gospa`` is None, and it compares the map with all
@@ -96,9 +106,31 @@ def association_summary(replay: Replay, resolution: float) -> dict[str, Any] | N
         return None
     truth = TrueLandmarks(log.landmark_ids, log.landmarks)
     ids = trace.landmark_ids.tolist()
-    return compare_association(
+    found = compare_association(
         replay.decisions, truth, ids, trace.landmarks, resolution=resolution
     ).as_dict()
+    return found | {"oracle_errors": _oracle_errors(log, resolution, settings)}
+
+
+def _oracle_errors(
+    log: SlamLog, resolution: float, settings: FilterSettings | None
+) -> float | None:
+    """Return :func:`~slamgym.evaluation.oracle_errors`; None without noise or truth."""
+    poses = true_poses_of(log, np.array([scan.t for scan in log.scans]))
+    true_ids = [ids for scan in log.scans if (ids := true_ids_of(scan)) is not None]
+    if settings is None or poses is None or len(true_ids) < len(log.scans):
+        return None
+    share = oracle_errors(
+        poses,
+        [scan.measurements for scan in log.scans],
+        true_ids,
+        log.landmark_ids,
+        log.landmarks,
+        settings.measurement_std,
+        range_std_per_metre=float(settings.options.get("range_std_per_metre", 0.0)),
+        places=places_of(log.landmark_ids, log.landmarks, resolution),
+    )
+    return finite(share)
 
 
 def landmark_table(trace: RunTrace) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ import pytest
 from slamgym.estimator.interface import ScanDecisions
 from slamgym.evaluation import (
     landmark_identities,
+    oracle_errors,
     places_of,
     score_association,
 )
@@ -152,3 +153,46 @@ def test_what_does_not_match_is_refused(true_ids, message):
 def test_a_resolution_that_is_no_length_is_refused(resolution):
     with pytest.raises(ValueError, match="resolution must be"):
         places_of([1], [(0, 0)], resolution)
+
+
+def test_the_oracle_takes_the_landmark_of_the_least_mahalanobis_distance():
+    rng = np.random.default_rng(4)
+    ids, world = np.array([2, 3, 5, 9]), rng.uniform(-4, 4, (4, 2))
+    poses, std, slope = rng.uniform(-1, 1, (6, 3)), (0.3, 0.2), 0.1
+    poses[4] = np.nan
+    truth = [rng.choice([*ids, CLUTTER], 5) for _ in poses]
+    scans = [rng.uniform((-3, 0.5), (3, 5), (5, 2)) for _ in poses]
+    for places in (None, {2: 2, 3: 2, 5: 5, 9: 5}):
+        name = (places or {}).get
+        wrong = []
+        for pose, readings, true in zip(poses, scans, truth, strict=True):
+            for (bearing, distance), i in zip(readings, true, strict=True):
+                squares = []
+                for x, y in world - pose[:2]:
+                    expected = math.hypot(x, y)
+                    turn = (
+                        math.remainder(
+                            math.atan2(y, x) - pose[2] - bearing, 2 * math.pi
+                        )
+                        if math.isfinite(x)
+                        else math.nan
+                    )
+                    gap = (distance - expected) / (std[1] + slope * expected)
+                    squares.append((turn / std[0]) ** 2 + gap**2)
+                if i != CLUTTER and math.isfinite(squares[0]):
+                    best = int(ids[np.argmin(squares)])
+                    wrong.append(name(best, best) != name(int(i), int(i)))
+        found = oracle_errors(
+            poses,
+            scans,
+            truth,
+            ids,
+            world,
+            std,
+            range_std_per_metre=slope,
+            places=places,
+        )
+        assert 0 < found < 1
+        assert found == np.mean(wrong)
+    nothing = oracle_errors(poses[4:5], scans[4:5], truth[4:5], ids, world, std)
+    assert math.isnan(nothing)

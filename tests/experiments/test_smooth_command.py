@@ -211,3 +211,27 @@ def test_a_graph_is_smoothed_against_the_truth_of_another_file(here):
     for who in ("filter", "smoother"):
         assert summary["ate"][who]["raw"] == pytest.approx(0, abs=1e-6)
         assert summary["landmark_rmse"][who]["raw"] == pytest.approx(0, abs=1e-6)
+
+
+def test_the_association_is_repaired_on_request(tmp_path):
+    log = a_log(with_ids=False)
+    path = tmp_path / "log.csv"
+    write_slamlog(log, path)
+    out = tmp_path / "out"
+    shown = slamgym("smooth", path, "--associate", "--out", out).stdout
+    found = json.loads((out / "summary.json").read_text())
+    assert found["repair"]["last"] <= found["repair"]["first"]
+    assert found["repair"]["landmarks"] == found["landmarks"] == 6
+    assert "readings of none" in shown
+    settings = settings_for(log, estimator=SMOOTHER, options={})
+    plain = smooth_log(log, settings)
+    repaired = smooth_log(log, settings, associate=True)
+    assert plain.repair is None
+    assert sum(map(len, repaired.repair.ids)) >= plain.drive.readings
+    np.testing.assert_allclose(repaired.poses, plain.poses, atol=0.05)
+
+
+def test_identified_readings_are_not_repaired():
+    log = a_log()
+    with pytest.raises(ValueError, match="reports no associations"):
+        smooth_log(log, settings_for(log, estimator=SMOOTHER), associate=True)

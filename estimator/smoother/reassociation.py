@@ -1,0 +1,476 @@
+"""Repair the association of a drive: which readings are of which landmark.
+
+`reassociate` alternates smoothing and association.  It accepts a change if that lowers
+the score of the whole drive ::
+
+    J = smoothed cost + ½ ln det S + m ln (A / 2π) + c u + d v
+
+with the information S of the m landmarks after the poses are eliminated, and the area A
+that the readings cover: together the negative logarithm of the evidence, by Laplace's
+approximation [1]_.  u readings are given to no landmark, each for the price c of
+clutter.  v times a scan does not show a landmark that is well in view, between its
+first and its last reading; without this price d, two landmarks for one would lower the
+cost, each of them with the nearer half of the readings.
+
+Small changes keep the poses: readings go to the landmarks that they fit, landmarks that
+do not pay for themselves leave, and others enter.  Large changes
+take landmarks apart where they are seen again after a gap, and match the parts of the
+drive anew, by the largest cliques of pairs of landmarks with equal distances.
+
+References
+----------
+.. [1] D. J. C. MacKay, Information Theory, Inference, and Learning Algorithms,
+   chapter 28, Cambridge University Press, 2003.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import linear_sum_assignment
+
+from ...arrays import Array, BoolArray, IntArray
+from ...jit import jit
+from ..association.constellations import (
+    DISTANCE_GATE,
+    LARGEST_GRAPH,
+    TwoPlaces,
+    largest_clique,
+    tables,
+)
+from ..kernels.assignment_search import compare_pairs
+from ..kernels.scan_update import as_rules, bearing_variance, range_variance
+from ..models.bearing_range import wrap_angle, wrap_angle_jit
+from .drive import Drive, DriveArrays, Sightings, landmark_order
+from .optimiser import Estimate, Noise, Optimiser, start_of
+
+NONE = -1  # the landmark of a reading that has none
+PRICE = 6.0
+"""c: a reading costs no more; half of χ² with two degrees of freedom, 99.75 %."""
+MISS = 1.0
+"""What a landmark costs that is well in view of a scan, but not in it."""
+LEAST = 3
+"""Readings of the smallest landmark."""
+SIGNIFICANT = 0.1
+"""Least decrease of the score that counts."""
+ROUNDS, BIRTHS, SEEDS = 8, 10, 150  # of small changes
+GAP = 30  # scans without a landmark that end a visit
+PARTS = (8, 12, 16)  # into which the drive is taken apart
+LARGEST_TURN = 1.5  # of the later part of a drive [rad]
+MATCHES, SMALLEST_CLIQUE, NODES = 2, 3, 20_000
+TOLERANCE, ITERATIONS = 0.03, 30  # of smoothing while searching
+
+
+class Reassociation(NamedTuple):
+    """A drive with repaired associations."""
+
+    drive: Drive
+    """With the readings that are given to landmarks."""
+    poses: Array
+    """Its poses to start smoothing from, shape (N, 3) [m, m, rad]."""
+    ids: list[IntArray]
+    """The landmark of each reading, -1 for none, one array for each scan."""
+    score: float
+    """J after the repair."""
+    first_score: float
+    """J before."""
+
+
+def reassociate(
+    drive: Drive,
+    *,
+    start: ArrayLike | None = None,
+    progress: Callable[[int, int], object] = lambda done, steps: None,
+) -> Reassociation:
+    """Improve the association of the readings of a drive, by the score J.
+
+    Parameters
+    ----------
+    drive : Drive
+        With all readings, also those that are believed to be of no landmark: a reading
+        with an identity of its own counts as such.
+    start : array_like, shape (N, 3), optional
+        Poses to start from; by default an invariant filter over the drive.
+    progress : callable, optional
+        Called with (steps done, steps).
+
+    Returns
+    -------
+    Reassociation
+        Its score is no higher than before.
+
+    Raises
+    ------
+    ValueError
+        If the drive holds no landmark with enough readings.
+    numpy.linalg.LinAlgError
+        If the drive as given cannot be smoothed.
+
+    Examples
+    --------
+    >>> drive = Drive(motion_std=(0.1, 0.1, 0.05), measurement_std=(0.02, 0.1))
+    >>> for k in range(8):  # one landmark by two names
+    ...     drive.predict((0.0, 0.0))
+    ...     drive.update([(0.0, 5.0)], [k // 4])
+    >>> np.concatenate(reassociate(drive).ids).tolist()
+    [0, 0, 0, 0, 0, 0, 0, 0]
+    """
+    search = _Search(drive)
+    poses = start_of(drive)[0] if start is None else np.asarray(start, dtype=float)
+    first = search.first(poses)
+    best = search.settled(first)
+    for done, parts in enumerate(PARTS, start=1):
+        trial = search.rebuilt(best, parts)
+        if trial is not None and trial.score < best.score:
+            best = trial
+        progress(done, len(PARTS))
+    return search.result(best, first.score)
+
+
+class _State(NamedTuple):
+    """An association, smoothed."""
+
+    labels: IntArray  # row of `places` of each reading or NONE, shape (M,)
+    poses: Array  # (N, 3)
+    places: Array  # of the landmarks, shape (m, 2)
+    score: float
+    covariance: Array  # of the landmarks, shape (2m, 2m)
+
+
+class _Search:
+    """Searches for better associations of the readings of one drive."""
+
+    def __init__(self, drive: Drive) -> None:
+        self.drive, (self.data, self.order) = drive, drive.arrays()
+        self.noise = Noise(drive.rules, 0.0, 1.0)
+        counts = np.diff(self.data.firsts)
+        self.count = len(counts)
+        self.owners = np.repeat(np.arange(self.count), counts)
+        self.starts = self.data.firsts[:-1][counts > 0]
+        self.rows = np.arange(len(self.owners))
+        self.rule_values = np.array(drive.rules)
+        bearings, ranges = self.data.readings.T
+        self.reach = np.quantile(ranges, 0.75)
+        self.width = np.quantile(np.abs(wrap_angle(bearings)), 0.95)
+        self.log_area = 0.0
+
+    def first(self, poses: Array) -> _State:
+        """Smooth the drive as it is given."""
+        ids = self.order[self.data.columns // 2]
+        found, labels, counts = np.unique(ids, return_inverse=True, return_counts=True)
+        located, places = self.located(poses), np.zeros((len(found), 2))
+        np.add.at(places, labels, located)
+        places /= counts[:, None]
+        labels = np.where(counts[labels] >= LEAST, labels, NONE)
+        if (labels == NONE).all():
+            raise ValueError(f"no landmark has {LEAST} readings, got {self.drive}")
+        sides = np.maximum(np.ptp(located, axis=0), 1.0)
+        self.log_area = float(np.log(sides).sum())
+        starts = self.smoothed(labels, poses, places), self.begun(labels)
+        states = [state for state in starts if state is not None]
+        if not states:
+            raise np.linalg.LinAlgError("the drive as given cannot be smoothed")
+        return min(states, key=lambda state: state.score)
+
+    def begun(self, labels: IntArray) -> _State | None:
+        """Smooth with associations that are far from those before; None if it fails."""
+        try:
+            poses, found = start_of(self.relabelled(labels))
+        except np.linalg.LinAlgError:
+            return None
+        places = np.zeros((max(found) + 1, 2))
+        places[list(found)] = list(found.values())
+        return self.smoothed(labels, poses, places)
+
+    def smoothed(self, labels: IntArray, poses: Array, places: Array) -> _State | None:
+        """Smooth with associations; None if that fails."""
+        used = labels != NONE
+        if not used.any():
+            return None
+        rows, slots = np.unique(labels[used], return_inverse=True)
+        counts = np.bincount(self.owners[used], minlength=len(poses))
+        firsts = np.append(0, np.cumsum(counts))
+        order, widths = landmark_order(slots, firsts)
+        columns = 2 * np.argsort(order)
+        arrays = self.data._replace(
+            firsts=firsts,
+            readings=np.ascontiguousarray(self.data.readings[used]),
+            columns=columns[slots],
+            widths=widths,
+        )
+        optimiser = Optimiser(DriveArrays(*arrays), self.noise)
+        at = Estimate(poses.copy(), places[rows][order].ravel())
+        try:
+            found = optimiser.minimise(at, TOLERANCE, ITERATIONS, strict=False)
+            information = optimiser.linearised(found).information
+            inverse = np.linalg.inv(information)
+        except np.linalg.LinAlgError:
+            return None
+        entries = (columns[:, None] + np.arange(2)).ravel()
+        places = found.estimate.landmarks[entries].reshape(-1, 2)
+        labels = np.full_like(labels, NONE)
+        labels[used] = slots
+        score = found.cost + PRICE * float((~used).sum())
+        at = found.estimate.poses
+        score += MISS * self.missed(at, places, labels)
+        score += len(rows) * (self.log_area - math.log(2 * math.pi))
+        score += float(np.linalg.slogdet(information)[1]) / 2
+        covariance = inverse[np.ix_(entries, entries)]
+        return _State(labels, found.estimate.poses, places, score, covariance)
+
+    def settled(self, state: _State) -> _State:
+        """Make small changes until none lowers the score."""
+        for _ in range(ROUNDS):
+            trials = (self.joined(state), self.rearranged(state))
+            better = (t for t in trials if t and t.score < state.score - SIGNIFICANT)
+            new = next(better, None)
+            if new is None:
+                break
+            state = new
+        return state
+
+    def rearranged(self, state: _State) -> _State | None:
+        """Add and remove landmarks, and give readings to those that they fit."""
+        places, costs = state.places, self.costs(state.poses, state.places)
+        m = len(places)
+        own = state.covariance.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)]
+        information = -float(np.linalg.slogdet(own)[1].mean()) / 2  # of one, at least
+        price = self.log_area - math.log(2 * math.pi) + information
+        for _ in range(BIRTHS):
+            born = self.birth(state.poses, costs, price)
+            if born is None:
+                break
+            places = np.vstack([places, born])
+            costs = np.hstack([costs, self.costs(state.poses, born[None])])
+        labels = self.assigned(costs)
+        while len(places) > 1:
+            worst = self.death(labels, costs, price)
+            if worst is None:
+                break
+            places, costs = np.delete(places, worst, 0), np.delete(costs, worst, 1)
+            labels = self.assigned(costs)
+        return self.smoothed(labels, state.poses, places)
+
+    def assigned(self, costs: Array) -> IntArray:
+        """Return the landmark of each reading by costs (M, m), one to one in a scan."""
+        m = costs.shape[1]
+        labels = np.where(costs.min(axis=1) < PRICE, costs.argmin(axis=1), m)
+        keys, counts = np.unique(self.owners * (m + 1) + labels, return_counts=True)
+        twice = np.unique(keys[(counts > 1) & (keys % (m + 1) < m)] // (m + 1))
+        for scan in twice.tolist():
+            first, last = np.searchsorted(self.owners, [scan, scan + 1])
+            spare = np.full((last - first,) * 2, PRICE)
+            table = np.hstack([costs[first:last], spare])
+            labels[first:last] = np.minimum(linear_sum_assignment(table)[1], m)
+        return np.where(labels == m, NONE, labels)
+
+    def birth(self, poses: Array, costs: Array, price: float) -> Array | None:
+        """Return the place of a new landmark worth its price, if there is one."""
+        labels = self.assigned(costs)
+        paid = np.where(labels == NONE, PRICE, costs[self.rows, labels])
+        dear = np.flatnonzero(paid > PRICE / 2)
+        if len(dear) < LEAST:
+            return None
+        seeds = dear[:: len(dear) // SEEDS + 1]
+        located = self.located(poses)[seeds]
+        saved = np.maximum(paid[:, None] - self.costs(poses, located), 0.0)
+        gains = np.maximum.reduceat(saved, self.starts, axis=0)
+        best = int(gains.sum(axis=0).argmax())
+        enough = (gains[:, best] > 0).sum() >= LEAST
+        worth = gains[:, best].sum() > price
+        return located[best] if enough and worth else None
+
+    def death(self, labels: IntArray, costs: Array, price: float) -> int | None:
+        """Return a landmark that is not worth its price, if there is one."""
+        m, used = costs.shape[1], labels != NONE
+        scans, own = self.owners[used], labels[used]
+        taken = np.zeros((self.count, m), dtype=np.bool_)
+        taken[scans, own] = True
+        others = np.where(taken[scans], PRICE, costs[used]).min(axis=1)
+        loss = np.minimum(others, PRICE) - costs[used, own]
+        losses, counts = np.bincount(own, loss, m), np.bincount(own, minlength=m)
+        losses[counts < LEAST] = -np.inf
+        worst = int(losses.argmin())
+        return worst if losses[worst] < price else None
+
+    def joined(self, state: _State) -> _State | None:
+        """Merge the landmarks that are likely to be the same, and not in one scan."""
+        m = len(state.places)
+        squared, spread = _offsets(state.places, state.covariance)
+        loss = squared / 2 + np.log(2 * np.pi * spread) - self.log_area
+        loss[self.together(state.labels, m) | np.tri(m, dtype=np.bool_)] = np.inf
+        rename, free = np.arange(m), np.full(m, True)
+        for flat in np.argsort(loss, axis=None).tolist():
+            i, j = divmod(flat, m)
+            if loss[i, j] >= 0:
+                break
+            if free[i] and free[j]:
+                rename[j], free[i], free[j] = i, False, False
+        if free.all():
+            return None
+        return self.smoothed(_renamed(state.labels, rename), state.poses, state.places)
+
+    def together(self, labels: IntArray, m: int) -> BoolArray:
+        """Return which landmarks a scan has shown together, shape (m, m)."""
+        shown = np.zeros((self.count, m), dtype=np.float32)
+        used = labels != NONE
+        shown[self.owners[used], labels[used]] = 1
+        return np.asarray(shown.T @ shown > 0)
+
+    def rebuilt(self, state: _State, parts: int) -> _State | None:
+        """Take all landmarks apart where they are seen again, and match them anew.
+
+        The drive is taken in successive parts.  The landmarks that a part shows first
+        are matched with those before it.
+        """
+        scans = self.count
+        labels, length = self.visits(state.labels), -(-scans // parts)
+        now = self.begun(labels)
+        for cut in range(length, scans, length):
+            if now is None:
+                return None
+            used = now.labels != NONE
+            first = np.full(len(now.places), scans)
+            np.minimum.at(first, now.labels[used], self.owners[used])
+            late = np.flatnonzero((first >= cut) & (first < cut + length))
+            early = np.flatnonzero(first < cut)
+            best = now
+            for pairs in self.matches(now, late, early):
+                rename = np.arange(len(now.places))
+                rename[pairs[:, 0]] = pairs[:, 1]
+                trial = self.begun(_renamed(now.labels, rename))
+                if trial is not None and trial.score < best.score:
+                    best = trial
+            while (trial := self.joined(best)) and trial.score < best.score:
+                best = trial
+            now = best
+        return None if now is None else self.settled(now)
+
+    def visits(self, labels: IntArray) -> IntArray:
+        """Return a label for each series of readings of a landmark without a gap."""
+        used = np.flatnonzero(labels != NONE)
+        order = used[np.lexsort([self.owners[used], labels[used]])]
+        new = np.diff(labels[order]) != 0
+        new |= np.diff(self.owners[order]) > GAP
+        found = np.full(len(labels), NONE)
+        found[order] = np.append(0, np.cumsum(new))
+        return found
+
+    def matches(
+        self, state: _State, late: IntArray, early: IntArray
+    ) -> Iterator[IntArray]:
+        """Yield pairs of landmarks that one rigid motion brings together."""
+        if min(len(late), len(early)) < SMALLEST_CLIQUE:
+            return
+        rows = np.concatenate([late, early])
+        entries = (2 * rows[:, None] + np.arange(2)).ravel()
+        P = state.covariance[np.ix_(entries, entries)]
+        places = TwoPlaces(state.places[late], state.places[early], P, LARGEST_TURN)
+        squared = _offsets(state.places[rows], P)[0][: len(late), len(late) :]
+        squared[self.together(state.labels, len(state.places))[np.ix_(late, early)]] = (
+            np.inf
+        )
+        nearest = np.argsort(squared, axis=None)[:LARGEST_GRAPH]
+        nearest = np.sort(nearest[np.isfinite(squared.ravel()[nearest])])
+        pairs = np.column_stack(np.unravel_index(nearest, squared.shape))
+        agree = np.zeros((len(pairs),) * 2, dtype=np.bool_)
+        compare_pairs(pairs, *tables(places), DISTANCE_GATE, LARGEST_TURN, agree)
+        for _ in range(MATCHES):
+            clique = largest_clique(pairs, agree, SMALLEST_CLIQUE - 1, NODES)
+            if not len(clique):
+                return
+            chosen = pairs[clique]
+            yield np.column_stack([late[chosen[:, 0]], early[chosen[:, 1]]])
+            left = np.setdiff1d(np.arange(len(pairs)), clique)
+            pairs, agree = pairs[left], np.ascontiguousarray(agree[np.ix_(left, left)])
+
+    def located(self, poses: Array) -> Array:
+        """Return where the readings put their landmarks, shape (M, 2) [m]."""
+        at, (bearing, distance) = poses[self.owners], self.data.readings.T
+        ahead = at[:, 2] + bearing
+        along = distance[:, None] * np.column_stack([np.cos(ahead), np.sin(ahead)])
+        return np.asarray(at[:, :2] + along)
+
+    def missed(self, poses: Array, places: Array, labels: IntArray) -> int:
+        """Return how often scans do not show a landmark that is in view.
+
+        Only scans between its first and its last reading count.
+        """
+        d = places - poses[:, None, :2]
+        ahead = np.arctan2(d[..., 1], d[..., 0]) - poses[:, 2:]
+        in_view = np.hypot(d[..., 0], d[..., 1]) <= self.reach
+        in_view &= np.abs(wrap_angle(ahead)) <= self.width
+        used = np.flatnonzero(labels != NONE)
+        scans, own = self.owners[used], labels[used]
+        first, last = np.full((2, len(places)), [[len(in_view)], [-1]])
+        np.minimum.at(first, own, scans)
+        np.maximum.at(last, own, scans)
+        number = np.arange(len(in_view))[:, None]
+        in_view &= (number > first) & (number < last)
+        in_view[scans, own] = False
+        return int(in_view.sum())
+
+    def costs(self, poses: Array, places: Array) -> Array:
+        """Return ½ νᵀ Q⁻¹ ν of readings and landmarks, at most c, shape (M, m)."""
+        found = np.full((len(self.owners), len(places)), PRICE)
+        values = self.rule_values
+        fill_costs(poses, self.owners, self.data.readings, places, values, found)
+        return found
+
+    def result(self, state: _State, first_score: float) -> Reassociation:
+        """Return the drive with the associations of a state."""
+        lengths = [len(scan.ids) for scan in self.drive.scans]
+        ids = np.split(state.labels, np.cumsum(lengths)[:-1])
+        drive = self.relabelled(state.labels)
+        return Reassociation(drive, state.poses, ids, state.score, first_score)
+
+    def relabelled(self, labels: IntArray) -> Drive:
+        """Return the drive with other landmarks for its readings."""
+        lengths = [len(scan.ids) for scan in self.drive.scans]
+        ids = np.split(labels, np.cumsum(lengths)[:-1])
+        pairs = zip(self.drive.scans, ids, strict=True)
+        return self.drive.with_scans([Sightings(z, i) for (z, _), i in pairs])
+
+
+@jit
+def fill_costs(
+    poses: Array,
+    owners: IntArray,
+    readings: Array,
+    places: Array,
+    rule_values: Array,
+    costs: Array,
+) -> None:
+    """Lower the costs (M, m) of readings and landmarks to ½ νᵀ Q⁻¹ ν."""
+    rules = as_rules(rule_values)
+    for i in range(len(owners)):
+        pose, z = poses[owners[i]], readings[i]
+        for j in range(len(places)):
+            dx, dy = places[j, 0] - pose[0], places[j, 1] - pose[1]
+            expected = max(math.sqrt(dx * dx + dy * dy), rules.min_range)
+            noisy = z[1] if rules.noise_as_read else expected
+            cost = (z[1] - expected) ** 2 / (2 * range_variance(rules, noisy))
+            if cost < costs[i, j]:
+                turn = wrap_angle_jit(math.atan2(dy, dx) - pose[2] - z[0])
+                cost += turn**2 / (2 * bearing_variance(rules, noisy))
+                costs[i, j] = min(costs[i, j], cost)
+
+
+def _renamed(labels: IntArray, rename: IntArray) -> IntArray:
+    """Return labels after each landmark k has become landmark rename[k]."""
+    return np.where(labels == NONE, NONE, rename[labels])
+
+
+def _offsets(places: Array, covariance: Array) -> tuple[Array, Array]:
+    """Return dᵀ C⁻¹ d and √det C of the offsets of n landmarks, both (n, n)."""
+    n = len(places)
+    P = covariance.reshape(n, 2, n, 2).transpose(0, 2, 1, 3)
+    own = P[np.arange(n), np.arange(n)]
+    C = own[:, None] + own[None] - P - P.transpose(1, 0, 2, 3) + 1e-12 * np.eye(2)
+    d = places[:, None] - places[None]
+    squared = np.einsum("ija,ijab,ijb->ij", d, np.linalg.inv(C), d)
+    return squared, np.sqrt(np.linalg.det(C))

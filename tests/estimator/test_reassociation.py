@@ -1,0 +1,139 @@
+"""The repair of the association of a drive."""
+
+import numpy as np
+import pytest
+
+from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.unicycle_motion import predict_pose
+from slamgym.estimator.smoother import Drive, reassociate, smooth
+from slamgym.estimator.smoother.drive import Sightings
+from slamgym.estimator.smoother.reassociation import NONE, PRICE, _Search
+
+MOTION_STD, MEASUREMENT_STD = (0.02, 0.01, 0.01), (0.02, 0.1)
+LAP = 50
+WORLD = np.random.default_rng(3).uniform(-11.0, 11.0, (14, 2))
+
+
+def two_laps(seed):
+    """Return the true path, and a drive with the true identities, without clutter."""
+    rng = np.random.default_rng(seed)
+    made = Drive(MOTION_STD, MEASUREMENT_STD, initial_pose=(8, 0, np.pi / 2))
+    pose, path, odometry = np.array([8.0, 0.0, np.pi / 2]), [], (1.0, 2 * np.pi / LAP)
+    for k in range(2 * LAP):
+        if k:
+            moved = predict_pose(pose, odometry)
+            slip = np.array(MOTION_STD) * rng.standard_normal(3)
+            pose = moved.pose + moved.jacobian_noise @ slip
+            made.predict(odometry)
+        exact = predict_measurement(pose, WORLD).measurement
+        z = exact + np.array(MEASUREMENT_STD) * rng.standard_normal(exact.shape)
+        near = np.flatnonzero((exact[:, 1] < 7.0) & (exact[:, 1] > 0.5))
+        made.update(z[near], near)
+        path.append(pose)
+    return np.array(path), made
+
+
+def renamed(drive, rename):
+    """Return a drive with the identities rename(scan, ids)."""
+    pairs = enumerate(drive.scans)
+    return drive.with_scans([Sightings(z, rename(k, ids)) for k, (z, ids) in pairs])
+
+
+def twice(k, ids):
+    """Name every landmark anew in the second lap."""
+    return ids + 100 * (k >= LAP)
+
+
+def swapped(k, ids):
+    """Swap two pairs of landmarks in the second lap."""
+    swap = np.arange(len(WORLD))
+    swap[[2, 5, 7, 9]] = [5, 2, 9, 7]
+    return swap[ids] if k >= LAP else ids
+
+
+def dropped(k, ids):
+    """Give no landmark to the readings of two landmarks."""
+    alone = 1000 + 20 * k + ids
+    return np.where((ids == 4) | (ids == 8), alone, ids)
+
+
+def as_one(k, ids):
+    """Give landmark 6 the name of 3, in scans that do not show both."""
+    both = (ids == 3).any()
+    return np.where((ids == 6) & ~both, 3, ids)
+
+
+def outcome(ids, truth):
+    """Count misplaced readings, those of no landmark, and landmarks."""
+    found, true = (
+        np.concatenate(ids),
+        np.concatenate([scan.ids for scan in truth.scans]),
+    )
+    labels = np.unique(found[found != NONE])
+    right = sum(np.bincount(true[found == i]).max() for i in labels)
+    unused = np.count_nonzero(found == NONE)
+    return len(true) - right - unused, unused, len(labels)
+
+
+@pytest.mark.parametrize("spoil", [twice, swapped, dropped, as_one])
+def test_a_spoilt_association_is_repaired(spoil):
+    _, right = two_laps(1)
+    wrong = renamed(right, spoil)
+    found = reassociate(wrong)
+    assert found.score < found.first_score - 10
+    misplaced, unused, landmarks = outcome(found.ids, right)
+    assert misplaced == 0
+    assert unused <= 0.01 * right.readings
+    assert landmarks == len(right.landmark_ids)
+    best = smooth(right)
+    repaired = smooth(wrong, associate=True)
+    np.testing.assert_allclose(repaired.poses, best.poses, atol=0.03)
+
+
+def test_a_right_association_is_left_alone():
+    _, right = two_laps(2)
+    found = reassociate(right)
+    misplaced, unused, landmarks = outcome(found.ids, right)
+    assert (misplaced, landmarks) == (0, len(WORLD))
+    assert unused <= 0.01 * right.readings
+    assert found.score <= found.first_score
+
+
+def test_costs_are_those_of_single_readings():
+    path, right = two_laps(3)
+    search = _Search(right)
+    found = search.costs(path, WORLD)
+    rows = np.random.default_rng(0).choice(len(found), 30)
+    std = np.array(MEASUREMENT_STD)
+    for i in rows.tolist():
+        z = search.data.readings[i]
+        gap = z - predict_measurement(path[search.owners[i]], WORLD).measurement
+        gap[:, 0] = np.angle(np.exp(1j * gap[:, 0]))
+        expected = np.minimum(((gap / std) ** 2).sum(axis=1) / 2, PRICE)
+        np.testing.assert_allclose(found[i], expected, rtol=1e-9)
+
+
+def test_two_landmarks_for_one_do_not_lower_the_score():
+    path, right = two_laps(4)
+    search = _Search(right)
+    first = search.first(path)
+    half = np.where(
+        search.located(path)[:, 0] > WORLD[search.order[search.data.columns // 2], 0],
+        0,
+        50,
+    )
+    labels = np.where(first.labels == 3, 3 + half, first.labels)
+    places = np.vstack([first.places, np.zeros((50, 2))])
+    places[53] = first.places[3]
+    assert search.smoothed(labels, first.poses, places).score > first.score + 10
+
+
+def test_progress_and_refusals():
+    _, right = two_laps(5)
+    seen = []
+    reassociate(right, progress=lambda done, steps: seen.append((done, steps)))
+    done, steps = zip(*seen, strict=True)
+    assert done == tuple(range(1, steps[0] + 1))
+    single = renamed(right, lambda k, ids: 1000 * (k + 1) + ids)
+    with pytest.raises(ValueError, match="no landmark has 3 readings"):
+        reassociate(single)
