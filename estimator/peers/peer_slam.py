@@ -90,7 +90,7 @@ class PeerSlam(ABC):
         self._start(mean, np.maximum(std, START_FLOOR))
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
-        """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
+        """Move by odometry (d, α) [m, rad]; dt multiplies the noise variance."""
         distance, turn = argument_checks.pair("odometry", odometry)
         variance = self._noise.over(distance, turn, dt)
         self._move(np.array([distance, turn]), variance)

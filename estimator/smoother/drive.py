@@ -139,7 +139,7 @@ class Drive:
         return tuple(found[np.argsort(first)].tolist())
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
-        """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
+        """Move by odometry (d, α) [m, rad]; dt multiplies the noise variance."""
         distance, turn = argument_checks.pair("odometry", odometry)
         self.motion_noise.over(distance, turn, dt)  # refuses a wrong dt
         self._pending.append((distance, turn, float(dt)))

@@ -30,8 +30,8 @@ class MonteCarloOptions(options.Options):
     runs: int = options.declared(
         200,
         "",
-        "Number of runs. Run i is the world of seed SEED + i; jobs whose seeds are "
-        "closer than this share worlds.",
+        "Number of runs. Run i is the world of seed SEED + i, so studies with "
+        "overlapping seed ranges share worlds.",
     )
     assume: list[str] | None = options.declared(
         None,

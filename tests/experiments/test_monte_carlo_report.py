@@ -265,14 +265,16 @@ def test_notes_group_failures_and_warn_of_few_runs():
         "ekf: 33 of 40 runs failed: 30 × ZeroDivisionError: boom (first: run 0, "
         "step 3); 1 × ValueError: [red]odd[/red] second line (first: run 31); "
         "1 × c (first: run 33, step 5); 1 × other messages.",
-        "ekf: only 7 runs did not fail: below 20 little can be shown.",
+        "ekf: only 7 runs succeeded; at least 20 are needed.",
     ]
     assert summarise_monte_carlo(typical())["notes"] == []
 
 
 def test_few_runs_are_noted_once_for_all_estimators_and_warned_of_in_each():
     summary = summarise_monte_carlo(typical().isel(run=slice(8)))
-    assert summary["notes"] == ["Only 8 runs: below 20 little can be shown."]
+    assert summary["notes"] == [
+        "Only 8 runs: at least 20 are needed to find more than large errors."
+    ]
     entry = summary["estimators"]["invariant"]
     assert any("Only 8 runs" in line for line in entry["warnings"])
 
