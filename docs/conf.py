@@ -49,6 +49,7 @@ html_theme_options = {
     "pygments_dark_style": "monokai",
 }
 html_sidebars = dict.fromkeys(("index", "homework", "logs"), ())  # no subpages
+html_context = {"default_mode": "auto"}  # dark where the system is
 html_show_sourcelink = False
 toc_object_entries_show_parents = "hide"
 html_domain_indices = False
