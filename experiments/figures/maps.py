@@ -491,6 +491,11 @@ def smoothed_figure(smoothed: SmoothedLog) -> Figure:
             *truth.T, "--", color=style.INK, lw=0.9, label="ground truth"
         )
         keys.insert(0, line)
+    if accuracy is not None and len(smoothed.log.landmarks):
+        angle, shift = accuracy.alignment
+        true = (smoothed.log.landmarks - shift) @ rotation(angle)
+        (line,) = axes.plot(*true.T, "+", color=style.INK, ms=8, label="true landmark")
+        keys.append(line)
     style.write_title(
         axes, f"{smoothed.log.name}, smoothed", _subtitle(smoothed, accuracy)
     )

@@ -122,6 +122,12 @@ def write_title(
     return above, below
 
 
+def sign(figure: Figure, text: str) -> Figure:
+    """Write what a figure is of into its lower right corner, and return it."""
+    figure.text(0.995, 0.004, text, ha="right", va="bottom", fontsize=7, color=GREY)
+    return figure
+
+
 def deviations(covariances: Array) -> Array:
     """Return the standard deviations (..., n) of covariances (..., n, n)."""
     variances = np.diagonal(covariances, axis1=-2, axis2=-1)
