@@ -121,16 +121,25 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         and ``association_precision``, ``…_recall``, ``…_duplicate`` and ``…_ghost`` in
         `info` score the episode at its end; -1 before.
     estimator : str, callable or object, default "invariant"
-        The filter, see `choose_estimator`. The reward depends on its covariance, so an
-        overconfident filter collects reward for information that it does not have.
+        A registered name or "module:Class", a factory with the keywords of
+        `make_estimator`, or an estimator with settings of its own. The reward depends
+        on its covariance, so an overconfident filter collects reward for information
+        that it does not have.
     estimator_options : mapping, optional
         Further options of the filter.
-    criterion, accuracy, success_reward, crash_cost, effort_cost, step_cost
-        See `RewardWeights`.
-    observation, max_landmarks, dtype
-        Form of the observation, see `ObservationForm`. With ``observation="set"`` the
-        rows per landmark are replaced by ``landmarks`` (R, 15), one row of
-        `landmark_set.FEATURES` per mapped landmark, and ``mask`` (R,).
+    criterion : {"D", "A", "E"}, default "D"
+        Measure of the uncertainty U.
+    accuracy : float, default 0.25
+        Largest worst standard deviation of a known landmark [m].
+    success_reward, crash_cost : float, default 5.0
+    effort_cost, step_cost : float, defaults 0.0 and 0.02
+    observation : {"flat", "set"}, default "flat"
+        With "set", the rows per landmark are replaced by ``landmarks`` (R, 15), one row
+        of `landmark_set.FEATURES` per mapped landmark, and ``mask`` (R,).
+    max_landmarks : int, default 32
+        R of a set; the nearest landmarks have a row.
+    dtype : {"float64", "float32"}, default "float64"
+        Type of the numbers.
     render_mode : {"human", "rgb_array"}, optional
         As in `LandmarkWorldEnv`; the frames also show the belief.
     **changes

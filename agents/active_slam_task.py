@@ -121,7 +121,7 @@ class ActiveSlamTask(Restorable):
         flat: dict[str, spaces.Space[Any]] = {
             **{key: flatten_space(box) for key, box in belief},
             **{
-                key: spaces.Box(-float(key == "goals"), 1.0, (size,), np.float64)
+                key: spaces.Box(0.0 - (key == "goals"), 1.0, (size,), np.float64)
                 for key, size in _SIZES.items()
             },
         }

@@ -12,7 +12,6 @@ e_l, e_p        errors of landmark and pose in the map, turned into the robot's 
 
 import math
 from dataclasses import dataclass
-from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -78,7 +77,7 @@ class ObservationForm:
                 "max_landmarks must be left out unless observation = 'set', "
                 f"got {rows!r}"
             )
-        if isinstance(rows, bool) or not isinstance(rows, Integral) or rows < 1:
+        if isinstance(rows, bool) or not isinstance(rows, int | np.integer) or rows < 1:
             raise ValueError(f"max_landmarks must be a whole number >= 1, got {rows!r}")
 
     @property

@@ -39,7 +39,7 @@ html_title = "slamgym"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_theme_options = {
-    "header_links_before_dropdown": 6,
+    "header_links_before_dropdown": 10,
     "navbar_align": "left",
     "navigation_with_keys": False,
     "show_toc_level": 2,
@@ -48,7 +48,8 @@ html_theme_options = {
     "pygments_light_style": "tango",
     "pygments_dark_style": "monokai",
 }
-html_sidebars = dict.fromkeys(("index", "start", "consistency"), ())  # no subpages
+html_sidebars = dict.fromkeys(("index", "homework", "logs"), ())  # no subpages
+html_context = {"default_mode": "auto"}  # dark where the system is
 html_show_sourcelink = False
 toc_object_entries_show_parents = "hide"
 html_domain_indices = False

@@ -1,7 +1,8 @@
-"""Worlds that move and measure. `envs` imports nothing of `estimator`, by design.
+"""Simulated worlds: robot, sensor, noise, controllers, pictures.
 
-A simulator that shared the filters' models could not reveal an error in them. So the
-drive equation, the measurement and the wrapping of angles are separate code here.
+`envs` imports nothing of `estimator`, by design. A simulator that shared the filters'
+models could not reveal an error in them. So the drive equation, the measurement and the
+wrapping of angles are separate code here.
 """
 
 from typing import TYPE_CHECKING

@@ -62,7 +62,7 @@ class SlamEstimator(Protocol):
         """Start a new run at a pose (3,) with deviations (3,) [m, m, rad], no map."""
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
-        """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
+        """Move by odometry (d, α) [m, rad]; dt multiplies the noise variance."""
 
     def update(
         self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
@@ -455,7 +455,7 @@ def describe_filter(slam: _HasMarginals) -> str:
 
 
 class ScanDecisions(NamedTuple):
-    """Which landmark each reading of one scan was given to, as decided in the end."""
+    """Final assignment of the readings of one scan to landmarks."""
 
     row_ids: tuple[int | None, ...]
     """The landmark of each row; None where the filter did not use the row."""

@@ -33,7 +33,7 @@ from .hypothesis_tests import (
 )
 
 FEW_RUNS = 20
-"""Number of runs below which the report warns that little can be shown."""
+"""Number of runs below which the report warns that it finds large errors only."""
 FEW_AVERAGES = 10
 """Number of runs below which the t-test rejects too often to count in the verdict."""
 FACTORS = (1.1, 1.2, 1.5)
@@ -111,7 +111,7 @@ class ConsistencyReport:
 
     @property
     def used_runs(self) -> int:
-        """Number of runs that did not fail."""
+        """Number of runs that succeeded."""
         return self.runs - len(self.failed_runs)
 
     @property
@@ -131,9 +131,7 @@ class ConsistencyReport:
                 f"{count} of {self.runs} runs failed and are left out: {names}."
             )
         if self.used_runs < FEW_RUNS:
-            found.append(
-                f"Only {self.used_runs} runs: below {FEW_RUNS} little can be shown."
-            )
+            found.append(few_runs(self.used_runs))
         return tuple(found)
 
     def sentences(self) -> tuple[str, ...]:
@@ -194,7 +192,7 @@ def evaluate_consistency(
     Raises
     ------
     ValueError
-        If shapes do not fit, or if fewer than 2 runs did not fail.
+        If shapes do not fit, or if fewer than 2 runs succeeded.
     """
     argument_checks.one_of("frame", frame, ("additive", "invariant"))
     scores, scans, freedom = _same_shape(nees, nis, nis_dof)
@@ -275,7 +273,7 @@ def _gaps(nees: Array, nis: Array, freedom: IntArray) -> tuple[int, BoolArray]:
     failed = np.asarray(no_nees | no_nis)
     if (~failed).sum() < 2:
         raise ValueError(
-            "nees must hold at least 2 runs that did not fail, "
+            "nees must hold at least 2 runs that succeeded, "
             f"got {failed.sum()} failed of {len(failed)}"
         )
     return first, failed
@@ -295,3 +293,9 @@ def _sentence(title: str, name: str, test: HypothesisTest) -> str:
 
 def _outcome(accepted: bool) -> str:
     return "accepted" if accepted else "rejected"
+
+
+def few_runs(runs: int) -> str:
+    """Warn of a study with fewer than FEW_RUNS runs."""
+    needed = f"at least {FEW_RUNS} are needed to find more than large errors"
+    return f"Only {runs} runs: {needed}."

@@ -327,7 +327,7 @@ POSE = 3
 LEAST_RATIO = 1.1
 """NEES per degree from which on a filter is overconfident."""
 KNOWABLE = 0.9
-"""Share of the least possible variance below which a claim is spurious."""
+"""Share of the smallest possible variance below which a reported one is false."""
 LOST_LEVEL, LOST_RATE = 1e-4, 1e-3
 """Quantile of χ²(3) beyond which a run is lost, and its rate that is accepted."""
 SHRINKS, GROWS = 0.5, 3.0

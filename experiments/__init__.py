@@ -30,8 +30,13 @@ if TYPE_CHECKING:
     from .judging import judge as judge
     from .logs import *
     from .monte_carlo import consistency_of as consistency_of
+    from .monte_carlo import heading_figure as heading_figure
     from .monte_carlo import load_results as load_results
     from .monte_carlo import merge_blocks as merge_blocks
+    from .monte_carlo import nees_figure as nees_figure
+    from .monte_carlo import nis_figure as nis_figure
+    from .monte_carlo import rmse_figure as rmse_figure
+    from .monte_carlo import runs_figure as runs_figure
     from .monte_carlo import summarise_monte_carlo as summarise_monte_carlo
     from .monte_carlo import write_html_report as write_html_report
     from .noise_fitting import *

@@ -54,6 +54,7 @@ def write_pages(app: Sphinx, config: Config) -> None:
         if not (picture := folder / f"{name}.gif").exists():
             preset_pictures.film(name, preset, picture)
     _write(folder / "fields.md", scenario_fields.page())
+    _write(folder / "examples.md", examples_page())
     _write(folder / "presets.md", preset_pictures.page(folder))
     listed = public_names()
     for package in status_iterator(listed, "listing public names … "):
@@ -76,6 +77,7 @@ def environment_page(name: str, environment: type, preset: str) -> str:
     body, _, example = rest.partition("\nExamples\n--------\n")
     body = re.sub(r":\w+:`~?(?:[\w.]+\.)?(\w+)`", r"`\1`", body)
     body = re.sub(r"``", "`", body)
+    body = re.sub(r"::$", ":", body, flags=re.MULTILINE)
     body = re.sub(r"(?<=## Arguments\n).*?(?=\n## |\Z)", _definitions, body, flags=re.S)
     return f"""# {name}
 
@@ -212,7 +214,7 @@ def api_index(listed: dict[str, list[str]]) -> str:
         for name in names
     }
     top = "\n".join(
-        f"* {_link(name, pages[id(thing)])}"
+        f"* {_link(name, pages[id(thing)])}: {_first_sentence(thing)}"
         for name in slamgym.__all__
         if not inspect.ismodule(thing := getattr(slamgym, name))
     )
@@ -229,6 +231,24 @@ The names used most can be imported from ``slamgym`` itself:
 
 {rows}
 """
+
+
+def _first_sentence(thing: object) -> str:
+    text = (inspect.getdoc(thing) or "").split("\n\n")[0].replace("\n", " ")
+    return re.sub(r"(?::\w+:)?`+~?([^`]+)`+", r"``\1``", text)
+
+
+def examples_page() -> str:
+    """Return the page that shows the programs of ``examples``, folded."""
+    parts = ["# Examples", "Each program runs as it is, in a clone of the repository."]
+    for path in sorted((ROOT / "examples").glob("[0-9]*")):
+        language = {".py": "python", ".c": "c"}[path.suffix]
+        code = path.read_text()
+        about = re.search(r'"""(.+?)(?:\n\n|""")|/\* (.+?)(?:\n \*\n|\*/)', code, re.S)
+        said = " ".join((about.group(1) or about.group(2)).split()) if about else ""
+        title = f"{path.name}: {said}".replace("`", "")
+        parts.append(f"````{{dropdown}} {title}\n```{language}\n{code}```\n````")
+    return "\n\n".join(parts) + "\n"
 
 
 def _link(name: str, page: str) -> str:

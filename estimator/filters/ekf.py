@@ -370,8 +370,7 @@ class EkfSlam(MapFilter):
             If an innovation covariance is not positive definite, naming the
             reading; the belief is then as before.
         MemoryError
-            If the landmarks would be more than memory holds; the belief is then as
-            before.
+            If the map would exceed the available memory; the belief is then as before.
         """
         sensor, kernel = self.sensor, self._update_map
         readings = argument_checks.scan(measurements, sensor.columns)

@@ -90,7 +90,7 @@ class PeerSlam(ABC):
         self._start(mean, np.maximum(std, START_FLOOR))
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
-        """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
+        """Move by odometry (d, α) [m, rad]; dt multiplies the noise variance."""
         moved = self._noise.motion.moved(odometry)
         self._move(np.array(moved), self._noise.over(moved, dt))
 

@@ -151,7 +151,7 @@ class Drive:
         return tuple(found[np.argsort(first)].tolist())
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
-        """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
+        """Move by odometry (d, α) [m, rad]; dt multiplies the noise variance."""
         reading = argument_checks.pair("odometry", odometry)
         noise = self.motion_noise
         noise.over(noise.motion.moved(reading), dt)  # refuses a wrong dt

@@ -96,7 +96,7 @@ class RecordedSlam:
             self._last = None
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
-        """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
+        """Move by odometry (d, α) [m, rad]; dt multiplies the noise variance."""
         motion = argument_checks.pair("odometry", odometry)
         step = partial(self._slam.predict, motion, dt)
 

@@ -12,9 +12,12 @@ from typing import Any
 from rich.text import Text
 
 from ...sim_configs import load_scenario
+from ...sim_configs.field_types import unknown_choice
 from . import options
 from .program import FAILURE, BadInputError, command, interruptible
 from .reporter import Reporter
+
+FORMATS = ("pdf", "svg", "png")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,8 +33,8 @@ class MonteCarloOptions(options.Options):
     runs: int = options.declared(
         200,
         "",
-        "Number of runs. Run i is the world of seed SEED + i; jobs whose seeds are "
-        "closer than this share worlds.",
+        "Number of runs. Run i is the world of seed SEED + i, so studies with "
+        "overlapping seed ranges share worlds.",
     )
     assume: list[str] | None = options.declared(
         None,
@@ -53,6 +56,12 @@ class MonteCarloOptions(options.Options):
     fresh: bool = options.declared(
         False, "--fresh", "Remove earlier results in the folder first."
     )
+    figures: str | None = options.declared(
+        None,
+        "FORMAT",
+        "Also write the figures of the report for print, 85 and 170 mm wide, as pdf, "
+        "svg or png.",
+    )
     out: Path | None = options.declared(
         None,
         "DIR",
@@ -65,7 +74,7 @@ class MonteCarloOptions(options.Options):
 @command
 @options.takes(
     "estimators runs seed steps set_ assume resolution jobs backend scheduler "
-    "block_size first_run merge fresh out as_json"
+    "block_size first_run merge fresh figures out as_json"
 )
 def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> int:
     """Many runs: are the filters consistent?
@@ -80,12 +89,13 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
     slamgym monte-carlo loop --estimators ekf,invariant --runs 200 --out loop
     slamgym monte-carlo six_landmarks -e mine:MyFilter --runs 100 --jobs 4
     slamgym monte-carlo loop --assume motion.std=[0.1,0.1,0.1]
+    slamgym monte-carlo loop --figures pdf
     slamgym monte-carlo hidden_identities -e 'ekf[management={backdate=true}]'
     slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://b:8786
     """  # noqa: D400 (the list of commands shows the question)
     from .. import monte_carlo
     from ..jobs import replace_own
-    from ..monte_carlo.report import write_html_report
+    from ..monte_carlo.report import write_figures, write_html_report
     from ..monte_carlo.results import REPORT, RESULTS, SUMMARY
     from ..monte_carlo.runner import SMALL_NOISE_SHARE
     from .output_folder import as_json_text, default_folder
@@ -94,6 +104,8 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
     assumed = options.changes("--assume", given.assume)
     reporter = given.reporter()
     options.refuse_broken(given.estimators)
+    if given.figures not in (None, *FORMATS):
+        raise BadInputError(unknown_choice("--figures", given.figures, FORMATS))
     place = given.out or default_folder("monte-carlo", world.name)
     told = world.with_changes(**assumed) if assumed else world
     with reporter.note_if_compiling("the filters"):
@@ -128,6 +140,8 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
     ):
         summary = monte_carlo.summarise_monte_carlo(results)
         summary["files"] = [RESULTS, SUMMARY, REPORT]
+        if given.figures:
+            summary["files"] += write_figures(results, summary, place, given.figures)
         with replace_own(place / REPORT) as partial:
             write_html_report(results, summary, partial)
         with replace_own(place / SUMMARY) as partial:

@@ -213,13 +213,15 @@ def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
 
 def write_study(study: Study, out: Path | None, reporter: Reporter) -> None:
     """Run a study, write its figure, table and summary, and print its results."""
+    from ..figures.style import sign
     from .output_folder import default_folder, output_folder, write_summary
     from .tables import written
 
     place = out or default_folder("noise-study", *study.names)
     with output_folder(place) as folder:
         found = study.run(reporter)
-        figures.save_figure(found.figure, folder / "noise_study.png", dpi=found.dpi)
+        figure = sign(found.figure, " · ".join(study.names))
+        figures.save_figure(figure, folder / "noise_study.png", dpi=found.dpi)
         _write_table(folder / "noise_study.csv", found.rows)
         rows = [_plain(row) for row in found.rows]
         if found.titles:

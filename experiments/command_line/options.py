@@ -60,7 +60,7 @@ def declared(
     words = form.split()
     names = [word for word in words if word.startswith("-")]
     value = [word for word in words if word not in names]
-    metavar = value[0] if value else None
+    metavar = value[0] if value else "N" if type(default) is int else None
     option = typer.Option(
         *names, metavar=metavar, help=text, show_default=shown, min=min
     )
@@ -172,7 +172,7 @@ class Options:
         "Take the noise from the information matrices of an iSAM or g2o text.",
     )
     seed: int = declared(0, "", "Seed of all random numbers.", min=0)
-    steps: int | None = declared(None, "", "Steps to drive.", "those of the scenario")
+    steps: int | None = declared(None, "N", "Steps to drive.", "those of the scenario")
     controller: str = declared(
         "open_loop",
         "NAME",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rich.text import Text
 
 from .. import figures
+from ..figures.style import sign
 from ..logs.recording import steps_of
 from ..logs.slamlog import SlamLog, write_slamlog
 from ..runs.filter_settings import FilterSettings
@@ -101,10 +102,16 @@ def filter_and_write(
     traces = [run.trace for run in runs]
     with reporter.progress("drawing") as tick:
         write_figures(
-            folder, traces[0], every_step=every_step, progress=tick, walls=walls
+            folder,
+            traces[0],
+            world=log.name,
+            every_step=every_step,
+            progress=tick,
+            walls=walls,
         )
         if len(traces) > 1:
             compared = figures.comparison_figure(traces, walls)
+            sign(compared, log.name)
             figures.save_figure(compared, folder / "comparison.png", dpi=150)
     write_run_page(folder / "run.html", log, viewed, walls=walls)
     if given.rerun is not None:
@@ -121,6 +128,7 @@ def write_figures(
     folder: Path,
     trace: RunTrace,
     *,
+    world: str,
     every_step: bool,
     progress: Callable[[int, int], object],
     walls: Sequence[Sequence[float]] = (),
@@ -133,6 +141,8 @@ def write_figures(
         The folder to write to.
     trace : RunTrace
         The run; it holds every map where every step is drawn.
+    world : str
+        Name of the log, which the figures show with that of the filter.
     every_step : bool
         Whether to draw the map after every step too.
     progress : callable
@@ -150,7 +160,8 @@ def write_figures(
     count = len(drawn) + every_step
     for done, (name, draw) in enumerate(drawn.items()):
         progress(done, count)
-        figures.save_figure(draw(trace), folder / f"{name}.png")
+        figure = sign(draw(trace), f"{world} · {trace.estimator}")
+        figures.save_figure(figure, folder / f"{name}.png")
     if every_step:
         progress(count - 1, count)
         figures.map_sequence(trace, folder / "map_steps", walls=walls)

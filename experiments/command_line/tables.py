@@ -111,11 +111,14 @@ def key_figures(summary: dict[str, Any]) -> Table:
     frame = (summary["nees"] or {}).get("frame", "additive")
     for name, key, hint in (
         (f"pose NEES, {frame}", "nees", ("too cautious", "overconfident")),
-        ("NIS", "nis", ("it assumes too much noise", "it assumes too little noise")),
+        ("NIS", "nis", [f"the filter assumes too {w} noise" for w in _MUCH]),
     ):
         if summary[key] is not None:
             rows.append((name, _ratio(summary[key], hint)))
     return named_rows(rows)
+
+
+_MUCH = ("much", "little")
 
 
 def _and_counts(text: str, counts: dict[str, int], words: Mapping[str, str]) -> str:
@@ -124,7 +127,9 @@ def _and_counts(text: str, counts: dict[str, int], words: Mapping[str, str]) -> 
     return ", ".join([text, *found])
 
 
-def _pose(pose: Sequence[float | None], covariance: Sequence[Sequence[float]]) -> str:
+def _pose(
+    pose: Sequence[float | None], covariance: Sequence[Sequence[float | None]]
+) -> str:
     parts = []
     for k, (name, unit) in enumerate((("x", "m"), ("y", "m"), ("θ", "rad"))):
         variance = covariance[k][k]
@@ -135,10 +140,10 @@ def _pose(pose: Sequence[float | None], covariance: Sequence[Sequence[float]]) -
 
 def _rmse(errors: dict[str, float | None]) -> str:
     raw, aligned = (significant(errors[key]) for key in ("raw", "aligned"))
-    return f"{raw} m RMS; {aligned} m once best fitted to the truth"
+    return f"{raw} m RMS; {aligned} m after alignment"
 
 
-def _ratio(numbers: dict[str, Any], hint: tuple[str, str]) -> str:
+def _ratio(numbers: dict[str, Any], hint: Sequence[str]) -> str:
     """Rate NEES or NIS per degree of freedom, which is 1 for a consistent filter."""
     ratio = numbers["per_degree"]
     text = f"{significant(ratio)} per degree of freedom; 1 is expected"
@@ -241,7 +246,7 @@ def association_table(scores: dict[str, Any]) -> Table:
     if scores["resolution"]:
         title += f", landmarks nearer than {scores['resolution']:g} m counted as one"
     of_the_map = [
-        ("GOSPA of the map", _gospa(found["aligned"]) + " once best fitted"),
+        ("GOSPA of the map", _gospa(found["aligned"]) + " after alignment"),
         ("… raw", f"{_gospa(found['raw'])}; cut-off {found['cutoff']:g} m"),
     ]
     if scores["correct"] is None:

@@ -100,8 +100,8 @@ def map_sequence(
 def noise_study_figure(runs: Sequence[tuple[str, RunTrace]]) -> Figure:
     """Compare the maps of runs that differ in their noise.
 
-    The reference comes first; the others follow below, two to a row, for example each
-    of σx, σy, σα, σβ, σr times 10 (left) and divided by 10 (right). All panels show the
+    The reference comes first, beside the legend; the others follow, four to a row, for
+    example each of σx, σy, σα, σβ, σr times 10 and divided by 10. All panels show the
     same area, at most twice as wide as that of the reference.
 
     Parameters
@@ -118,10 +118,10 @@ def noise_study_figure(runs: Sequence[tuple[str, RunTrace]]) -> Figure:
     if len(runs) < 2:
         raise ValueError(f"runs must hold a reference and a variation, got {len(runs)}")
     limits = shared_limits([map_limits(trace) for _, trace in runs])
-    rows = 1 + len(runs) // 2
+    rows = -(-(len(runs) + 1) // 4)
     width, height = limits[1] - limits[0]
-    figure = style.new_figure(7.6, (3.15 * height / width + 0.55) * rows + 0.4)
-    grid = figure.subplots(rows, 2, squeeze=False)
+    figure = style.new_figure(13.0, (2.4 * height / width + 0.55) * rows + 0.4)
+    grid = figure.subplots(rows, 4, squeeze=False)
     reference, beside, *others = grid.flat
     picture = _draw_panel(reference, *runs[0], limits)
     beside.set_axis_off()
@@ -226,12 +226,11 @@ def shared_limits(limits: Sequence[Array]) -> Array:
 
 def _label_outer_axes(grid: NDArray[np.object_], panels: int) -> None:
     """Label x below the lowest panel of each column, and y at the left."""
-    shown = [[True, False], *([True, True] for _ in range(len(grid) - 1))]
-    if panels % 2 == 0:
-        shown[-1][1] = False
+    shown = np.arange(grid.size).reshape(grid.shape) <= panels
+    shown[0, 1] = False  # the legend
     for i, row in enumerate(grid):
         for j, axes in enumerate(row):
-            last = not any(below[j] for below in shown[i + 1 :])
+            last = not shown[i + 1 :, j].any()
             axes.tick_params(labelbottom=last, labelleft=j == 0)
             axes.set_xlabel("x [m]" if last else "")
             axes.set_ylabel("y [m]" if j == 0 else "")
@@ -491,6 +490,11 @@ def smoothed_figure(smoothed: SmoothedLog) -> Figure:
             *truth.T, "--", color=style.INK, lw=0.9, label="ground truth"
         )
         keys.insert(0, line)
+    if accuracy is not None and len(smoothed.log.landmarks):
+        angle, shift = accuracy.alignment
+        true = (smoothed.log.landmarks - shift) @ rotation(angle)
+        (line,) = axes.plot(*true.T, "+", color=style.INK, ms=8, label="true landmark")
+        keys.append(line)
     style.write_title(
         axes, f"{smoothed.log.name}, smoothed", _subtitle(smoothed, accuracy)
     )

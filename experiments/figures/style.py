@@ -69,11 +69,17 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 200) -> None:
             f"path must end in one of {', '.join(f'.{f}' for f in sorted(formats))}, "
             f"got {str(path)!r}"
         )
-    lay_out(figure, dpi)
     with replace_when_written(target) as partial:
-        metadata = _METADATA.get(target.suffix.lower())
-        with rc_context({"svg.hashsalt": "slamgym"}):  # makes its ids reproducible
-            figure.savefig(partial, dpi=dpi, metadata=metadata)
+        draw_file(figure, partial, target.suffix.lower(), dpi)
+
+
+def draw_file(figure: Figure, path: Path, suffix: str, dpi: float = 300) -> None:
+    """Write a figure in the format of a suffix, with the fonts in the file."""
+    lay_out(figure, dpi)
+    form, metadata = suffix.removeprefix("."), _METADATA.get(suffix)
+    # The salt makes ids reproducible; type 42 is what publishers accept.
+    with rc_context({"svg.hashsalt": "slamgym", "pdf.fonttype": 42}):
+        figure.savefig(path, dpi=dpi, format=form, metadata=metadata)
 
 
 def dress(axes: Axes, *, size: float = 10.0) -> None:
@@ -114,6 +120,12 @@ def write_title(
     )
     below.set(fontsize=small, color=GREY)
     return above, below
+
+
+def sign(figure: Figure, text: str) -> Figure:
+    """Write what a figure is of into its lower right corner, and return it."""
+    figure.text(0.995, 0.004, text, ha="right", va="bottom", fontsize=7, color=GREY)
+    return figure
 
 
 def deviations(covariances: Array) -> Array:

@@ -10,6 +10,11 @@ from typing import TYPE_CHECKING
 from ...public_names import attach
 
 if TYPE_CHECKING:
+    from .figures import heading_figure as heading_figure
+    from .figures import nees_figure as nees_figure
+    from .figures import nis_figure as nis_figure
+    from .figures import rmse_figure as rmse_figure
+    from .figures import runs_figure as runs_figure
     from .report import write_html_report as write_html_report
     from .results import load_results as load_results
     from .results import merge_blocks as merge_blocks

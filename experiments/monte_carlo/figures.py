@@ -19,6 +19,7 @@ from ...evaluation.hypothesis_tests import (
     normal_scores,
 )
 from ..figures.style import ALARM, BLUE, GREY, INK, ORANGE, TEAL, dress, new_figure
+from .summary import summarise_monte_carlo
 from .verdict import POSE_FREEDOM, EstimatorScores, labels_of, scores_of
 
 
@@ -36,7 +37,34 @@ class EstimatorLook(NamedTuple):
 
 Shown = list[tuple[EstimatorScores, EstimatorLook]]
 
-_WIDTH = 4.8
+
+class Study(NamedTuple):
+    """What the figures of a study show, and how wide they are."""
+
+    shown: Shown
+    summary: dict[str, Any]
+    width: float
+    title: str
+
+    @classmethod
+    def of(cls, results: "xr.Dataset | Study", width_mm: float) -> "Study":
+        """Measure results, unless that is done; the title names the world."""
+        if isinstance(results, Study):
+            return results
+        summary = summarise_monte_carlo(results)
+        if not (shown := _shown(results, summary)):
+            raise ValueError("results must hold an estimator with a successful run")
+        return cls(shown, summary, width_mm / _MM, _title(summary))
+
+    @property
+    def frame(self) -> ErrorFrame:
+        """Error frame of the NEES."""
+        frame: ErrorFrame = self.summary["frame"]
+        return frame
+
+
+_MM = 25.4  # in an inch
+_WIDTH = 4.8  # of the figures in a report [inch]
 _LOG_FROM = 4.0
 _BINS = 70
 _FEW_DOTS = 100
@@ -44,7 +72,9 @@ MOST_DOTS = 300
 """Of one estimator in `runs_figure`, which shows quantiles of more runs."""
 
 
-def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> dict[str, Figure]:
+def report_figures(
+    dataset: xr.Dataset, summary: dict[str, Any], *, width_mm: float | None = None
+) -> dict[str, Figure]:
     """Draw all figures of a report.
 
     Parameters
@@ -53,6 +83,9 @@ def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> dict[str, Fi
         Results of ``monte_carlo``.
     summary : dict
         Their summary, of ``summarise_monte_carlo``.
+    width_mm : float, optional
+        Width of figures for print, which name the world. By default they are those of
+        the web page, which names it.
 
     Returns
     -------
@@ -61,24 +94,61 @@ def report_figures(dataset: xr.Dataset, summary: dict[str, Any]) -> dict[str, Fi
         successful runs; empty if there is none. ``nis`` shows those with innovations,
         which a smoother has not.
     """
-    frame: ErrorFrame = summary["frame"]
-    each = [scores_of(dataset, label, frame) for label in labels_of(dataset)]
-    shown = [(scores, look_of(i)) for i, scores in enumerate(each) if scores.good.any()]
-    if not shown:
+    study = Study(_shown(dataset, summary), summary, _WIDTH, "")
+    if not study.shown:
         return {}
-    figures = {
-        "nees": nees_figure(shown, frame, summary),
-        "runs": runs_figure(shown, frame),
-        "heading": heading_figure(shown, summary["knowable_heading_std"]),
-        "rmse": rmse_figure(shown),
+    if width_mm is not None:
+        study = study._replace(width=width_mm / _MM, title=_title(summary))
+    drawn = {
+        "nees": nees_figure,
+        "runs": runs_figure,
+        "heading": heading_figure,
+        "rmse": rmse_figure,
     }
-    innovative = [pair for pair in shown if pair[0].nis_per_degree is not None]
-    return figures | ({"nis": nis_figure(innovative)} if innovative else {})
+    if _innovative(study.shown):
+        drawn["nis"] = nis_figure
+    return {name: draw(study) for name, draw in drawn.items()}
 
 
-def nees_figure(shown: Shown, frame: ErrorFrame, summary: dict[str, Any]) -> Figure:
-    """Draw ANEES / 3 over time, with the 95 % bands of one step and of the grid."""
-    figure = new_figure(_WIDTH, 2.9)
+def _title(summary: dict[str, Any]) -> str:
+    return f"{summary['scenario']}, {summary['runs']} runs of {summary['steps']} steps"
+
+
+def _shown(dataset: xr.Dataset, summary: dict[str, Any]) -> Shown:
+    """Return the estimators with successful runs."""
+    labels = enumerate(labels_of(dataset))
+    each = [(scores_of(dataset, x, summary["frame"]), look_of(i)) for i, x in labels]
+    return [pair for pair in each if pair[0].good.any()]
+
+
+def _innovative(shown: Shown) -> Shown:
+    """Return the estimators with innovations."""
+    return [pair for pair in shown if pair[0].nis_per_degree is not None]
+
+
+def nees_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
+    """Draw ANEES / 3 over time, with the 95 % bands of one step and of the grid.
+
+    Parameters
+    ----------
+    results : xarray.Dataset
+        Results of ``monte_carlo``.
+    width_mm : float, default 85
+        Width of the figure [mm]: 85 for a column of a paper, 170 for a page.
+
+    Returns
+    -------
+    Figure
+        For `save_figure`.
+
+    Raises
+    ------
+    ValueError
+        If no estimator has a successful run.
+    """
+    study = Study.of(results, width_mm)
+    shown, frame, summary = study.shown, study.frame, study.summary
+    figure = new_figure(study.width, 2.9)
     axes = figure.subplots()
     runs = max(int(scores.good.sum()) for scores, _ in shown)
     band = np.array(average_band(runs, POSE_FREEDOM)) / POSE_FREEDOM
@@ -98,12 +168,17 @@ def nees_figure(shown: Shown, frame: ErrorFrame, summary: dict[str, Any]) -> Fig
     everything = np.concatenate(extremes)
     if everything.max() > _LOG_FROM or everything.min() < 1 / _LOG_FROM:
         log_ticks(axes, "y")
-    return _finished(figure, axes, "ANEES / 3")
+    return _finished(figure, axes, "ANEES / 3", study.title)
 
 
-def runs_figure(shown: Shown, frame: ErrorFrame) -> Figure:
-    """Draw the time average of each run's NEES / 3, a row of dots per estimator."""
-    figure = new_figure(_WIDTH, 0.8 + 1.0 * len(shown))
+def runs_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
+    """Draw the time average of each run's NEES / 3, a row of dots per estimator.
+
+    Parameters, result and errors are those of :func:`nees_figure`.
+    """
+    study = Study.of(results, width_mm)
+    shown, frame = study.shown, study.frame
+    figure = new_figure(study.width, 0.8 + 1.0 * len(shown))
     axes = figure.subplots()
     size = 3.4 if len(shown[0][0].good) <= _FEW_DOTS else 2.6
     each = [_dots(scores.ratios(frame).mean(axis=1)) for scores, _ in shown]
@@ -131,12 +206,18 @@ def runs_figure(shown: Shown, frame: ErrorFrame) -> Figure:
     axes.set_ylim(len(shown) - 0.55, -0.7)
     axes.grid(visible=False, axis="y")
     axes.set_xlabel("time average of NEES / 3")
+    name_world(axes, study.title)
     return figure
 
 
-def heading_figure(shown: Shown, knowable: float) -> Figure:
-    """Draw claimed and true deviation of the heading, a panel per estimator [°]."""
-    figure = new_figure(_WIDTH, 0.75 + 1.3 * len(shown))
+def heading_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
+    """Draw claimed and true deviation of the heading, a panel per estimator [°].
+
+    Parameters, result and errors are those of :func:`nees_figure`.
+    """
+    study = Study.of(results, width_mm)
+    shown, knowable = study.shown, study.summary["knowable_heading_std"]
+    figure = new_figure(study.width, 0.75 + 1.3 * len(shown))
     panels = figure.subplots(len(shown), 1, sharex=True, sharey=True, squeeze=False)
     for axes, (scores, look) in zip(panels[:, 0], shown, strict=True):
         claimed, true = (
@@ -158,13 +239,19 @@ def heading_figure(shown: Shown, knowable: float) -> Figure:
         axes.set_title(plain(scores.label), loc="left", fontsize=10, color=INK, pad=3)
     panels[-1, 0].set_xlabel("step")
     figure.supylabel("heading, RMS over runs [°]", fontsize=10, color=INK)
+    name_world(panels[0, 0], study.title)
     legend_above(figure, panels[0, 0])
     return figure
 
 
-def rmse_figure(shown: Shown) -> Figure:
-    """Draw the root mean square of the position's raw error over time."""
-    figure = new_figure(_WIDTH, 2.5)
+def rmse_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
+    """Draw the root mean square of the position's raw error over time.
+
+    Parameters, result and errors are those of :func:`nees_figure`.
+    """
+    study = Study.of(results, width_mm)
+    shown = study.shown
+    figure = new_figure(study.width, 2.5)
     axes = figure.subplots()
     for scores, look in shown:
         rms = _root_mean_square(scores.over_time("position_error"))
@@ -174,12 +261,18 @@ def rmse_figure(shown: Shown) -> Figure:
         least = thinned(shown[0][0].steps, np.sqrt(bound))
         axes.plot(*least, color=GREY, ls=":", lw=1.5, label="bound of any filter")
     axes.set_ylim(bottom=0)
-    return _finished(figure, axes, "RMS error, raw [m]")
+    return _finished(figure, axes, "RMS error, raw [m]", study.title)
 
 
-def _finished(figure: Figure, axes: Axes, ylabel: str) -> Figure:
+def name_world(axes: Axes, title: str) -> None:
+    """Write the world of a figure for print above its axes, on the right."""
+    axes.set_title(title, loc="right", fontsize=8, color=GREY, pad=3)
+
+
+def _finished(figure: Figure, axes: Axes, ylabel: str, title: str) -> Figure:
     """Dress and label the axes of a number over the steps."""
     dress(axes)
+    name_world(axes, title)
     axes.margins(x=0.01)
     axes.set(xlabel="step", ylabel=ylabel)
     legend_above(figure, axes)
@@ -204,6 +297,7 @@ def _mark_grid(
     for chosen, face in ((rejected, look.colour), (~rejected, "white")):
         (dots,) = axes.plot(steps[chosen], ratios[chosen], look.marker, ms=4.5)
         dots.set(color=look.colour, markerfacecolor=face, markeredgewidth=1.2, zorder=3)
+        dots.set_clip_on(False)
 
 
 def _root_mean_square(values: Array) -> Array:
@@ -245,7 +339,7 @@ _DASHES: tuple[Any, ...] = (
 )
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 _MOST_POINTS = 400
-_LETTERS = 52  # in a row of a legend
+_LETTERS = 11  # per inch, in a row of a legend
 _KEY = 6  # width of a key in letters
 _ROW = 0.19  # height of a row of a legend [inch]
 
@@ -313,7 +407,8 @@ def legend_above(figure: Figure, axes: Axes) -> None:
     """Put the legend above the axes in as many columns as fit; the figure grows."""
     handles, labels = axes.get_legend_handles_labels()
     longest = max((len(label) for label in labels), default=0) + _KEY
-    columns = max(1, min(len(labels), _LETTERS // longest))
+    letters = int(_LETTERS * figure.get_figwidth())
+    columns = max(1, min(len(labels), letters // longest))
     rows = math.ceil(len(labels) / columns)
     figure.set_figheight(figure.get_figheight() + _ROW * rows)
     figure.legend(
@@ -337,18 +432,19 @@ _TAIL = 0.025
 _LEAST = 0.02  # smallest range of correlations on the axis
 
 
-def nis_figure(shown: list[tuple[EstimatorScores, EstimatorLook]]) -> Figure:
+def nis_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
     """Draw NIS by its degrees of freedom over time, and its autocorrelation.
 
     Innovations are white, so the NIS of neighbouring steps may be pooled: each point
     covers a block of steps and all runs, with its 95 % band of χ².
 
-    Parameters
-    ----------
-    shown : list of (EstimatorScores, EstimatorLook)
-        Estimators with successful runs.
+    Parameters, result and errors are those of :func:`nees_figure`.
     """
-    figure = new_figure(4.8, 4.0)
+    study = Study.of(results, width_mm)
+    shown = _innovative(study.shown)
+    if not shown:
+        raise ValueError("results must hold an estimator that reports innovations")
+    figure = new_figure(study.width, 4.0)
     above, below = figure.subplots(2, 1, height_ratios=(3, 2))
     _draw_band(above, shown[0][0])
     for scores, look in shown:
@@ -359,6 +455,7 @@ def nis_figure(shown: list[tuple[EstimatorScores, EstimatorLook]]) -> Figure:
     for axes in (above, below):
         dress(axes)
     figure.align_ylabels()
+    name_world(above, study.title)
     legend_above(figure, above)
     return figure
 

@@ -30,10 +30,12 @@ from ..figures.style import (
     ORANGE,
     PALE,
     TEAL,
+    draw_file,
     headings_and_key,
     lay_out,
     page_environment,
 )
+from ..jobs import replace_own
 from .figures import MOST_DOTS, PURPLE, SKY, grid_steps, report_figures
 from .runner import ASSUMED_FILE, python_call
 from .summary import NOTHING, measures, number, percent
@@ -81,6 +83,7 @@ def html_report(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
         "measures": measures(summary),
         "bad_run": _bad_run(summary),
         "figures": report_figures(dataset, summary),
+        "prints": [file for file in summary.get("files", ()) if "mm." in file],
         "good_runs": max(entry["good_runs"] for entry in entries.values()),
         "tested": grid_steps(summary),
     }
@@ -101,6 +104,20 @@ def html_report(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
         "verbatim": lambda text: Markup(html.escape(text)),
     }
     return environment.get_template("html_report.html").render(summary | page)
+
+
+def write_figures(
+    dataset: xr.Dataset, summary: dict[str, Any], folder: Path, suffix: str
+) -> list[str]:
+    """Write the figures of a report for print, 85 and 170 mm wide; return the names."""
+    names = []
+    for width in (85, 170):
+        figures = report_figures(dataset, summary, width_mm=width)
+        for name, figure in figures.items():
+            names.append(f"{name}_{width}mm.{suffix}")
+            with replace_own(folder / names[-1]) as partial:
+                draw_file(figure, partial, suffix)
+    return names
 
 
 def headline(summary: dict[str, Any]) -> str:

@@ -583,7 +583,7 @@ def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
     Returns
     -------
     dict or None
-        Means over the runs that did not fail of ``correct``, ``wrong``,
+        Means over the runs that succeeded of ``correct``, ``wrong``,
         ``new_correct``, ``duplicate``, ``ghost``, ``missed``, ``clutter_used``,
         ``map_size``, ``true_map_size``, ``precision`` and ``recall``; None where
         the estimator reports none.  ``gospa``: ``raw`` and ``aligned`` means of

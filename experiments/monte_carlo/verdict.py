@@ -23,6 +23,7 @@ from ...evaluation.consistency_report import (
     FEW_RUNS,
     ConsistencyReport,
     evaluate_consistency,
+    few_runs,
 )
 from ...evaluation.diagnosis import (
     CANNOT_TELL,
@@ -290,21 +291,18 @@ def run_warnings(entries: Mapping[str, Mapping[str, Any]], runs: int) -> list[st
     >>> for line in run_warnings({"ekf": entry}, 5):
     ...     print(line)
     ekf: 2 of 5 runs failed: 2 × boom (first: run 0, step 3).
-    Only 5 runs: below 20 little can be shown.
+    Only 5 runs: at least 20 are needed to find more than large errors.
     """
     failed = {label: _failed(label, entry, runs) for label, entry in entries.items()}
     found = [sentence for sentence in failed.values() if sentence]
     for label, entry in entries.items():
         found += [f"{label}: {text}" for text in _suspicions(entry) if text]
     if runs < FEW_RUNS:
-        found.append(f"Only {runs} runs: below {FEW_RUNS} little can be shown.")
-        return found
+        return [*found, few_runs(runs)]
     for label, entry in entries.items():
-        if entry["good_runs"] < FEW_RUNS:
-            found.append(
-                f"{label}: only {entry['good_runs']} runs did not fail: below "
-                f"{FEW_RUNS} little can be shown."
-            )
+        if (good := entry["good_runs"]) < FEW_RUNS:
+            succeeded = f"only {good} runs succeeded" if good else "no run succeeded"
+            found.append(f"{label}: {succeeded}; at least {FEW_RUNS} are needed.")
     return found
 
 

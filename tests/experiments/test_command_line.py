@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 from commands import slamgym
+from matplotlib.figure import Figure
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -73,7 +74,7 @@ def without_pictures(monkeypatch):
 @pytest.fixture
 def without_figure(monkeypatch):
     """Draw no figure of a noise study, where only its rows count."""
-    monkeypatch.setattr(figures, "noise_study_figure", lambda _: None)
+    monkeypatch.setattr(figures, "noise_study_figure", lambda _: Figure())
     monkeypatch.setattr(figures, "save_figure", lambda _, path, **__: path.touch())
 
 

@@ -44,7 +44,7 @@ def refused(*arguments):
 @pytest.mark.slow
 def test_results_summary_and_report_are_written_and_told(here):
     arguments = ("monte-carlo", "six_landmarks", "--runs", 40, "--out", "out")
-    result = slamgym(*arguments)
+    result = slamgym(*arguments, "--figures", "pdf")
     assert result.exit_code == 0, result.stderr
     assert "ekf: not consistent" in result.stdout
     assert "report.html" in result.stdout
@@ -56,6 +56,15 @@ def test_results_summary_and_report_are_written_and_told(here):
     page = (here / "out" / "report.html").read_text()
     assert "not consistent" in page
     assert "<svg" in page
+    assert '<a href="nees_85mm.pdf" download>' in page
+    printed = (here / "out" / "nees_85mm.pdf").read_bytes()
+    assert b"/MediaBox [ 0 0 240.9" in printed  # 85 mm in points
+    assert b"/FontFile2" in printed  # the fonts themselves, as TrueType
+
+
+def test_figures_of_an_unknown_format_are_refused():
+    message = refused("monte-carlo", "six_landmarks", "--figures", "gif")
+    assert "--figures must be one of pdf, svg, png" in message
 
 
 @pytest.mark.slow

@@ -8,12 +8,20 @@ import re
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from monte_carlo_dataset import typical, with_failures
 from rich.console import Console
 from scipy.stats import chi2
 
 from slamgym.evaluation.consistency_report import evaluate_consistency
 from slamgym.evaluation.hypothesis_tests import equivalence_test, family_band
+from slamgym.experiments import (
+    heading_figure,
+    nees_figure,
+    nis_figure,
+    rmse_figure,
+    runs_figure,
+)
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.monte_carlo.figures import (
     look_of,
@@ -265,14 +273,16 @@ def test_notes_group_failures_and_warn_of_few_runs():
         "ekf: 33 of 40 runs failed: 30 × ZeroDivisionError: boom (first: run 0, "
         "step 3); 1 × ValueError: [red]odd[/red] second line (first: run 31); "
         "1 × c (first: run 33, step 5); 1 × other messages.",
-        "ekf: only 7 runs did not fail: below 20 little can be shown.",
+        "ekf: only 7 runs succeeded; at least 20 are needed.",
     ]
     assert summarise_monte_carlo(typical())["notes"] == []
 
 
 def test_few_runs_are_noted_once_for_all_estimators_and_warned_of_in_each():
     summary = summarise_monte_carlo(typical().isel(run=slice(8)))
-    assert summary["notes"] == ["Only 8 runs: below 20 little can be shown."]
+    assert summary["notes"] == [
+        "Only 8 runs: at least 20 are needed to find more than large errors."
+    ]
     entry = summary["estimators"]["invariant"]
     assert any("Only 8 runs" in line for line in entry["warnings"])
 
@@ -497,3 +507,26 @@ def test_readings_that_a_gate_rejects_are_counted():
     strict, loose = summarise_monte_carlo(results)["estimators"].values()
     assert loose["unused_readings"] == 0.0
     assert 0.4 < strict["unused_readings"] < 0.9
+
+
+@pytest.mark.parametrize("width", [85.0, 170.0])
+@pytest.mark.parametrize(
+    "draw", [nees_figure, runs_figure, heading_figure, nis_figure, rmse_figure]
+)
+def test_a_figure_for_print_is_as_wide_as_asked_and_names_its_world(draw, width):
+    figure = draw(typical(), width)
+    assert figure.get_figwidth() * 25.4 == pytest.approx(width)
+    said = {text.get_text() for text in figure.findobj(Text)}
+    assert "six_landmarks, 40 runs of 29 steps" in said
+    figure.draw_without_rendering()
+    box = figure.get_tightbbox()
+    assert box.x0 > -0.1
+    assert box.x1 * 25.4 < width + 2.0
+
+
+def test_a_figure_needs_a_run_that_succeeded():
+    failures = [
+        (name, run, 5, "boom") for name in ("ekf", "invariant") for run in range(40)
+    ]
+    with pytest.raises(ValueError, match="a successful run"):
+        nees_figure(with_failures(typical(), failures))

@@ -587,7 +587,7 @@ def _check(submap: Submap, index: int, landmarks: int) -> None:
         raise ValueError(f"state['submap_{index}_slots'] must be whole numbers")
     size = 3 + 2 * len(slots)
     fits = mean.shape == (size,) and covariance.shape == (size, size)
-    inside = slots.dtype.kind == "i" and all(0 <= s < landmarks for s in slots.tolist())
+    inside = all(0 <= s < landmarks for s in slots.tolist())
     if not (fits and inside):
         raise ValueError(f"submap {index} of the state does not fit the rest of it")
     saved_states.array(f"submap_{index}_mean", mean, (size,))
