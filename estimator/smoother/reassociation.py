@@ -43,7 +43,7 @@ from ..association.constellations import (
     tables,
 )
 from ..kernels.assignment_search import compare_pairs
-from ..kernels.scan_update import as_rules, bearing_variance, range_variance
+from ..kernels.scan_update import as_rules, variances
 from ..models.bearing_range import wrap_angle, wrap_angle_jit
 from .drive import Drive, DriveArrays, Sightings, landmark_order
 from .optimiser import Estimate, Noise, Optimiser, start_of
@@ -453,10 +453,11 @@ def fill_costs(
             dx, dy = places[j, 0] - pose[0], places[j, 1] - pose[1]
             expected = max(math.sqrt(dx * dx + dy * dy), rules.min_range)
             noisy = z[1] if rules.noise_as_read else expected
-            cost = (z[1] - expected) ** 2 / (2 * range_variance(rules, noisy))
+            to_bearing, to_range = variances(rules, noisy)
+            cost = (z[1] - expected) ** 2 / (2 * to_range)
             if cost < costs[i, j]:
                 turn = wrap_angle_jit(math.atan2(dy, dx) - pose[2] - z[0])
-                cost += turn**2 / (2 * bearing_variance(rules, noisy))
+                cost += turn**2 / (2 * to_bearing)
                 costs[i, j] = min(costs[i, j], cost)
 
 
