@@ -185,7 +185,7 @@ def judge(what: str, value: float, goal: float) -> None:
 
 
 def judge_beliefs(count: int) -> None:
-    """Print the time of the whole belief of submaps, the first of which joins them."""
+    """Print the time of the whole belief of submaps; the first call joins them."""
     slam = mapped(SubmapSlam(*NOISE), count)
     times = []
     for now in drive(count, 10):

@@ -427,11 +427,6 @@ class ScanRecord(NamedTuple):
         ledger[COLUMN, :used] = 3 + 2 * np.arange(used)
         return cls(ids, found[:, chosen], ledger)
 
-    @property
-    def innovation(self) -> Array:
-        """Innovations ν, shape (m, 2)."""
-        return self.rows[:, INNOVATION].reshape(-1, 2)
-
     def joint_factor(self) -> Array:
         """Return L of S = L Lᵀ, shape (2m, 2m), lower triangular.
 
@@ -529,7 +524,7 @@ class ScanReport(UpdateReport):
     @cached_property
     def innovation(self) -> Array:
         """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
-        return self._record.innovation
+        return self._record.rows[:, INNOVATION].reshape(-1, 2)
 
     def _with_outcome(self, outcome: int) -> tuple[int, ...]:
         ids, ledger = self._readings()

@@ -148,9 +148,9 @@ class CompressedEkfSlam:
         argument_checks.refuse_reserved(ids)
 
         required = [i for i in ids if i in self._map.slots]
-        changes = not self._is_adequate(required) and bool(
-            (np.abs(readings) <= LARGEST).all()  # otherwise refused
-        )
+        changes = not self._is_adequate(required)
+        if changes:
+            changes = bool((np.abs(readings) <= LARGEST).all())  # otherwise refused
 
         def correct() -> UpdateReport:
             if changes:
