@@ -54,10 +54,10 @@ Belief and UpdateReport are in slamgym.estimator; the mean is (x, y, θ, l1x, l1
 class Finding(NamedTuple):
     """One result of the checks."""
 
+    #: "required" to run at all, "correct" for right beliefs, or "recommended".
     level: Level
-    """"required" to run at all, "correct" for right beliefs, or "recommended"."""
+    #: The method, what is expected of it, and what it did.
     message: str
-    """The method, what is expected of it, and what it did."""
 
     def __str__(self) -> str:
         return f"{self.level}: {self.message}"
@@ -652,6 +652,7 @@ def check_repeated_runs(factory: Factory) -> Iterator[str]:
         yield "reset() should forget the run, but the next one differs from a first one"
 
 
+#: The checks of each level, in the order of their findings.
 CHECKS: dict[Level, tuple[Check, ...]] = {
     "required": (
         check_interface,
@@ -682,4 +683,3 @@ CHECKS: dict[Level, tuple[Check, ...]] = {
         check_repeated_runs,
     ),
 }
-"""The checks of each level, in the order of their findings."""

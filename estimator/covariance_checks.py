@@ -59,15 +59,15 @@ class _Call(NamedTuple):
     """One call: its equation, and what the equation needs."""
 
     method: str
+    #: Of both Jacobians and the covariance of the noise.
     equation: Callable[..., _Gaussian]
-    """Of both Jacobians and the covariance of the noise."""
     jacobians: tuple[Array, Array]
     rows: tuple[str, ...]
     columns: tuple[tuple[str, ...], tuple[str, ...]]
+    #: The right one by "", wrong ones by the mistake that leads to them.
     noises: dict[str, Array]
-    """The right one by "", wrong ones by the mistake that leads to them."""
+    #: Results of other mistakes.
     others: dict[str, _Gaussian]
-    """Results of other mistakes."""
 
     def right(self) -> _Gaussian:
         return self.equation(*self.jacobians, self.noises[""])

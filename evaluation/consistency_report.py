@@ -32,17 +32,17 @@ from .hypothesis_tests import (
     whiteness_test,
 )
 
+#: Number of runs below which the report warns that little can be shown.
 FEW_RUNS = 20
-"""Number of runs below which the report warns that little can be shown."""
+#: Number of runs below which the t-test rejects too often to count in the verdict.
 FEW_AVERAGES = 10
-"""Number of runs below which the t-test rejects too often to count in the verdict."""
 FACTORS = (1.1, 1.2, 1.5)
 _GRID = 10
 _LAGS = 10
 _ERROR_RATE = 0.05
 _MOST_NAMES = 10
+#: The outcome of a test without data.
 _NOTHING = HypothesisTest(np.nan, Band(np.nan, np.nan), np.nan, _ERROR_RATE)
-"""The outcome of a test without data."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,37 +53,37 @@ class ConsistencyReport:
     ``str(report)`` gives one sentence per test.
     """
 
+    #: Error coordinates of the NEES.
     frame: str
-    """Error coordinates of the NEES."""
     degrees_of_freedom: int
+    #: Number of runs, failed ones included.
     runs: int
-    """Number of runs, failed ones included."""
+    #: Rows with nan in place of a NEES or NIS; no test counts them.
     failed_runs: tuple[int, ...]
-    """Rows with nan in place of a NEES or NIS; no test counts them."""
+    #: Leading steps at which no run has a NEES, as at a start known for certain.
     undefined_steps: int
-    """Leading steps at which no run has a NEES, as at a start known for certain."""
     final_step: HypothesisTest
     time_average: HypothesisTest
     bootstrap: HypothesisTest
     family: FamilyTest
+    #: Steps of the grid of ``family``.
     family_steps: IntArray
-    """Steps of the grid of ``family``."""
     nis: HypothesisTest
     whiteness: HypothesisTest
     equivalence: EquivalenceTest
+    #: Mean of the runs' time averages.
     mean_ratio: float
-    """Mean of the runs' time averages."""
+    #: Median of the runs' time averages.
     median_ratio: float
-    """Median of the runs' time averages."""
+    #: Share of the runs whose time average is above 3.
     share_above_3: float
-    """Share of the runs whose time average is above 3."""
+    #: Fewest runs without which the mean of the others is inside the margin, 0 if it is
+    #: anyway.
     deciding_runs: int
-    """Fewest runs without which the mean of the others is inside the margin, 0 if it is
-    anyway."""
+    #: Mean without these runs.
     ratio_of_others: float
-    """Mean without these runs."""
+    #: (factor, number of runs with which the final step finds it in 90 % of cases).
     runs_needed: tuple[tuple[float, int], ...]
-    """(factor, number of runs with which the final step finds it in 90 % of cases)."""
 
     def __repr__(self) -> str:
         return (

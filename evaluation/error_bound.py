@@ -33,25 +33,25 @@ from ..jit import jit, njit_internal
 class PosteriorBound(NamedTuple):
     """Least mean squared errors of B runs, given their true paths; invariant frame."""
 
+    #: Of the position after each scan, shape (B, T) [m²].
     position: Array
-    """Of the position after each scan, shape (B, T) [m²]."""
+    #: Of the heading after each scan, shape (B, T) [rad²].
     heading: Array
-    """Of the heading after each scan, shape (B, T) [rad²]."""
+    #: Of the position in the additive frame, to first order, shape (B, T) [m²].
     raw_position: Array
-    """Of the position in the additive frame, to first order, shape (B, T) [m²]."""
+    #: At the end: of a landmark about the centre of the map, shape (B,) [m²].
     map: Array
-    """At the end: of a landmark about the centre of the map, shape (B,) [m²]."""
+    #: Of (x, y, θ, l1x, …) at the end of each run, shape (3 + 2n, 3 + 2n) for the n
+    #: landmarks that it read, in the order of their rows.
     covariances: tuple[Array, ...]
-    """Of (x, y, θ, l1x, …) at the end of each run, shape (3 + 2n, 3 + 2n) for the n
-    landmarks that it read, in the order of their rows."""
 
 
 class Efficiency(NamedTuple):
     """Bound divided by mean squared error, 1 for an estimate that cannot be better."""
 
     value: float
+    #: 95 %, by the scatter of the runs.
     interval: tuple[float, float]
-    """95 %, by the scatter of the runs."""
 
 
 def posterior_bound(

@@ -21,8 +21,8 @@ from ..estimator.models.rigid_motion import (
     invariant_error,
 )
 
+#: Conditional variance, as a share of the variance, below which it counts as zero.
 SINGULAR = 1e-10
-"""Conditional variance, as a share of the variance, below which it counts as zero."""
 
 _FEW = 4  # up to this size, all covariances are factored together
 

@@ -30,8 +30,8 @@ _NOISE = {
 }
 
 
+#: The five noises: εx, εy, εα of the motion, εβ, εr of the readings.
 CHANNELS = ("along", "sideways", "turn", "bearing", "range")
-"""The five noises: εx, εy, εα of the motion, εβ, εr of the readings."""
 
 
 _SYMBOLS = dict(zip(CHANNELS, ("σx", "σy", "σα", "σβ", "σr"), strict=True))
@@ -53,14 +53,14 @@ class Finding(NamedTuple):
     """The result of one test on one noise."""
 
     cause: str
+    #: Two-sided, not adjusted for other tests.
     p_value: float
-    """Two-sided, not adjusted for other tests."""
+    #: Estimate of the relative change in NEES; ranks findings.
     impact: float
-    """Estimate of the relative change in NEES; ranks findings."""
+    #: Whether it is large enough to change NEES.
     matters: bool
-    """Whether it is large enough to change NEES."""
+    #: What is wrong, to follow "because".
     text: str
-    """What is wrong, to follow "because"."""
 
 
 def noise_findings(sums: Array) -> list[Finding]:
@@ -213,14 +213,14 @@ def _kurtosis_score(kurtosis: float, n: float) -> float:
     return float((1 - 2 / (9 * a) - np.cbrt(cube)) / np.sqrt(2 / (9 * a)))
 
 
+#: Sums over w, the standardised noise of a channel in a run: 1, w, w², w³, w⁴, and g w,
+#: g², where a bias b adds b g: g = d/σx along, so that b is a scale, else 1/σ. That of
+#: d which has no noise counts, odometry or true distance. The last two are the number
+#: of pairs of successive steps, of the same landmark, and the sum of w w' over them.
 MOMENTS = (
     *("count", "first", "second", "third", "fourth"),
     *("slope", "leverage", "pairs", "lagged"),
 )
-"""Sums over w, the standardised noise of a channel in a run: 1, w, w², w³, w⁴, and
-g w, g², where a bias b adds b g: g = d/σx along, so that b is a scale, else 1/σ. That
-of d which has no noise counts, odometry or true distance. The last two are the number
-of pairs of successive steps, of the same landmark, and the sum of w w' over them."""
 _ROUNDING = 1e-9
 _LEAST_STD = 1e-6  # in place of 0, where the world has noise
 
@@ -232,8 +232,8 @@ class _Noise(NamedTuple):
     std: Array | float
     lever: Array | float
     runs: IntArray
+    #: Whether a number, but the first, is of the step after that of the one before.
     follows: BoolArray
-    """Whether a number, but the first, is of the step after that of the one before."""
 
 
 def noise_sums(

@@ -20,10 +20,10 @@ from ..estimator.support.argument_checks import as_floats
 class Alignment(NamedTuple):
     """A rigid motion of the plane, e ↦ C(φ) e + c."""
 
+    #: φ, counter-clockwise, in [-π, π] [rad].
     angle: float
-    """φ, counter-clockwise, in [-π, π] [rad]."""
+    #: c, shape (2,) [m].
     translation: Array
-    """c, shape (2,) [m]."""
 
     def apply(self, positions: Array) -> Array:
         """Move positions, shape (n, 2)."""
@@ -35,12 +35,12 @@ class Alignment(NamedTuple):
 class PositionAccuracy(NamedTuple):
     """Distances between estimated and true positions, raw and aligned."""
 
+    #: Shape (n,) [m].
     raw_errors: Array
-    """Shape (n,) [m]."""
+    #: Shape (n,) [m].
     aligned_errors: Array
-    """Shape (n,) [m]."""
+    #: The motion that takes the estimate onto the truth.
     alignment: Alignment
-    """The motion that takes the estimate onto the truth."""
 
     @property
     def raw_rmse(self) -> float:
@@ -56,10 +56,10 @@ class PositionAccuracy(NamedTuple):
 class LandmarkDistances(NamedTuple):
     """Distance of each landmark estimate to its ground truth."""
 
+    #: ‖e‖, shape (n,) [m].
     euclidean: Array
-    """‖e‖, shape (n,) [m]."""
+    #: sqrt(eᵀ P⁻¹ e), shape (n,): the same distance in standard deviations.
     mahalanobis: Array
-    """sqrt(eᵀ P⁻¹ e), shape (n,): the same distance in standard deviations."""
 
 
 def align_positions(estimate: ArrayLike, truth: ArrayLike) -> Alignment:

@@ -532,14 +532,14 @@ def first_poses(name: str, poses: ArrayLike, count: int) -> Array:
 class BatchTrace(NamedTuple):
     """The belief of every run about its pose, after every step; B runs, T steps."""
 
+    #: (x, y, θ), shape (B, T, 3) [m, m, rad], heading in [-π, π).
     poses: Array
-    """(x, y, θ), shape (B, T, 3) [m, m, rad], heading in [-π, π)."""
+    #: Shape (B, T, 3, 3).
     pose_covariances: Array
-    """Shape (B, T, 3, 3)."""
+    #: νᵀ S⁻¹ ν of each scan, shape (B, T).
     nis: Array
-    """νᵀ S⁻¹ ν of each scan, shape (B, T)."""
+    #: Of the NIS, shape (B, T).
     degrees_of_freedom: IntArray
-    """Of the NIS, shape (B, T)."""
 
     @classmethod
     def empty(cls, runs: int, steps: int) -> BatchTrace:
@@ -555,12 +555,12 @@ class BatchTrace(NamedTuple):
 class BatchBeliefs(NamedTuple):
     """The present belief of every run; the states are (x, y, θ, l0x, l0y, …)."""
 
+    #: Shape (B, 3 + 2L), landmarks by id, zeros where not mapped; θ in [-π, π).
     means: Array
-    """Shape (B, 3 + 2L), landmarks by id, zeros where not mapped; θ in [-π, π)."""
+    #: Of the additive error, shape (B, 3 + 2L, 3 + 2L), zeros where not mapped.
     covariances: Array
-    """Of the additive error, shape (B, 3 + 2L, 3 + 2L), zeros where not mapped."""
+    #: Which landmarks are in the map, shape (B, L).
     mapped: BoolArray
-    """Which landmarks are in the map, shape (B, L)."""
 
     @classmethod
     def of(cls, beliefs: Sequence[Belief], landmarks: int) -> BatchBeliefs:
@@ -610,12 +610,12 @@ class BatchStorage(NamedTuple):
     Entries beyond the mapped landmarks are arbitrary.
     """
 
+    #: Shape (B, capacity): (x, y, θ), then the landmarks by slot; θ is not wrapped.
     means: Array
-    """Shape (B, capacity): (x, y, θ), then the landmarks by slot; θ is not wrapped."""
+    #: Of the additive error, shape (B, capacity, capacity).
     covariances: Array
-    """Of the additive error, shape (B, capacity, capacity)."""
+    #: Shape (B, L): landmark i has column 3 + 2 slots[i]; -1 where not mapped.
     slots: IntArray
-    """Shape (B, L): landmark i has column 3 + 2 slots[i]; -1 where not mapped."""
 
     @classmethod
     def of(cls, means: Array, covariances: Array, slots: IntArray) -> BatchStorage:

@@ -44,10 +44,10 @@ from .gaussian_map import (
 class MapFilter:
     """A filter without its steps: reset, belief, saved state, map editing."""
 
+    #: The belief, in the arrays that steps change.
     map: GaussianMap
-    """The belief, in the arrays that steps change."""
+    #: What distinguishes this filter's updates from another's.
     rules: Rules
-    """What distinguishes this filter's updates from another's."""
 
     __repr__ = describe_filter
 
@@ -244,8 +244,8 @@ class EkfSlam(MapFilter):
     _linearisation: ClassVar[int] = AT_ESTIMATE
     _frame: ClassVar[int] = ADDITIVE
 
+    #: The kernel: screen, correct, add new landmarks.
     _update_map: ClassVar[UpdateKernel] = staticmethod(update_map)
-    """The kernel: screen, correct, add new landmarks."""
 
     def __init__(
         self,
@@ -562,10 +562,10 @@ def _gate(probability: float | None) -> float:
 class MotionNoise(NamedTuple):
     """Variances of the motion noise, and whether it acts on a robot at rest."""
 
+    #: (σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²].
     variance: Array
-    """(σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²]."""
+    #: False: odometry of exactly (0, 0) adds no noise.
     at_rest: bool = True
-    """False: odometry of exactly (0, 0) adds no noise."""
 
     @classmethod
     def checked(cls, motion_std: ArrayLike, noise_at_rest: bool) -> MotionNoise:

@@ -53,8 +53,8 @@ from .landmark_merging import coincide
 set_attribute = object.__setattr__  # of frozen dataclasses
 FIRST_LANDMARKS = FIRST_READINGS = 8  # that a new map has room for
 
+#: Takes block, readings and ids in; returns the status.
 UpdateKernel = Callable[..., int]
-"""Takes block, readings and ids in; returns the status."""
 
 
 class GaussianMap:
@@ -83,10 +83,10 @@ class GaussianMap:
     ({7: 0}, array([2., 0.]))
     """
 
+    #: The memory, as kernels take it.
     block: Array
-    """The memory, as kernels take it."""
+    #: Its parts by name.
     parts: Parts
-    """Its parts by name."""
     _slots: dict[int, int]
     _last: Callable[[], ScanReport | None]
 
@@ -351,13 +351,13 @@ class GaussianMap:
         self.hold(BeliefArrays(*saved), np.asarray(state["landmark_ids"]).tolist())
 
 
+#: What a saved map must be.
 MAP_STATE: Table = {
     "landmark_ids": (IDS, "n"),
     "mean": (NUMBERS, "3+2n"),
     "covariance": (COVARIANCE, "3+2n", "3+2n"),
     "reference": (NUMBERS, "3+2n"),
 }
-"""What a saved map must be."""
 
 
 def without_landmarks(array: Array, slots: Iterable[int]) -> Array:

@@ -455,8 +455,8 @@ class Rules(NamedTuple):
 
 
 ITERATIONS = Rules._fields.index("iterations")
+#: Column of the first of the four standard deviations of a reading in the rules.
 FIRST_STD = Rules._fields.index("bearing_std")
-"""Column of the first of the four standard deviations of a reading in the rules."""
 AFTER_STDS = Rules._fields.index("min_range")
 
 

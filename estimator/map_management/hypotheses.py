@@ -36,23 +36,23 @@ from ..support.undo import (
 from .managed_slam import ManagedSlam
 from .policy import LandmarkPolicy, as_policy
 
+#: Cost, the hypothesis that it continues, and what completes the association.
 Option = tuple[float, int, Callable[[], ScanAssociation]]
-"""Cost, the hypothesis that it continues, and what completes the association."""
 
+#: Hypotheses e^20 times less probable than the best one are discarded.
 SPREAD = 40.0
-"""Hypotheses e^20 times less probable than the best one are discarded."""
 
+#: Associations tried in a scan, for each hypothesis kept.
 TRIED = 4
-"""Associations tried in a scan, for each hypothesis kept."""
 
+#: Most hypotheses whose poses overlap.
 PER_BASIN = 3
-"""Most hypotheses whose poses overlap."""
 
+#: Least variance of a pose that counts [m², rad²].
 NIL = 1e-12
-"""Least variance of a pose that counts [m², rad²]."""
 
+#: Two poses overlap up to this Bhattacharyya distance in every coordinate.
 OVERLAP = 0.5
-"""Two poses overlap up to this Bhattacharyya distance in every coordinate."""
 
 
 def manage(
@@ -73,8 +73,8 @@ def manage(
 class Hypothesis:
     """One sequence of associations, and the filter that has followed it."""
 
+    #: −2 ln of its probability, relative to the best hypothesis.
     cost: float
-    """−2 ln of its probability, relative to the best hypothesis."""
     slam: ManagedSlam
 
 

@@ -24,24 +24,24 @@ from ...arrays import Array, BoolArray, IntArray
 from ..association.constellations import Constellations, TwoPlaces, match_constellations
 from ..interface import MapView
 
+#: Landmarks that are the same: (kept, gone).
 Pairs = list[tuple[int, int]]
-"""Landmarks that are the same: (kept, gone)."""
 
+#: Landmarks count as local within this many times the reach of the readings.
 LOCAL_REACH = 3.0
-"""Landmarks count as local within this many times the reach of the readings."""
+#: Largest χ² of the offset of two landmarks that may be the same; 2 degrees.
 OFFSET_GATE = 25.0
-"""Largest χ² of the offset of two landmarks that may be the same; 2 degrees."""
+#: Largest χ² of the offset of two landmarks that are the same; 2 degrees, 99 %.
 SAME_GATE = 9.21
-"""Largest χ² of the offset of two landmarks that are the same; 2 degrees, 99 %."""
+#: Landmarks around the robot are those more certain than this times lost ones.
 LOCAL_STD = 0.5
-"""Landmarks around the robot are those more certain than this times lost ones."""
+#: An offset is accurate if its σ is less than this times that of lost landmarks.
 ACCURATE = 0.25
-"""An offset is accurate if its σ is less than this times that of lost landmarks."""
+#: How many σ beyond the reach of a reading its landmark may be.
 NEAR_STDS = 10.0
-"""How many σ beyond the reach of a reading its landmark may be."""
 TURN_STDS = 4.0
+#: The heading may be wrong by this number of σ, and by this angle [rad].
 SLACK = 0.2
-"""The heading may be wrong by this number of σ, and by this angle [rad]."""
 
 
 class LoopCloser:

@@ -178,6 +178,7 @@ class MapPruner:
         vars(self._records).update(saved)
 
 
+#: What a saved state holds about the landmarks of a map.
 RECORDS: saved_states.Table = {
     "ids": (saved_states.IDS, "n"),
     "sightings": (saved_states.COUNTS, "n"),
@@ -187,7 +188,6 @@ RECORDS: saved_states.Table = {
     "aliases": (saved_states.WHOLE, -1, 2),
     "doubtful": (saved_states.IDS, -1),
 }
-"""What a saved state holds about the landmarks of a map."""
 
 
 class LandmarkMerger:

@@ -280,6 +280,7 @@ def _drop_contradicted(
 # One of the last scans of a run, kept so that it can be repeated.
 
 MOTIONS = (saved_states.NUMBERS, -1, 3)
+#: What the saved state of a scan holds, beside the state of the filter.
 SCAN: saved_states.Table = {
     "number": (saved_states.COUNTS,),
     "motions": MOTIONS,
@@ -289,14 +290,13 @@ SCAN: saved_states.Table = {
     "removed": (saved_states.WHOLE, -1),
     "merged": (saved_states.WHOLE, -1, 2),
 }
-"""What the saved state of a scan holds, beside the state of the filter."""
+#: What a saved state holds about the last scans, beside these.
 WINDOW: saved_states.Table = {"motions": MOTIONS, "count": (saved_states.COUNTS,)}
-"""What a saved state holds about the last scans, beside these."""
 
 NO_LANDMARK = np.iinfo(np.int64).min
 
+#: (d, α) [m, rad] and dt.
 Motion = tuple[float, float, float]
-"""(d, α) [m, rad] and dt."""
 
 
 @dataclass(frozen=True)
@@ -305,18 +305,18 @@ class RecentScan:
 
     number: int
     motions: tuple[Motion, ...]
+    #: Rows (β, r), shape (m, 2).
     readings: Array
-    """Rows (β, r), shape (m, 2)."""
+    #: Landmark of each row, None where the filter does not use it.
     row_ids: tuple[int | None, ...]
-    """Landmark of each row, None where the filter does not use it."""
+    #: Label of the tentative landmark of each row, or `NO_LABEL`.
     labels: tuple[int, ...]
-    """Label of the tentative landmark of each row, or `NO_LABEL`."""
+    #: State of the filter before the scan, where a tentative landmark begins in it.
     before: Mapping[str, Any] | None = None
-    """State of the filter before the scan, where a tentative landmark begins in it."""
+    #: Landmarks removed after it.
     removed: tuple[int, ...] = ()
-    """Landmarks removed after it."""
+    #: Landmarks merged after it: (kept, gone).
     merged: tuple[tuple[int, int], ...] = ()
-    """Landmarks merged after it: (kept, gone)."""
 
     @property
     def begins(self) -> bool:

@@ -11,25 +11,25 @@ import numpy as np
 from ...arrays import LARGEST_IN_STATE, Array, IntArray
 from .argument_checks import as_floats, identities
 
+#: Tolerance of a negative eigenvalue, relative to the trace, or to 1 if it is less.
 ROUNDING = 1e-9
-"""Tolerance of a negative eigenvalue, relative to the trace, or to 1 if it is less."""
 
 
+#: A length, or a letter for one: "n", or "3+2n" for 3 + 2n.  Its first use sets it.
 Size = int | str
-"""A length, or a letter for one: "n", or "3+2n" for 3 + 2n.  Its first use sets it."""
 
 
 class Kind(NamedTuple):
     """What the numbers of an entry are."""
 
+    #: As they are saved.
     dtype: type[np.generic]
-    """As they are saved."""
+    #: Returns a copy of a value by its name and shape, or refuses it.
     checked: Callable[[str, Any, tuple[int, ...]], Any]
-    """Returns a copy of a value by its name and shape, or refuses it."""
 
 
+#: The kind and the shape of each entry of a state, in the order of the checks.
 Table = Mapping[str, tuple[Kind, *tuple[Size, ...]]]
-"""The kind and the shape of each entry of a state, in the order of the checks."""
 
 
 def read(

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _LOG, _SCENARIO = "a log", "a scenario"
 _ONE_RUN, _MANY_RUNS = "one run of a scenario", "a scenario with --runs above 1"
+#: Parameters that have an effect on one kind of study alone.
 _ONLY_FOR = {
     _LOG: (
         *("motion_std", "measurement_std", "initial_pose_std"),
@@ -36,7 +37,6 @@ _ONLY_FOR = {
     _ONE_RUN: ("controller",),
     _MANY_RUNS: ("change", "jobs"),
 }
-"""Parameters that have an effect on one kind of study alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,21 +129,21 @@ class Results(NamedTuple):
     """The results of a noise study."""
 
     rows: "Sequence[NoiseRow] | Sequence[NoiseEffect]"
+    #: Of the rows in the summary; empty where they have none.
     titles: Sequence[str]
-    """Of the rows in the summary; empty where they have none."""
     figure: "Figure"
     dpi: int
+    #: What to print, one below the other.
     shown: Sequence[Any]
-    """What to print, one below the other."""
 
 
 class Study(NamedTuple):
     """A noise study to run and to write."""
 
+    #: Of its folder, by default.
     names: tuple[str, str]
-    """Of its folder, by default."""
+    #: The head of its summary.
     about: dict[str, Any]
-    """The head of its summary."""
     run: Callable[[Reporter], Results]
 
 

@@ -309,8 +309,8 @@ def _known(value: float) -> str:
 # --------------------------------------------------------------------------------------
 # The events of a log: odometry rows, and scans of simultaneous readings.
 
+#: The true id of a reading that is of no landmark.
 NO_LANDMARK = -1
-"""The true id of a reading that is of no landmark."""
 
 
 @dataclass(frozen=True)

@@ -233,6 +233,7 @@ def _bad_run(summary: dict[str, Any]) -> str:
     )
 
 
+#: CSS variables that the page must define, by the colours of the figures.
 COLOUR_VARIABLES = {
     INK: "--ink",
     "#000000": "--ink",
@@ -246,7 +247,6 @@ COLOUR_VARIABLES = {
     SKY: "--sky",
     ALARM: "--alarm",
 }
-"""CSS variables that the page must define, by the colours of the figures."""
 
 
 def inline_svg(figure: Figure, name: str, description: str) -> str:

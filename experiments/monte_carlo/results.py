@@ -275,8 +275,8 @@ class BlockFolder(NamedTuple):
     """The blocks of a job in its folder, which `opened` makes, checks and locks."""
 
     path: Path
+    #: Of the job.
     digest: str
-    """Of the job."""
 
     def missing(self, blocks: Iterable[range]) -> list[range]:
         """Return the blocks that are still to be computed; warn of a damaged one."""
@@ -480,13 +480,13 @@ class Job(NamedTuple):
     """What is computed, except for the number of runs."""
 
     scenario: Scenario
+    #: The scenario whose noise the estimators assume.
     assumed: Scenario
-    """The scenario whose noise the estimators assume."""
     estimators: tuple[EstimatorChoice, ...]
     seed: int
     block_size: int
+    #: True landmarks nearer to each other count as one place [m].
     resolution: float = 0.0
-    """True landmarks nearer to each other count as one place [m]."""
 
     @property
     def variables(self) -> dict[str, Variable]:

@@ -39,10 +39,10 @@ NOISE_SIZES = {"noise": len(CHANNELS), "moment": len(MOMENTS)}
 class Variable(NamedTuple):
     """One variable of the results."""
 
+    #: Dimensions other than ``estimator``.
     dims: tuple[str, ...]
-    """Dimensions other than ``estimator``."""
+    #: numpy kind: f8, i8, ?, or U for text.
     kind: str
-    """numpy kind: f8, i8, ?, or U for text."""
     meaning: str
 
 
@@ -95,8 +95,8 @@ MAPS = ("raw", "aligned")
 
 PREFIX = "association_"
 
+#: Followed by the error frame.
 KNOWN_IDS_NEES = "known_ids_nees"
-"""Followed by the error frame."""
 
 _ASSOCIATION: dict[str, str] = {
     **{f"{PREFIX}{name}": f"{name.replace('_', ' ')}, see docs" for name in COUNTS},
@@ -110,6 +110,7 @@ _ASSOCIATION: dict[str, str] = {
     KNOWN_IDS_ATE: "path error of the same filter with known identities, raw [m]",
 }
 
+#: Those of a world that hides identities; nan where unknown.
 HIDDEN_VARIABLES: dict[str, Variable] = {
     **VARIABLES,
     **{name: Variable(RUN, "f8", meaning) for name, meaning in _ASSOCIATION.items()},
@@ -118,9 +119,10 @@ HIDDEN_VARIABLES: dict[str, Variable] = {
         for frame in ERROR_FRAMES
     },
 }
-"""Those of a world that hides identities; nan where unknown."""
 
 
+#: Of runs that were repeated with less noise to find the cause of an inconsistency; in
+#: the results, but in no block, if there are any.
 SMALL_NOISE: dict[str, Variable] = {
     **{
         f"small_noise_nees_{frame}": Variable(
@@ -131,8 +133,6 @@ SMALL_NOISE: dict[str, Variable] = {
     "small_noise_heading_nees": Variable(RUN, "f8", "mean NEES of the heading"),
     "small_noise_factor": Variable(RUN, "f8", "of all noise, nan if not repeated"),
 }
-"""Of runs that were repeated with less noise to find the cause of an inconsistency; in
-the results, but in no block, if there are any."""
 
 
 def variables_of(scenario: Scenario) -> dict[str, Variable]:
@@ -345,8 +345,8 @@ def by_id(values: Array, ids: list[int], count: int) -> Array:
     return rows
 
 
+#: Path error above that with known identities [m].
 MARGIN = 1.0
-"""Path error above that with known identities [m]."""
 
 SHARES = ("precision", "recall")
 

@@ -51,10 +51,10 @@ if TYPE_CHECKING:
 
 
 BLOCK_SIZE = 64
+#: Factors of all noise; the second is used if the first decides nothing.
 LESS_NOISE = 0.1, SMALLEST_NOISE
-"""Factors of all noise; the second is used if the first decides nothing."""
+#: Attribute of results, but of no file: share of the time for runs with less noise.
 SMALL_NOISE_SHARE = "small_noise_share"
-"""Attribute of results, but of no file: share of the time for runs with less noise."""
 EACH_RUN = "estimator", "run"
 _MOST_BYTES, _BYTES_OF_READING = 2**28, 17
 

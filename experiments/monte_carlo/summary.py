@@ -230,8 +230,8 @@ def _unused_readings(scores: EstimatorScores) -> float | None:
 Entry = dict[str, Any]
 Computation = Callable[[EstimatorScores], float | None]
 
+#: In place of a number that is unknown.
 NOTHING = "–"
-"""In place of a number that is unknown."""
 _LEAST_BOUND = math.radians(0.1)  # of a heading that is shown
 
 
@@ -291,14 +291,14 @@ def _with_error(found: dict[str, Any]) -> str:
 class Measure(NamedTuple):
     """A number of one estimator: its computation, and its row in tables."""
 
+    #: Its keys in the entry of an estimator, joined by dots.
     path: str
-    """Its keys in the entry of an estimator, joined by dots."""
+    #: None for a part of an entry that is computed as a whole.
     compute: Computation | None = None
-    """None for a part of an entry that is computed as a whole."""
+    #: Title of its row; tables omit a measure without one.
     name: str = ""
-    """Title of its row; tables omit a measure without one."""
+    #: Value of a consistent filter, or lower bound; else empty.
     right: str = ""
-    """Value of a consistent filter, or lower bound; else empty."""
     write: Callable[[Any], str] = number
 
     def of(self, entry: Entry) -> str:
@@ -362,6 +362,7 @@ def _declared(frame: ErrorFrame) -> list[Measure]:
     # fmt: on
 
 
+#: Rows of a world that hides identities, of :func:`association_summary`.
 _ASSOCIATION: tuple[tuple[Any, ...], ...] = (
     ("median_ate.hidden", "path (ATE), median run, raw [m]"),
     ("median_ate.known", "… with known identities [m]"),
@@ -380,7 +381,6 @@ _ASSOCIATION: tuple[tuple[Any, ...], ...] = (
     ("recall", "recall", "1", share),
     ("bad_runs.count", "bad runs of {runs}", "0", str),
 )
-"""Rows of a world that hides identities, of :func:`association_summary`."""
 
 
 def measures(summary: dict[str, Any]) -> list[Measure]:

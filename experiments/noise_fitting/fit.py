@@ -51,8 +51,8 @@ from .search import (
     with_noise,
 )
 
+#: Of the gate of the fit, as an option of filters.
 GATE_PROBABILITY = float(-np.expm1(-GATE / 2))
-"""Of the gate of the fit, as an option of filters."""
 
 
 class Fitted(NamedTuple):
@@ -60,13 +60,13 @@ class Fitted(NamedTuple):
 
     settings: FilterSettings
     log_likelihood: float
+    #: Readings beyond the gate.
     rejected: int
-    """Readings beyond the gate."""
+    #: Of the innovations in bearing and in range.
     whiteness: tuple[Whiteness, Whiteness]
-    """Of the innovations in bearing and in range."""
+    #: Of the readings, each by its own standard deviation, (M, 2); nan for the first of
+    #: each landmark.
     innovations: Array
-    """Of the readings, each by its own standard deviation, (M, 2); nan for the first of
-    each landmark."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,24 +74,24 @@ class NoiseFit:
     """The noise of a log."""
 
     log: SlamLog
+    #: The standard deviations that were fitted.
     noise: tuple[FittedNoise, ...]
-    """The standard deviations that were fitted."""
     before: Fitted
+    #: With the most likely noise.
     fitted: Fitted
-    """With the most likely noise."""
+    #: The same, the noise of the sensor inflated where innovations are not white; where
+    #: all are white, it is `fitted` itself.
     suggested: Fitted
-    """The same, the noise of the sensor inflated where innovations are not white; where
-    all are white, it is `fitted` itself."""
+    #: The factor of the sensor's noise at which the pose NEES is 1 per degree of
+    #: freedom; None if the truth is unknown.
     calibration: Calibration | None
-    """The factor of the sensor's noise at which the pose NEES is 1 per degree of
-    freedom; None if the truth is unknown."""
+    #: Shape (M,).
     reading_times: Array
-    """Shape (M,)."""
     readings: int
+    #: Number of times that the log was filtered.
     passes: int
-    """Number of times that the log was filtered."""
+    #: Whether a filter associated the readings; they have its identities in `log`.
     is_associated: bool = False
-    """Whether a filter associated the readings; they have its identities in `log`."""
 
 
 def fit_noise(
@@ -212,10 +212,10 @@ FACTORS = np.geomspace(0.25, 16.0, 19)
 class Calibration(NamedTuple):
     """The factor of the sensor's noise at which the pose NEES is as expected."""
 
+    #: 0 or infinity if none of `FACTORS` is small or large enough; likewise below.
     factor: float
-    """0 or infinity if none of `FACTORS` is small or large enough; likewise below."""
+    #: Of its 95 % interval.
     low: float
-    """Of its 95 % interval."""
     high: float
 
 
@@ -326,12 +326,12 @@ SIGNIFICANT = 0.01
 class Whiteness(NamedTuple):
     """The correlation in time of innovations, scan by scan and for each landmark."""
 
+    #: Of two Ljung-Box tests, the smaller one twice; nan for too few innovations.
     p_value: float
-    """Of two Ljung-Box tests, the smaller one twice; nan for too few innovations."""
+    #: Correlation of one innovation of a landmark with its next.
     first: float
-    """Correlation of one innovation of a landmark with its next."""
+    #: Suggested factor of the standard deviation, 1 for white ones.
     inflation: float
-    """Suggested factor of the standard deviation, 1 for white ones."""
 
 
 def whiteness(events: DriveEvents, record: DriveRecord) -> tuple[Whiteness, Whiteness]:

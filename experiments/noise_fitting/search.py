@@ -44,8 +44,8 @@ FACTORS = 4.0 ** np.arange(-3, 3)  # of motion and of sensor noise, tried at the
 BEARING, RANGE, PER_METRE, IN_METRES = 3, 4, 5, 6  # columns of the sensor's noise
 
 
+#: Entries of the sensor's noise, and those that can replace them.
 NEEDLESS = ((PER_METRE, RANGE), (IN_METRES, BEARING))
-"""Entries of the sensor's noise, and those that can replace them."""
 EXACT = 1e-6  # [rad, m] below which readings have no noise
 WORTH = 3.0  # by which a part of σβ in metres must raise the log likelihood (p = .014)
 PLAIN = 0.15  # standard deviation of log σ below which it is certainly not zero
@@ -58,22 +58,22 @@ class FittedNoise(NamedTuple):
     unit: str
     before: float
     value: float
+    #: Of its 95 % interval.
     low: float
-    """Of its 95 % interval."""
     high: float
+    #: Fitted; zero: the interval begins at zero; unknown: nothing depends on it.
     verdict: Verdict
-    """Fitted; zero: the interval begins at zero; unknown: nothing depends on it."""
 
 
 class _Fit(NamedTuple):
     """A noise during the search."""
 
+    #: Shape (7,).
     noise: Array
-    """Shape (7,)."""
+    #: Which entries are fitted, shape (7,); the others are zero.
     free: BoolArray
-    """Which entries are fitted, shape (7,); the others are zero."""
+    #: Its logarithm.
     likelihood: float
-    """Its logarithm."""
     converged: bool
     passes: int
 
@@ -81,8 +81,8 @@ class _Fit(NamedTuple):
 class Found(NamedTuple):
     """The most likely noise."""
 
+    #: Shape (7,).
     noise: Array
-    """Shape (7,)."""
     table: tuple[FittedNoise, ...]
     passes: int
 
@@ -273,6 +273,7 @@ def _refuse_exact(noise: Array, typical_range: float) -> None:
             )
 
 
+#: Name and unit of each standard deviation; of a motion, per unit of the log's time.
 ENTRIES = (
     ("σx", "m"),
     ("σy", "m"),
@@ -282,7 +283,6 @@ ENTRIES = (
     ("σr per metre", "m/m"),
     ("σβ in metres", "m"),
 )
-"""Name and unit of each standard deviation; of a motion, per unit of the log's time."""
 
 SMALL = 0.1  # share of its neighbours at which the search for a zero begins
 
@@ -350,15 +350,15 @@ class LogLikelihood:
     many landmarks is therefore cut into parts, and each begins with an empty map.
     """
 
+    #: At its start.
     filter: EkfSlam
-    """At its start."""
     events: DriveEvents
     gate: float = GATE
     threads: int | None = None
+    #: Of one part.
     most_landmarks: int = MOST_LANDMARKS
-    """Of one part."""
+    #: The parts, if they are given.
     stretches: Sequence[Stretch] = ()
-    """The parts, if they are given."""
 
     @cached_property
     def parts(self) -> tuple[DriveEvents, ...]:

@@ -25,14 +25,14 @@ from .trace import finite
 class SmoothedLog:
     """A log, filtered and smoothed."""
 
+    #: The filter's run, whose associations the smoother has.
     filtered: Replay
-    """The filter's run, whose associations the smoother has."""
+    #: All poses at scans and all landmarks, given the whole log.
     drive: SmoothedDrive
-    """All poses at scans and all landmarks, given the whole log."""
+    #: The pose after every step of the log, shape (K + 1, 3) [m, m, rad].
     poses: Array
-    """The pose after every step of the log, shape (K + 1, 3) [m, m, rad]."""
+    #: Step of each pose of the drive, shape (N,).
     scan_steps: IntArray
-    """Step of each pose of the drive, shape (N,)."""
 
     @property
     def log(self) -> SlamLog:

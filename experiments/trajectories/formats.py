@@ -40,21 +40,21 @@ from .trajectory import (
 class TrajectoryFormat(NamedTuple):
     """What a module of this package defines."""
 
+    #: Writes a shard: (trajectories, path), and its options by name. The same
+    #: trajectories give the same bytes.
     write: Callable[..., None]
-    """Writes a shard: (trajectories, path), and its options by name. The same
-    trajectories give the same bytes."""
+    #: Yields the trajectories of a shard, one after the other.
     read: Callable[[Path], Iterator[Trajectory]]
-    """Yields the trajectories of a shard, one after the other."""
+    #: Raises a ValueError for a scenario that the format cannot hold.
     check: Callable[[Scenario], None] = lambda scenario: None
-    """Raises a ValueError for a scenario that the format cannot hold."""
+    #: The ending of the names of its shards.
     ENDING: str = ""
-    """The ending of the names of its shards."""
+    #: The packages besides numpy that write it; their versions determine the bytes.
     LIBRARIES: tuple[str, ...] = ()
-    """The packages besides numpy that write it; their versions determine the bytes."""
+    #: Names and defaults of the numbers > 0 that its `write` also takes.
     OPTIONS: Mapping[str, float] = {}
-    """Names and defaults of the numbers > 0 that its `write` also takes."""
+    #: Whether it writes and reads the beliefs of a filter too.
     HOLDS_BELIEFS: bool = False
-    """Whether it writes and reads the beliefs of a filter too."""
 
 
 def trajectory_format(name: str) -> TrajectoryFormat:
@@ -418,6 +418,7 @@ def _scans(log: slamlog.SlamLog) -> Iterator[slamlog.Scan]:
     return (event for event in log.events if isinstance(event, slamlog.Scan))
 
 
+#: The formats, or the modules that define them and load a library.
 FORMATS = {
     "slamlog": TrajectoryFormat(_write_slamlog, _read_slamlog),
     "npz": TrajectoryFormat(_write_npz, _read_npz, ENDING=".npz", HOLDS_BELIEFS=True),
@@ -426,4 +427,3 @@ FORMATS = {
     "tum": TrajectoryFormat(_write_tum, _read_tum),
     "g2o": "g2o",
 }
-"""The formats, or the modules that define them and load a library."""

@@ -31,9 +31,9 @@ from .formats import filtered_path, numbers, read_metadata, write_lines, write_m
 from .trajectory import Trajectory, array_of
 
 LIBRARIES = ("numba", "scipy")
+#: The smallest standard deviation in the files [m, rad]: noise of zero would have
+#: infinite information, and optimisers do not converge with 1e-6.
 OPTIONS = {"smallest_std": 1e-3}
-"""The smallest standard deviation in the files [m, rad]: noise of zero would have
-infinite information, and optimisers do not converge with 1e-6."""
 
 
 def check(scenario: Scenario) -> None:

@@ -234,9 +234,9 @@ class MadeShard(NamedTuple):
 
     entry: ShardEntry
     path: Path
+    #: Content of its files by their relative paths ("." for a shard that is one file);
+    #: None if the shard stands in the staging folder of the job.
     files: dict[str, bytes] | None = None
-    """Content of its files by their relative paths ("." for a shard that is one file);
-    None if the shard stands in the staging folder of the job."""
 
 
 @dataclass(frozen=True)

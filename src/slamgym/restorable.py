@@ -4,8 +4,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+#: What `Restorable.state` returns; it stays as it is, whatever the object does.
 State = tuple[Any, ...]
-"""What `Restorable.state` returns; it stays as it is, whatever the object does."""
 
 
 class Restorable:
