@@ -15,13 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
+from .models import rigid_motion
 from .models.bearing_range import wrap_angle
-from .models.rigid_motion import (
-    ErrorFrame,
-    additive_error,
-    invariant_covariance,
-    invariant_error,
-)
 from .support.undo import Undo, to_the_end, undo_all, undone_on_error
 
 __all__ = [
@@ -171,7 +166,7 @@ class Belief:
     #: Given as any sequence or array, kept as a tuple.
     landmark_ids: tuple[int, ...]
     #: Coordinates in which the filter takes its error to be Gaussian.
-    frame: ErrorFrame = "additive"
+    frame: rigid_motion.ErrorFrame = "additive"
 
     def __post_init__(self) -> None:
         mean = np.array(self.mean, dtype=np.float64).ravel()
@@ -199,7 +194,7 @@ class Belief:
         covariance: Array,
         slots: Mapping[int, int],
         landmark_ids: Sequence[int],
-        frame: ErrorFrame = "additive",
+        frame: rigid_motion.ErrorFrame = "additive",
     ) -> Belief:
         """Return the belief over the pose and some landmarks of a larger state.
 
@@ -268,13 +263,13 @@ class Belief:
                 f"(n, 2), got {np.shape(true_pose)} and {np.shape(true_landmarks)}"
             )
         if self._chosen(frame) == "invariant":
-            return invariant_error(truth, self.mean)
-        return additive_error(truth, self.mean)
+            return rigid_motion.invariant_error(truth, self.mean)
+        return rigid_motion.additive_error(truth, self.mean)
 
     def error_covariance(self, frame: str | None = None) -> Array:
         """Return the covariance (3 + 2n, 3 + 2n) that belongs to :meth:`error`."""
         if self._chosen(frame) == "invariant":
-            return invariant_covariance(self.mean, self.covariance)
+            return rigid_motion.invariant_covariance(self.mean, self.covariance)
         return self.covariance
 
     def __repr__(self) -> str:

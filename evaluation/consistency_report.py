@@ -16,21 +16,7 @@ from numpy.typing import ArrayLike
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.models.rigid_motion import ErrorFrame
 from ..estimator.support import argument_checks
-from .hypothesis_tests import (
-    EQUIVALENCE_MARGIN,
-    Band,
-    EquivalenceTest,
-    FamilyTest,
-    HypothesisTest,
-    bootstrap_test,
-    equivalence_test,
-    family_test,
-    final_step_test,
-    nis_test,
-    runs_to_detect,
-    time_average_test,
-    whiteness_test,
-)
+from . import hypothesis_tests as tests
 
 #: Number of runs below which the report warns that little can be shown.
 FEW_RUNS = 20
@@ -42,7 +28,7 @@ _LAGS = 10
 _ERROR_RATE = 0.05
 _MOST_NAMES = 10
 #: The outcome of a test without data.
-_NOTHING = HypothesisTest(np.nan, Band(np.nan, np.nan), np.nan, _ERROR_RATE)
+_NOTHING = tests.HypothesisTest(np.nan, tests.Band(np.nan, np.nan), np.nan, _ERROR_RATE)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -62,15 +48,15 @@ class ConsistencyReport:
     failed_runs: tuple[int, ...]
     #: Leading steps at which no run has a NEES, as at a start known for certain.
     undefined_steps: int
-    final_step: HypothesisTest
-    time_average: HypothesisTest
-    bootstrap: HypothesisTest
-    family: FamilyTest
+    final_step: tests.HypothesisTest
+    time_average: tests.HypothesisTest
+    bootstrap: tests.HypothesisTest
+    family: tests.FamilyTest
     #: Steps of the grid of ``family``.
     family_steps: IntArray
-    nis: HypothesisTest
-    whiteness: HypothesisTest
-    equivalence: EquivalenceTest
+    nis: tests.HypothesisTest
+    whiteness: tests.HypothesisTest
+    equivalence: tests.EquivalenceTest
     #: Mean of the runs' time averages.
     mean_ratio: float
     #: Median of the runs' time averages.
@@ -139,7 +125,7 @@ class ConsistencyReport:
     def sentences(self) -> tuple[str, ...]:
         """Return the warnings, then one sentence per test with its error rate."""
         frame, grid, near = f"{self.frame} frame", self.family, self.equivalence
-        low, high = EQUIVALENCE_MARGIN
+        low, high = tests.EQUIVALENCE_MARGIN
         needed = ", ".join(f"{factor:g}: {runs}" for factor, runs in self.runs_needed)
         innovations = (
             _sentence("NIS over all scans, χ²", "ratio", self.nis),
@@ -211,14 +197,16 @@ def evaluate_consistency(
         runs=len(failed),
         failed_runs=tuple(np.flatnonzero(failed).tolist()),
         undefined_steps=first,
-        final_step=final_step_test(scores[:, -1], dof),
-        time_average=time_average_test(averages, dof),
-        bootstrap=bootstrap_test(averages, dof, rng=rng),
-        family=family_test(scores[:, grid], dof),
+        final_step=tests.final_step_test(scores[:, -1], dof),
+        time_average=tests.time_average_test(averages, dof),
+        bootstrap=tests.bootstrap_test(averages, dof, rng=rng),
+        family=tests.family_test(scores[:, grid], dof),
         family_steps=grid + first,
-        nis=nis_test(scans, freedom) if has_nis else _NOTHING,
-        whiteness=whiteness_test(scans, freedom, lags=lags) if has_nis else _NOTHING,
-        equivalence=equivalence_test(averages, dof),
+        nis=tests.nis_test(scans, freedom) if has_nis else _NOTHING,
+        whiteness=tests.whiteness_test(scans, freedom, lags=lags)
+        if has_nis
+        else _NOTHING,
+        equivalence=tests.equivalence_test(averages, dof),
         mean_ratio=float(averages.mean() / dof),
         median_ratio=float(np.median(averages) / dof),
         share_above_3=float(np.mean(averages > 3 * dof)),
@@ -232,7 +220,7 @@ def _deciding_runs(ratios: Array) -> tuple[int, float]:
     """Return how many of the largest ratios lift the mean, and that of the others."""
     smallest = np.sort(ratios)
     means = np.cumsum(smallest) / np.arange(1, len(smallest) + 1)
-    inside = np.flatnonzero(means <= EQUIVALENCE_MARGIN.high)
+    inside = np.flatnonzero(means <= tests.EQUIVALENCE_MARGIN.high)
     kept = int(inside[-1]) + 1 if len(inside) else len(means)
     return len(means) - kept, float(means[kept - 1])
 
@@ -249,7 +237,7 @@ def assert_consistent(report: ConsistencyReport) -> None:
 
 @cache
 def _runs_needed(dof: int) -> tuple[tuple[float, int], ...]:
-    return tuple((factor, runs_to_detect(factor, dof)) for factor in FACTORS)
+    return tuple((factor, tests.runs_to_detect(factor, dof)) for factor in FACTORS)
 
 
 def _same_shape(
@@ -281,7 +269,7 @@ def _gaps(nees: Array, nis: Array, freedom: IntArray) -> tuple[int, BoolArray]:
     return first, failed
 
 
-def _sentence(title: str, name: str, test: HypothesisTest) -> str:
+def _sentence(title: str, name: str, test: tests.HypothesisTest) -> str:
     found = f"{title}: {name} {test.statistic:.3f}"
     if np.isnan(test.p_value):
         return f"{found}, nothing decided: too few runs, or all equal."

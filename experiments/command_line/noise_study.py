@@ -41,22 +41,22 @@ _ONLY_FOR = {
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseStudyOptions(options.Options):
-    """The options of ``slamgym noise-study``."""
+    """The options of ``slamgym noise-study``.
 
-    estimator: str = options.declared(
-        "invariant",
-        "--estimator -e NAME",
-        "A filter, as for replay; with --runs, several with commas between.",
-    )
-    runs: int = options.declared(
-        1, "", "For a scenario: with more than one, each change is a Monte Carlo."
-    )
-    change: str = options.declared(
-        "all",
-        "both|world|filter|all",
-        "With --runs: whether noises change in world and filter, in the world alone, "
-        "or in what the filter assumes.",
-    )
+    Attributes
+    ----------
+    estimator
+        A filter, as for replay; with --runs, several with commas between.
+    runs
+        For a scenario: with more than one, each change is a Monte Carlo.
+    change
+        With --runs: whether noises change in world and filter, in the world alone, or
+        in what the filter assumes.
+    """
+
+    estimator: str = options.declared("invariant", "--estimator -e NAME")
+    runs: int = options.declared(1, "")
+    change: str = options.declared("all", "both|world|filter|all")
 
 
 @program.command

@@ -22,18 +22,7 @@ from rich.text import Text
 from ...evaluation.consistency_report import FEW_AVERAGES
 from ...evaluation.diagnosis import p_text
 from ...sim_configs.atomic_file import replace_when_written
-from ..figures.style import (
-    ALARM,
-    BLUE,
-    GREY,
-    INK,
-    ORANGE,
-    PALE,
-    TEAL,
-    headings_and_key,
-    lay_out,
-    page_environment,
-)
+from ..figures import style
 from .figures import MOST_DOTS, PURPLE, SKY, grid_steps, report_figures
 from .runner import ASSUMED_FILE, python_call
 from .summary import NOTHING, measures, number, percent
@@ -71,7 +60,7 @@ def write_html_report(
 
 def html_report(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
     """Return the report's HTML; see :func:`write_html_report`."""
-    environment = page_environment(Path(__file__).parent, finalize=escaped)
+    environment = style.page_environment(Path(__file__).parent, finalize=escaped)
     entries = summary["estimators"]
     page = {
         "headline": headline(summary),
@@ -195,7 +184,7 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
         Result of ``summarise_monte_carlo``.
     """
     entries = summary["estimators"]
-    headings, key = headings_and_key(list(entries))
+    headings, key = style.headings_and_key(list(entries))
     note = "Averages over runs and steps; heading and RMSE are root mean squares."
     table = Table(
         title=Text(
@@ -235,17 +224,17 @@ def _bad_run(summary: dict[str, Any]) -> str:
 
 #: CSS variables that the page must define, by the colours of the figures.
 COLOUR_VARIABLES = {
-    INK: "--ink",
+    style.INK: "--ink",
     "#000000": "--ink",
-    GREY: "--grey",
-    PALE: "--pale",
+    style.GREY: "--grey",
+    style.PALE: "--pale",
     "#ffffff": "--paper",
-    BLUE: "--blue",
-    ORANGE: "--orange",
-    TEAL: "--teal",
+    style.BLUE: "--blue",
+    style.ORANGE: "--orange",
+    style.TEAL: "--teal",
     PURPLE: "--purple",
     SKY: "--sky",
-    ALARM: "--alarm",
+    style.ALARM: "--alarm",
 }
 
 
@@ -265,7 +254,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
         Text for screen readers.
     """
     buffer = io.StringIO()
-    lay_out(figure, 72)
+    style.lay_out(figure, 72)
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     svg = buffer.getvalue()

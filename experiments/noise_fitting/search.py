@@ -20,21 +20,8 @@ from ...estimator.filters.ekf import EkfSlam
 from ...estimator.kernels.drive_likelihood import DriveEvents, DriveRecord
 from ...estimator.kernels.kalman_gain import GATED
 from ..runs.filter_settings import FilterSettings
+from . import scoring
 from .intervals import NOT_ZERO, Verdict, intervals
-from .scoring import (
-    BETTER,
-    FAINT,
-    GREATEST,
-    Stretch,
-    maximise,
-    parts_of,
-    restricted,
-    sample_of,
-    scores,
-    stretches_of,
-    totals,
-    without_readings,
-)
 
 ROUNDS = 12  # of rejecting readings and fitting the others
 COARSE = 6  # iterations of a round after which readings are rejected anew
@@ -121,7 +108,7 @@ def most_likely_noise(likelihood: LogLikelihood, before: Array) -> Found:
     _refuse_diverged(found)
     _refuse_exact(found.noise, _typical_range(smooth))
     noise, at = found.noise, np.flatnonzero(chosen)
-    along = restricted(smooth.of, noise, at)
+    along = scoring.restricted(smooth.of, noise, at)
     judged = dict(
         zip(at.tolist(), intervals(along, noise[at], found.likelihood), strict=True)
     )
@@ -171,7 +158,7 @@ def _coarse_start(likelihood: LogLikelihood, start: Array, chosen: BoolArray) ->
             for b in FACTORS
         ]
     )
-    values = totals(likelihood.of(tried))
+    values = scoring.totals(likelihood.of(tried))
     if not np.isfinite(values).any():
         raise np.linalg.LinAlgError("the fit diverges: no noise explains the readings")
     best = int(np.argmax(values))
@@ -185,8 +172,8 @@ def _typical_range(likelihood: LogLikelihood) -> float:
 def _fit(smooth: LogLikelihood, found: _Fit, *, most: int | None = None) -> _Fit:
     """Fit the free entries, starting from their present values."""
     free = np.flatnonzero(found.free)
-    along = restricted(smooth.of, found.noise, free)
-    fit = maximise(along, found.noise[None, free], most=most)
+    along = scoring.restricted(smooth.of, found.noise, free)
+    fit = scoring.maximise(along, found.noise[None, free], most=most)
     noise = found.noise.copy()
     noise[free] = fit.parameters
     passes = found.passes + fit.passes
@@ -221,10 +208,10 @@ def _without_needless(smooth: LogLikelihood, found: _Fit) -> _Fit:
 def _is_plain(smooth: LogLikelihood, found: _Fit, entry: int) -> bool:
     """Return whether an entry is significantly above zero."""
     free = np.flatnonzero(found.free)
-    along = restricted(smooth.of, found.noise, free)
-    information = scores(along, np.log(found.noise[free])).information
+    along = scoring.restricted(smooth.of, found.noise, free)
+    information = scoring.scores(along, np.log(found.noise[free])).information
     at = int(np.flatnonzero(free == entry)[0])
-    covariance = np.linalg.inv(information + FAINT * np.eye(len(free)))
+    covariance = np.linalg.inv(information + scoring.FAINT * np.eye(len(free)))
     return bool(covariance[at, at] < PLAIN**2)
 
 
@@ -233,9 +220,9 @@ def _without_zeros(smooth: LogLikelihood, found: _Fit) -> _Fit:
     for _ in range(int(np.count_nonzero(found.free)) - 1):
         free = np.flatnonzero(found.free)
         tried = [_fixed_at_zero(found, entry) for entry in free.tolist()]
-        values = totals(smooth.of(np.array([one.noise for one in tried])))
+        values = scoring.totals(smooth.of(np.array([one.noise for one in tried])))
         best = int(np.argmax(values))
-        if values[best] < found.likelihood - BETTER:
+        if values[best] < found.likelihood - scoring.BETTER:
             break
         found = _fit(smooth, tried[best])
     return found
@@ -251,7 +238,7 @@ def _refuse_most(rejected: BoolArray) -> None:
 
 
 def _refuse_diverged(found: _Fit) -> None:
-    if not found.converged or found.noise.max() > 0.5 * GREATEST:
+    if not found.converged or found.noise.max() > 0.5 * scoring.GREATEST:
         values = ", ".join(
             f"{name} {value:.3g}"
             for (name, _), value in zip(ENTRIES, found.noise, strict=True)
@@ -358,13 +345,15 @@ class LogLikelihood:
     #: Of one part.
     most_landmarks: int = MOST_LANDMARKS
     #: The parts, if they are given.
-    stretches: Sequence[Stretch] = ()
+    stretches: Sequence[scoring.Stretch] = ()
 
     @cached_property
     def parts(self) -> tuple[DriveEvents, ...]:
         """The parts of the drive."""
-        stretches = self.stretches or stretches_of(self.events, self.most_landmarks)
-        return parts_of(self.events, stretches)
+        stretches = self.stretches or scoring.stretches_of(
+            self.events, self.most_landmarks
+        )
+        return scoring.parts_of(self.events, stretches)
 
     def sample(self, most_readings: int = MOST_READINGS) -> LogLikelihood:
         """Return the likelihood of evenly spread parts of a drive with many readings.
@@ -373,10 +362,10 @@ class LogLikelihood:
         """
         if len(self.events.readings) <= most_readings:
             return self
-        stretches = stretches_of(self.events, SAMPLED_LANDMARKS)
+        stretches = scoring.stretches_of(self.events, SAMPLED_LANDMARKS)
         if len(stretches) == 1:
             return self
-        events, chosen = sample_of(self.events, stretches, most_readings)
+        events, chosen = scoring.sample_of(self.events, stretches, most_readings)
         return replace(self, events=events, stretches=chosen)
 
     def of(self, noises: Array) -> Array:
@@ -420,5 +409,5 @@ class LogLikelihood:
 
         It is smooth: no reading is rejected here and accepted there.
         """
-        kept = without_readings(self.events, dropped)
+        kept = scoring.without_readings(self.events, dropped)
         return replace(self, events=kept, gate=np.inf)
