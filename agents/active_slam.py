@@ -149,7 +149,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
-    _changing = (*LandmarkWorldEnv._changing, "task", "_explorers")
+    changing = (*LandmarkWorldEnv.changing, "task", "_explorers")
 
     def __init__(
         self,
@@ -277,7 +277,7 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
     (3, 8)
     """
 
-    _changing = (*LandmarkWorldVectorEnv._changing, "task", "_explorers")
+    changing = (*LandmarkWorldVectorEnv.changing, "task", "_explorers")
 
     def __init__(
         self,
@@ -365,7 +365,7 @@ class Explorers(Restorable):
         The task of these worlds.
     """
 
-    _changing = ("_filters", "_record")
+    changing = ("_filters", "_record")
 
     def __init__(self, filters: Filters, task: ActiveSlamTask) -> None:
         self._filters, self._task = filters, task

@@ -59,7 +59,7 @@ class NoiseRows(Restorable, Generic[Row]):
     (0.1, 0.2)
     """
 
-    _changing = ("_draw", "_next", "_block", "_to_come")
+    changing = ("_draw", "_next", "_block", "_to_come")
 
     def __init__(
         self, draw: Callable[[IntArray], Iterable[Row]], first: int = 0

@@ -66,7 +66,7 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
     ((3, 28, 2), (3, 3))
     """
 
-    _changing: ClassVar[tuple[str, ...]] = (
+    changing: ClassVar[tuple[str, ...]] = (
         "_seeds",
         "_worlds",
         "_steps_left",
