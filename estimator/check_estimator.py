@@ -76,8 +76,8 @@ class CallError(Exception):
 
     def __init__(self, message: str, cause: object = None) -> None:
         super().__init__(message)
+        #: Equal for calls that failed for the same reason.
         self.cause = cause or message
-        """Equal for calls that failed for the same reason."""
 
 
 Check = Callable[[Factory], Iterator[str | CallError]]

@@ -61,16 +61,16 @@ class ScanAssociation:
         self._next_id, self.scan = candidates.next_id, candidates.scan
         self._density, self._longest = candidates.density, 0.0
         self._detections = candidates.detections
+        #: For each row the landmark that the filter associates it with, if any.
         self.row_ids: list[int | None] = [None] * rows
-        """For each row the landmark that the filter associates it with, if any."""
+        #: Labels of landmarks that were tentative before this scan.
         self.confirmed: dict[int, int] = {}
-        """Labels of landmarks that were tentative before this scan."""
+        #: For each row the label of its tentative landmark, if any.
         self.labels: list[int] = [NO_LABEL] * rows
-        """For each row the label of its tentative landmark, if any."""
         self.tentative_rows: list[int] = []
         self.ambiguous_rows: list[int] = []
+        #: Landmarks that some row may belong to, so that they are not missing.
         self.explained: set[int] = set()
-        """Landmarks that some row may belong to, so that they are not missing."""
 
     @property
     def candidates(self) -> Candidates:

@@ -58,11 +58,10 @@ class BatchOfBeliefs(Restorable):
         self._covariances = aligned_zeros(self.runs, capacity, capacity)
         self._slots = np.full((self.runs, landmarks), -1, dtype=np.int64)
         self._mapped = np.zeros(self.runs, dtype=np.int64)
+        #: Step of the last :meth:`run` at which a run stopped, -1 if it did not.
+        #:
+        #: A stopped run remains stopped, at step 0 of every later :meth:`run`.
         self.failed_at = np.full(self.runs, NEVER, dtype=np.int64)
-        """Step of the last :meth:`run` at which a run stopped, -1 if it did not.
-
-        A stopped run remains stopped, at step 0 of every later :meth:`run`.
-        """
         begin_runs(tuple(self._arrays()), self.failed_at == NEVER, poses.copy(), std**2)
 
     def reset(
@@ -223,8 +222,8 @@ class BatchSlam(BatchOfBeliefs):
             raise ValueError(f"{type(estimator).__name__} cannot run in batches")
         self.runs = argument_checks.whole("runs", runs, 1)
         self.landmarks = argument_checks.whole("landmarks", landmarks, 0)
+        #: What distinguishes this filter's updates from another's.
         self.rules = estimator.rules
-        """What distinguishes this filter's updates from another's."""
         self.rule_values = estimator.rule_values.copy()
         self.motion_values = estimator.motion_values
         self._threads = argument_checks.whole("threads", threads or usable_cores(), 1)

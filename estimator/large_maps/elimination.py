@@ -481,8 +481,8 @@ class SubmapElimination:
     def __init__(
         self, parts: list[Part], size: int, quadratic: Callable[[int], Quadratic]
     ) -> None:
+        #: c.
         self.cost = 0.0
-        """c."""
         self._nodes: list[Node] = []
         self._solved = np.zeros(size)  # L⁻¹ g
         updates: list[tuple[Array, Array]] = []

@@ -169,10 +169,10 @@ class HypothesisSlam:
         noise = motion_std, measurement_std
         make = partial(ManagedSlam, estimator, *noise, management=self._policy)
         self._pool = FilterPool(partial(make, **options))
+        #: The hypotheses, the most probable first.
         self.hypotheses = [Hypothesis(0.0, self._pool.fresh())]
-        """The hypotheses, the most probable first."""
+        #: Number of steps taken.
         self.steps = 0
-        """Number of steps taken."""
         self._report: UpdateReport | None = None
 
     @property

@@ -55,8 +55,8 @@ class LoopCloser:
 
     def __init__(self, rules: Constellations | None) -> None:
         self._rules = rules
+        #: Mapped landmarks that may be older, lost ones.
         self.doubtful: set[int] = set()
-        """Mapped landmarks that may be older, lost ones."""
 
     def lost(self, view: MapView) -> BoolArray:
         """Return which landmarks of a view are lost, shape (n,).

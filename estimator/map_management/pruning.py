@@ -209,10 +209,10 @@ class LandmarkMerger:
         self, policy: LandmarkPolicy, editor: MapEditor, records: LandmarkRecords
     ) -> None:
         self._policy, self._editor, self._records = policy, editor, records
+        #: Landmarks known to differ.
         self.apart: set[tuple[int, int]] = set()
-        """Landmarks known to differ."""
+        #: Landmarks merged into others: gone to kept.
         self.aliases: dict[int, int] = {}
-        """Landmarks merged into others: gone to kept."""
 
     def note_scan(self, view: MapView, ids: Sequence[int]) -> None:
         """Record that landmarks seen in one scan are different ones."""

@@ -67,8 +67,8 @@ class RecentScans:
         """Start a new run."""
         self.scans: list[RecentScan] = []
         self.motions: tuple[Motion, ...] = ()
+        #: About every scan since the start, or since a saved state was loaded.
         self.decisions: list[ScanDecisions] = []
-        """About every scan since the start, or since a saved state was loaded."""
 
     def copy_from(self, other: RecentScans) -> None:
         """Continue from the scans of another run with the same kind of filter."""

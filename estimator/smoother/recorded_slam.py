@@ -68,8 +68,8 @@ class RecordedSlam:
         self._slam, self._noise = slam, noise
         self._editor = MapEditor(slam)
         self._last: Event | None = None
+        #: Number of steps taken.
         self.steps = 0
-        """Number of steps taken."""
         self._report: UpdateReport | None = None
         for name, member in optional_members(slam).items():
             setattr(self, name, member)

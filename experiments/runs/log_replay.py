@@ -253,8 +253,8 @@ class RunRecorder:
         self._readings: Counter[str] = Counter()
         self._changes: Counter[str] = Counter()
         self._ids: tuple[int, ...] = ()
+        #: The step of the last reading of each landmark.
         self.last_seen: dict[int, int] = {}
-        """The step of the last reading of each landmark."""
 
     def add(self, predicted: Belief, report: UpdateReport | None) -> None:
         """Record one step, after the scan at its end."""

@@ -326,10 +326,10 @@ class RunFrames:
         last = len(self._scans) - 1
         self._maps = ThinnedSteps[MapFrame](_MOST_FRAMES, _MOST_LANDMARKS, last)
         self._pairs = ThinnedSteps[CorrelationFrame](_MOST_FRAMES, _MOST_PAIRS, last)
+        #: Landmarks of the largest map.
         self.largest = 0
-        """Landmarks of the largest map."""
+        #: Whether the filter joins its map on demand; then the frames hold no map.
         self.joins = False
-        """Whether the filter joins its map on demand; then the frames hold no map."""
 
     @property
     def maps(self) -> dict[int, MapFrame]:
@@ -476,8 +476,8 @@ class PackedArrays:
     """
 
     def __init__(self) -> None:
+        #: Type, length and, of frames, the name of their numbers of entries.
         self.table: dict[str, dict[str, Any]] = {}
-        """Type, length and, of frames, the name of their numbers of entries."""
         self._parts: list[bytes] = []
 
     def put(self, name: str, values: AnyArray, kind: str) -> None:

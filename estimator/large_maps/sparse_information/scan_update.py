@@ -181,8 +181,8 @@ class ScanRules:
         if unknown:
             raise TypeError(f"SparseInformationSlam has no option {min(unknown)!r}")
         noise = np.array(motion_std), np.array(measurement_std)
+        #: Makes the filter of the same belief in dense form.
         self.dense = partial(BASES[base], *noise, **settings)
-        """Makes the filter of the same belief in dense form."""
         self.rules = self.dense().rules
         at_rest = settings.get("noise_at_rest", True)
         self.motion_noise = ekf.MotionNoise.checked(motion_std, at_rest)

@@ -63,8 +63,8 @@ class ClosedSubmaps:
         self.store, self._frame = store, frame
         self.renamed = dict(renamed or {})
         self.summaries = list(summaries)
+        #: Slots of the landmarks in the submaps, including links.
         self.slots: set[int] = set().union(*(s.slots.tolist() for s in summaries))
-        """Slots of the landmarks in the submaps, including links."""
         self._initialisation = initialisation or FrameInitialisation()
         self._joined: JoinedMap | None = None
         self._whole: tuple[IntArray, Gaussian] | None = None

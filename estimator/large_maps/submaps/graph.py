@@ -57,8 +57,8 @@ class SubmapGraph:
     ) -> None:
         self.index, self.chain = index, chain
         self.closed, self.active = closed, active
+        #: Whether the active submap is full, but could not be written.
         self.is_overdue = False
-        """Whether the active submap is full, but could not be written."""
 
     @property
     def pose(self) -> Array:
@@ -398,8 +398,8 @@ class ActiveSubmap:
 
     def __init__(self, slam: EkfSlam) -> None:
         self.filter = slam
+        #: Coordinates of the error.
         self.frame = FRAMES[slam.rules.frame]
-        """Coordinates of the error."""
 
     def begin(self) -> None:
         """Begin a new submap, with the robot at the origin of the frame."""
@@ -508,8 +508,8 @@ class Chain:
     def __init__(self, pose: Array, covariance: Array) -> None:
         self.start = (pose.copy(), covariance.copy())
         self.pose, self.covariance = self.start
+        #: Frames of the last join, shape (J + 1, 3).
         self.joined = pose[None].copy()
-        """Frames of the last join, shape (J + 1, 3)."""
 
     def extend(self, pose: Array, covariance: Array) -> None:
         """Append a submap by its last pose, shape (3,), and that pose's covariance."""
