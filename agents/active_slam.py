@@ -475,15 +475,13 @@ def matched_rmse(beliefs: BatchStorage, landmarks: ComplexArray) -> Array:
 
 
 @jit
-def _write_rmse(
-    means: Array, slots: IntArray, landmarks: ComplexArray, errors: Array
-) -> None:
+def _write_rmse(means: Array, slots: IntArray, true: ComplexArray, rmse: Array) -> None:
     for b in range(len(means)):
         squares, mapped = 0.0, 0
         for i in range(slots.shape[1]):
             if slots[b, i] >= 0:
                 x = 3 + 2 * slots[b, i]
-                dx = means[b, x] - landmarks[b, i].real
-                dy = means[b, x + 1] - landmarks[b, i].imag
+                dx = means[b, x] - true[b, i].real
+                dy = means[b, x + 1] - true[b, i].imag
                 squares, mapped = squares + dx * dx + dy * dy, mapped + 1
-        errors[b] = math.sqrt(squares / mapped) if mapped else 0.0
+        rmse[b] = math.sqrt(squares / mapped) if mapped else 0.0

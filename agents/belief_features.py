@@ -283,7 +283,7 @@ correlation_jit, turned_jit = njit_internal(correlation), njit_internal(turned)
 @njit_internal
 def write_pose_features(
     mean: Array,
-    covariance: Array,
+    P: Array,
     bounds: Rectangle,
     pose: Array,
     correlations: Array,
@@ -296,11 +296,9 @@ def write_pose_features(
     pose[0] = clip_jit((2 * mean[0] - left - right) / (right - left), -1.0, 1.0)
     pose[1] = clip_jit((2 * mean[1] - bottom - top) / (top - bottom), -1.0, 1.0)
     pose[2], pose[3] = cos, sin
-    aa, ab, bb = turned_jit(
-        covariance[0, 0], covariance[0, 1], covariance[1, 1], cos, sin
-    )
-    x_h, y_h = covariance[0, 2], covariance[1, 2]
-    ahead, aside, turn = root_jit(aa), root_jit(bb), root_jit(covariance[2, 2])
+    aa, ab, bb = turned_jit(P[0, 0], P[0, 1], P[1, 1], cos, sin)
+    x_h, y_h = P[0, 2], P[1, 2]
+    ahead, aside, turn = root_jit(aa), root_jit(bb), root_jit(P[2, 2])
     std[0], std[1] = on_log_scale_jit(ahead), on_log_scale_jit(aside)
     std[2] = on_log_scale_jit(turn)
     correlations[0] = correlation_jit(ab, ahead * aside)

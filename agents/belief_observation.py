@@ -150,9 +150,7 @@ class BeliefObservation(
         if self.env.render_mode is not None:
             self.env.get_wrapper_attr("show_belief")(self.belief)
         features = belief_features(self._filters.storage(), self._bounds)
-        return with_features(
-            observation, {key: row[0] for key, row in features.items()}
-        )
+        return with_features(observation, {k: row[0] for k, row in features.items()})
 
 
 def scenario_of(env: Any) -> Scenario:
@@ -297,11 +295,9 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
             self._ended = ended
         return self._with_beliefs(observations), rewards, terminated, truncated, infos
 
-    def _finish(
-        self, observations: Observations, ended: BoolArray, infos: Infos
-    ) -> None:
+    def _finish(self, observed: Observations, ended: BoolArray, infos: Infos) -> None:
         """Update with the last scan of ended episodes, then with the first new one."""
-        last = {key: rows.copy() for key, rows in observations.items()}
+        last = {key: rows.copy() for key, rows in observed.items()}
         for world in np.flatnonzero(ended).tolist():
             for key, rows in last.items():
                 rows[world] = infos["final_obs"][world][key]
@@ -310,7 +306,7 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
             return
         shown = self._with_beliefs(last)
         infos["final_obs"] = final_infos(shown, {}, ended)["final_obs"]
-        self._begin(observations, ended)
+        self._begin(observed, ended)
 
     def _begin(self, observations: Observations, worlds: BoolArray) -> None:
         self._restart(worlds)

@@ -202,6 +202,4 @@ def _first(part: str, values: AnyArray, wrong: BoolArray) -> str:
 
 
 def _has_a_method(estimator: Any) -> bool:
-    return any(hasattr(estimator, method) for method in _METHODS) or not callable(
-        estimator
-    )
+    return any(hasattr(estimator, name) for name in _METHODS) or not callable(estimator)

@@ -248,15 +248,13 @@ def same_beliefs(one: Belief, other: Belief) -> bool:
     )
 
 
-def _called(
-    name: str, function: Callable[..., Any], *arguments: Any, **keywords: Any
-) -> Any:
+def _called(name: str, function: Callable[..., Any], *values: Any, **named: Any) -> Any:
     """Call a function of the user; describe the call if it fails."""
     try:
-        return function(*arguments, **keywords)
+        return function(*values, **named)
     except Exception as error:
-        shown = [_shown(value) for value in arguments]
-        shown += [f"{key}={_shown(value)}" for key, value in keywords.items()]
+        shown = [_shown(value) for value in values]
+        shown += [f"{key}={_shown(value)}" for key, value in named.items()]
         kind, place = type(error).__name__, _place(error)
         message = f"{name}({', '.join(shown)}) raised {kind}: {error}{place}"
         raise CallError(message, (name, kind, place or str(error))) from error

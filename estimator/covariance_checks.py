@@ -76,13 +76,11 @@ class _Call(NamedTuple):
         """Yield frequent mistakes, each with the belief that it leads to."""
         noise = self.noises[""]
         for which, columns in enumerate(self.columns):
-            for (i, row), (j, column) in product(
-                enumerate(self.rows), enumerate(columns)
-            ):
+            for (i, row), (j, col) in product(enumerate(self.rows), enumerate(columns)):
                 for factor, text in ((-1, "has the wrong sign"), (0, "is missing")):
                     changed = [jacobian.copy() for jacobian in self.jacobians]
                     changed[which][..., i, j] *= factor
-                    yield f"∂{row}/∂{column} {text}", self.equation(*changed, noise)
+                    yield f"∂{row}/∂{col} {text}", self.equation(*changed, noise)
         for text, wrong in self.noises.items():
             yield text, self.equation(*self.jacobians, wrong)
         yield from self.others.items()

@@ -109,13 +109,11 @@ class ConsistencyReport:
         """Return what weakens the report: failed runs, few runs."""
         found = []
         if self.failed_runs:
-            count = len(self.failed_runs)
+            n = len(self.failed_runs)
             names = ", ".join(map(str, self.failed_runs[:_MOST_NAMES]))
-            if count > _MOST_NAMES:
-                names += f" and {count - _MOST_NAMES} more"
-            found.append(
-                f"{count} of {self.runs} runs failed and are left out: {names}."
-            )
+            if n > _MOST_NAMES:
+                names += f" and {n - _MOST_NAMES} more"
+            found.append(f"{n} of {self.runs} runs failed and are left out: {names}.")
         if self.used_runs < FEW_RUNS:
             found.append(
                 f"Only {self.used_runs} runs: below {FEW_RUNS} little can be shown."

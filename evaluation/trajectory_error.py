@@ -280,12 +280,10 @@ def _unwrapped(headings: Array) -> Array:
 def _paired(**positions: ArrayLike) -> tuple[Array, Array]:
     """Check two arrays of positions; their names are those the caller knows."""
     arrays = {name: as_floats(name, value) for name, value in positions.items()}
-    for name, array in arrays.items():
-        if array.ndim != 2 or array.shape[1] != 2 or not len(array):
-            raise ValueError(
-                f"{name} must be n >= 1 positions, got shape {array.shape}"
-            )
-        if not np.isfinite(array).all():
+    for name, rows in arrays.items():
+        if rows.ndim != 2 or rows.shape[1] != 2 or not len(rows):
+            raise ValueError(f"{name} must be n >= 1 positions, got shape {rows.shape}")
+        if not np.isfinite(rows).all():
             raise ValueError(f"{name} must be finite, got nan or inf")
     first, second = arrays.values()
     if len(first) != len(second):

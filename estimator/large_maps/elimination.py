@@ -393,10 +393,8 @@ class LandmarkDissection:
             order = these[np.argsort(points[these, axis], kind="stable")]
             low, high = order[: len(order) // 2], order[len(order) // 2 :]
             side[low], side[high] = 1, 2
-            low_separator = low[_is_linked(low, part.indptr, part.indices, side == 2)]
-            high_separator = high[
-                _is_linked(high, part.indptr, part.indices, side == 1)
-            ]
+            low_separator = low[_linked(low, part.indptr, part.indices, side == 2)]
+            high_separator = high[_linked(high, part.indptr, part.indices, side == 1)]
             side[these] = 0
             if len(low_separator) <= len(high_separator):
                 low = np.setdiff1d(low, low_separator)
@@ -407,7 +405,7 @@ class LandmarkDissection:
         self.nodes[slots] = nodes
 
 
-def _is_linked(
+def _linked(
     rows: IntArray, starts: IntArray, links: IntArray, others: BoolArray
 ) -> BoolArray:
     """Return which rows of a sparse matrix link to one of the others."""

@@ -230,9 +230,7 @@ class KalmanPeer(PeerSlam):
         """Return the state moved by (d, α) with noise of these variances (3,)."""
 
     @abstractmethod
-    def _corrected(
-        self, state: Moments, readings: Readings
-    ) -> tuple[Moments, Innovation]:
+    def _corrected(self, state: Moments, scan: Readings) -> tuple[Moments, Innovation]:
         """Return the state after readings of mapped landmarks, and what was new."""
 
     def _mean(self) -> Array:

@@ -116,7 +116,7 @@ def array(name: str, value: Any, shape: tuple[int, ...] | None = None) -> Array:
     """
     numbers = as_floats(f"state[{name!r}]", value)
     if shape is not None:
-        _refuse_other_shape(name, numbers.shape, shape)
+        _refuse_shape(name, numbers.shape, shape)
     if not np.isfinite(numbers).all():
         raise ValueError(f"state[{name!r}] must be finite")
     if (np.abs(numbers) > LARGEST_IN_STATE).any():
@@ -175,7 +175,7 @@ def whole_numbers(
     numbers = np.asarray(value) if not isinstance(value, str) else np.array(value)
     if numbers.dtype.kind not in "iu" and numbers.size:
         raise ValueError(f"state[{name!r}] must be whole numbers, got {value!r}")
-    _refuse_other_shape(name, numbers.shape, shape)
+    _refuse_shape(name, numbers.shape, shape)
     if least is not None and numbers.size and numbers.min() < least:
         raise ValueError(
             f"state[{name!r}] must be whole numbers >= {least}, got {numbers.min()}"
@@ -199,9 +199,7 @@ def flag(name: str, value: Any, shape: tuple[int, ...] = ()) -> bool:
     return bool(given)
 
 
-def _refuse_other_shape(
-    name: str, given: tuple[int, ...], wanted: tuple[int, ...]
-) -> None:
+def _refuse_shape(name: str, given: tuple[int, ...], wanted: tuple[int, ...]) -> None:
     if len(given) != len(wanted) or any(
         w not in (-1, g) for w, g in zip(wanted, given, strict=True)
     ):

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from . import options
 from .monte_carlo import show_study
+from .options import FilesOfEstimates, Options, declared, takes
 from .program import BadInputError, command
 
 
 @dataclass(frozen=True, kw_only=True)
-class JudgeOptions(options.Options):
+class JudgeOptions(Options):
     """The options of ``slamgym judge``.
 
     Attributes
@@ -33,21 +33,17 @@ class JudgeOptions(options.Options):
         The folder to write: new, empty, or with earlier output of slamgym.
     """
 
-    drives: Path | None = options.declared(
-        None, "DIR", "the estimates, if generate wrote them"
-    )
-    truths: list[Path] | None = options.declared(
-        None, "--truth FILE", "that of the drives"
-    )
-    covariances: str = options.declared("additive", "additive|invariant|right|left")
-    frame: str = options.declared("invariant", "invariant|additive")
-    align: str | None = options.declared(None, "fit|X,Y,THETA", "none")
-    out: Path | None = options.declared(None, "DIR", "results/judge-<scenario>")
+    drives: Path | None = declared(None, "DIR", "the estimates, if generate wrote them")
+    truths: list[Path] | None = declared(None, "--truth FILE", "that of the drives")
+    covariances: str = declared("additive", "additive|invariant|right|left")
+    frame: str = declared("invariant", "invariant|additive")
+    align: str | None = declared(None, "fit|X,Y,THETA", "none")
+    out: Path | None = declared(None, "DIR", "results/judge-<scenario>")
 
 
 @command
-@options.takes("drives truths covariances frame align out as_json")
-def judge(files: options.FilesOfEstimates, *, given: JudgeOptions) -> int:
+@takes("drives truths covariances frame align out as_json")
+def judge(files: FilesOfEstimates, *, given: JudgeOptions) -> int:
     """Judge estimates of any program.
 
     Decide with known error rates whether the covariances of estimates agree with

@@ -165,12 +165,10 @@ def one_run_study(
         with reporter.progress("filtering") as tick:
             runs = study(progress=tick)
         with reporter.progress("drawing"):
-            figure = figures.noise_study_figure(
-                [(run.title, run.trace) for run in runs]
-            )
+            drawn = figures.noise_study_figure([(run.title, run.trace) for run in runs])
         title = heading("", name, ", noise study of ", estimator)
         rows, titles = [run.row for run in runs], [run.title for run in runs]
-        return Results(rows, titles, figure, 130, (title, runs_table(runs)))
+        return Results(rows, titles, drawn, 130, (title, runs_table(runs)))
 
     about = {
         "slamgym": __version__,
@@ -191,9 +189,7 @@ def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
     runs, seed, change = given.runs, given.seed, given.change
     texts = [f"{key}={value}" for key, value in given.named_options().items()]
     texts += given.option_texts or []
-    labels = [
-        options.with_options(label, texts) for label in split_labels(given.estimator)
-    ]
+    labels = [options.with_options(one, texts) for one in split_labels(given.estimator)]
     if change != "all" and change not in CHANGED:
         raise program.BadInputError(
             unknown_choice("--change", change, ("all", *CHANGED))
@@ -220,7 +216,7 @@ def write_study(study: Study, out: Path | None, reporter: Reporter) -> None:
     with output_folder(place) as folder:
         found = study.run(reporter)
         figures.save_figure(found.figure, folder / "noise_study.png", dpi=found.dpi)
-        _write_table(folder / "noise_study.csv", found.rows)
+        _write_csv(folder / "noise_study.csv", found.rows)
         rows = [_plain(row) for row in found.rows]
         if found.titles:
             titles = zip(found.titles, rows, strict=True)
@@ -230,9 +226,7 @@ def write_study(study: Study, out: Path | None, reporter: Reporter) -> None:
     reporter.finish({**summary, "out": str(place)})
 
 
-def _write_table(
-    path: Path, rows: "Sequence[NoiseRow] | Sequence[NoiseEffect]"
-) -> None:
+def _write_csv(path: Path, rows: "Sequence[NoiseRow] | Sequence[NoiseEffect]") -> None:
     """Write rows as CSV below the names of their columns, empty where None."""
     with naming_file(path), path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")

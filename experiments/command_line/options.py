@@ -247,13 +247,11 @@ class Options:
                 noise_from_file=self.noise_from_file,
             )
         except OSError as error:
-            reason, file = error.strerror or error, error.filename or path
+            why, file = error.strerror or error, error.filename or path
             hint = ""
             if str(path) in list_presets():
                 hint = f"; {path} is a scenario: slamgym run {path}"
-            raise BadInputError(
-                f"cannot read the log {file}: {reason}{hint}"
-            ) from error
+            raise BadInputError(f"cannot read the log {file}: {why}{hint}") from error
         except MemoryError as error:
             raise BadInputError(f"the log {path} does not fit into memory") from error
         if "left_out" in log.header:

@@ -201,9 +201,7 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
     for heading in headings:
         table.add_column(Text(heading), justify="right", overflow="fold", min_width=7)
     verdicts = [entry["verdict"] for entry in entries.values()]
-    table.add_row(
-        "verdict", "", *(Text(word, _STYLES[KINDS[word]]) for word in verdicts)
-    )
+    table.add_row("verdict", "", *(Text(w, _STYLES[KINDS[w]]) for w in verdicts))
     for measure in measures(summary):
         cells = [Text(measure.of(entry)) for entry in entries.values()]
         table.add_row(Text(measure.name), Text(measure.right), *cells)
@@ -238,7 +236,7 @@ COLOUR_VARIABLES = {
 }
 
 
-def inline_svg(figure: Figure, name: str, description: str) -> str:
+def inline_svg(figure: Figure, name: str, text: str) -> str:
     """Return a figure as an ``<svg>`` element without size, font or colour of its own.
 
     It fills the available width and keeps text as text; the same figure gives the same
@@ -250,7 +248,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
         A figure in the colours of `COLOUR_VARIABLES`.
     name : str
         Prefix of all ids, unique on the page.
-    description : str
+    text : str
         Text for screen readers.
     """
     buffer = io.StringIO()
@@ -264,9 +262,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     svg = re.sub(r"<!--.*?-->", "", svg, flags=re.DOTALL)
     svg = _use_page_style(_short_numbers(_own_ids(svg, name)))
     box = re.search(r'viewBox="[^"]*"', svg)
-    attributes = (
-        f'{box[0] if box else ""} role="img" aria-label="{escape(description)}"'
-    )
+    attributes = f'{box[0] if box else ""} role="img" aria-label="{escape(text)}"'
     return re.sub(r"<svg\b[^>]*>", lambda _: f"<svg {attributes}>", svg, count=1)
 
 

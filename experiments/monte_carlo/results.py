@@ -197,9 +197,9 @@ def attributes(job: Job, runs: range, command: str) -> dict[str, Any]:
 def provenance(command: str) -> dict[str, str]:
     """Return the attributes that name the command and the versions of packages."""
     own = {"slamgym": __version__, "python": platform.python_version()}
-    versions = own | {package: version(package) for package in _PACKAGES}
+    found = own | {package: version(package) for package in _PACKAGES}
     return {
-        "versions": json.dumps(versions),
+        "versions": json.dumps(found),
         "command": command,
         "comment": _FROM_TRUTH,
     }

@@ -262,17 +262,15 @@ def _measure_path(truth: Array, filtered: FilteredRuns, run: int) -> dict[str, V
     return measured
 
 
-def _measure_map(
-    true_pose: Array, true_landmarks: Array, belief: Belief
-) -> dict[str, Value]:
+def _measure_map(true_pose: Array, truth: Array, belief: Belief) -> dict[str, Value]:
     ids = list(belief.landmark_ids)
-    if len(set(ids)) < len(ids) or not set(ids) <= set(range(len(true_landmarks))):
+    if len(set(ids)) < len(ids) or not set(ids) <= set(range(len(truth))):
         raise ValueError(
-            f"landmark_ids must be different ones of 0 … {len(true_landmarks) - 1}, "
+            f"landmark_ids must be different ones of 0 … {len(truth) - 1}, "
             f"got {tuple(ids)}"
         )
     states = (
-        np.concatenate([true_pose, true_landmarks[ids].ravel()]),
+        np.concatenate([true_pose, truth[ids].ravel()]),
         belief.mean,
         belief.covariance,
     )
@@ -287,10 +285,10 @@ def _measure_map(
         return measured
     for frame in ERROR_FRAMES:
         values = nees.landmark_nees(*states, frame=frame)
-        measured[f"landmark_nees_{frame}"] = by_id(values, ids, len(true_landmarks))
+        measured[f"landmark_nees_{frame}"] = by_id(values, ids, len(truth))
     return measured | {
         "relative_map_nees": float(nees.relative_map_nees(*states)),
-        **measure_landmarks(true_pose, true_landmarks, belief.pose, *_map_of(belief)),
+        **measure_landmarks(true_pose, truth, belief.pose, *_map_of(belief)),
         "landmark_mahalanobis": np.sqrt(measured["landmark_nees_additive"]),
     }
 

@@ -281,9 +281,7 @@ class _Work:
         size = runs_at_once(self.job.scenario)
         starts = range(block.start, block.stop, size)
         spans = [range(k, min(k + size, block.stop)) for k in starts]
-        return [
-            joined(parts) for parts in zip(*map(self._measured, spans), strict=True)
-        ]
+        return [joined(each) for each in zip(*map(self._measured, spans), strict=True)]
 
     def _measured(self, span: range) -> list[Block]:
         world, first = self.job.scenario, self.job.seed + span.start

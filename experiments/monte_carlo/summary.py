@@ -568,7 +568,7 @@ def _entry(found: Efficiency) -> dict[str, Any] | None:
         return None
     return {
         "value": finite(found.value),
-        "interval": [finite(end) for end in found.interval],
+        "interval": [*map(finite, found.interval)],
     }
 
 

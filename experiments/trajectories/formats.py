@@ -88,10 +88,8 @@ def trajectory_format(name: str) -> TrajectoryFormat:
             f"the format '{name}' needs the package {error.name}: "
             "pip install 'slamgym[trajectories]'"
         ) from None
-    defined = {
-        n: vars(module)[n] for n in TrajectoryFormat._fields if n in vars(module)
-    }
-    return TrajectoryFormat(**defined)
+    known = {n: vars(module)[n] for n in TrajectoryFormat._fields if n in vars(module)}
+    return TrajectoryFormat(**known)
 
 
 # --------------------------------------------------------------------------------------
@@ -282,10 +280,8 @@ def dead_reckoning(start: Array, odometry: Array) -> Array:
     x, y, heading = start.tolist()
     distances, turns = odometry.T
     headings = np.cumsum([heading, *turns])
-    along_x, along_y, *_ = drive(0.0, 0.0, headings[:-1], distances, turns)
-    return np.column_stack(
-        [np.cumsum([x, *along_x]), np.cumsum([y, *along_y]), headings]
-    )
+    step_x, step_y, *_ = drive(0.0, 0.0, headings[:-1], distances, turns)
+    return np.column_stack([np.cumsum([x, *step_x]), np.cumsum([y, *step_y]), headings])
 
 
 _ESTIMATOR = "invariant"

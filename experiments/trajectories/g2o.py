@@ -77,12 +77,10 @@ def read(path: Path) -> Iterator[Trajectory]:
         yield _trajectory(path / name, about)
 
 
-def _vertices(
-    landmarks: dict[int, Array], poses: Array, first_pose: int
-) -> Iterator[str]:
+def _vertices(landmarks: dict[int, Array], poses: Array, first: int) -> Iterator[str]:
     for place, position in landmarks.items():
         yield f"VERTEX_XY {place} {numbers(position)}"
-    for place, pose in enumerate(poses, start=first_pose):
+    for place, pose in enumerate(poses, start=first):
         yield f"VERTEX_SE2 {place} {numbers(pose)}"
 
 

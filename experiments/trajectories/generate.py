@@ -302,16 +302,14 @@ class ShardWork:
 
         job, layout = self.job, trajectory_format(self.job.format)
         seeds = [job.seed + episode for episode in episodes]
-        trajectories = drive_episodes(
-            job.scenario, job.controller, seeds, progress=progress
-        )
+        driven = drive_episodes(job.scenario, job.controller, seeds, progress=progress)
         if job.estimator is not None:
             name_of = job.estimator
-            trajectories = [with_beliefs(each, name_of) for each in trajectories]
+            driven = [with_beliefs(each, name_of) for each in driven]
         number = episodes.start // job.episodes_per_shard
         path = folder / f"shard_{number:05d}{layout.ENDING}"
         options = {name: getattr(job, name) for name in layout.OPTIONS}
-        layout.write(trajectories, path, **options)
+        layout.write(driven, path, **options)
         count = len(episodes)
         entry = ShardEntry(path.name, episodes.start, count, checksum(path))
         return MadeShard(entry, path)

@@ -314,17 +314,15 @@ def move(
     evaluated from x̄ to the predicted position x̂⁻, which then becomes the new x̄:
     G = I + (J (x̂⁻ − x̄), 0) e_θᵀ.
     """
-    motion = predict_pose(pose.mean, odometry)
-    G, F = motion.jacobian_pose, motion.jacobian_noise
+    moved = predict_pose(pose.mean, odometry)
+    G, F = moved.jacobian_pose, moved.jacobian_noise
     if not from_mean:
-        way = motion.pose[:2] - pose.reference
+        way = moved.pose[:2] - pose.reference
         G = G.copy()
         G[:2, 2] = -way[1], way[0]
     covariance = G @ pose.covariance @ G.T + (F * variance) @ F.T
     covariance = (covariance + covariance.T) / 2
-    return ConditionalPose(
-        motion.pose, G @ pose.gain, covariance, motion.pose[:2].copy()
-    )
+    return ConditionalPose(moved.pose, G @ pose.gain, covariance, moved.pose[:2].copy())
 
 
 def marginalise_pose(pose: ConditionalPose, scan: LinearScan) -> tuple[Array, Array]:
@@ -391,9 +389,7 @@ def relocate(
     return moved, MapMeasurement(Q[:, 3:].T @ Y, Q[:, 3:].T @ w)
 
 
-def cut_links(
-    pose: ConditionalPose, information: Array, weak: BoolArray
-) -> ConditionalPose:
+def cut_links(pose: ConditionalPose, matrix: Array, weak: BoolArray) -> ConditionalPose:
     """Remove the links between the pose and weak landmarks, as the SEIF does.
 
     The weak landmarks w are marginalised out of p | m with all passive landmarks fixed
@@ -407,9 +403,9 @@ def cut_links(
     dropped = np.repeat(weak, 2)
     stays = pose.is_linked.repeat(2) & ~dropped
     K_w = pose.gain[:, dropped]
-    moved = np.linalg.solve(information[np.ix_(dropped, dropped)], K_w.T)
+    moved = np.linalg.solve(matrix[np.ix_(dropped, dropped)], K_w.T)
     gain = np.zeros_like(pose.gain)
-    gain[:, stays] = pose.gain[:, stays] - moved.T @ information[np.ix_(dropped, stays)]
+    gain[:, stays] = pose.gain[:, stays] - moved.T @ matrix[np.ix_(dropped, stays)]
     added = K_w @ moved
     return pose._replace(gain=gain, covariance=pose.covariance + (added + added.T) / 2)
 
