@@ -372,10 +372,7 @@ def _within(estimate: Estimate, path: Array) -> tuple[Estimate, Array]:
 
 
 def _measured(
-    chunk: _Chunk,
-    files: Sequence[Estimate | str],
-    frame: str,
-    align: Any,
+    chunk: _Chunk, files: Sequence[Estimate | str], frame: str, align: Any
 ) -> _Part:
     """Measure the estimates of one estimator on the drives of a chunk."""
     truth = chunk.runs.true_poses

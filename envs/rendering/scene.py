@@ -110,12 +110,7 @@ class Scene:
 
     def _show_belief(self, belief: BeliefLike | None) -> None:
         parts = self._moving
-        for each in (
-            parts.map_ellipses,
-            parts.map,
-            parts.pose_ellipse,
-            parts.estimate,
-        ):
+        for each in (parts.map_ellipses, parts.map, parts.pose_ellipse, parts.estimate):
             each.set_visible(belief is not None)
         if belief is None:
             return

@@ -129,10 +129,7 @@ def tables(places: TwoPlaces) -> tuple[Array, Array]:
     """Return distance, variance and direction between landmarks of each map."""
     m = len(places.local)
     P = _blocks(places.covariance)
-    return (
-        _table(places.local, P[:m, :m]),
-        _table(places.older, P[m:, m:]),
-    )
+    return (_table(places.local, P[:m, :m]), _table(places.older, P[m:, m:]))
 
 
 def _table(points: Array, P: Array) -> Array:

@@ -130,10 +130,7 @@ def _is_superfluous(
 def assign_nearest(policy: AssociationPolicy, fit: Distances) -> IntArray:
     """Assign each reading to its most likely landmark, as the policy's gates allow."""
     return nearest_neighbours(
-        fit,
-        match=policy.match_gate,
-        new=policy.new_gate,
-        ambiguity=policy.ambiguity,
+        fit, match=policy.match_gate, new=policy.new_gate, ambiguity=policy.ambiguity
     )
 
 

@@ -464,10 +464,7 @@ class LoadedBeliefs(NamedTuple):
 
 
 def checked_beliefs(
-    beliefs: BatchBeliefs,
-    references: ArrayLike | None,
-    runs: BoolArray,
-    landmarks: int,
+    beliefs: BatchBeliefs, references: ArrayLike | None, runs: BoolArray, landmarks: int
 ) -> LoadedBeliefs:
     """Return beliefs of B runs over L landmarks, or refuse those of the chosen runs."""
     count, size = len(runs), 3 + 2 * landmarks

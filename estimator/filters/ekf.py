@@ -33,12 +33,7 @@ from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds, landmark_pairs
 from ..support.memory_limit import covariance_bytes
 from ..support.undo import Undo
-from .gaussian_map import (
-    MAP_STATE,
-    GaussianMap,
-    UpdateKernel,
-    not_positive_definite,
-)
+from .gaussian_map import MAP_STATE, GaussianMap, UpdateKernel, not_positive_definite
 
 
 class MapFilter:

@@ -386,10 +386,7 @@ def without_landmarks(array: Array, slots: Iterable[int]) -> Array:
 def workspace_for(rules: Rules, readings: int, capacity: int) -> Workspace:
     """Allocate what updates by these rules need, with this many readings at most."""
     return new_workspace(
-        readings,
-        capacity,
-        iterated=rules.iterations > 1,
-        spoilable=readings > BLOCK,
+        readings, capacity, iterated=rules.iterations > 1, spoilable=readings > BLOCK
     )
 
 

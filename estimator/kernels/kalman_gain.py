@@ -26,12 +26,7 @@ BLOCK = 6  # readings absorbed at a time below it
 
 @njit_internal
 def absorb(
-    covariance: Array,
-    size: int,
-    rows: Array,
-    columns: IntArray,
-    used: int,
-    block: int,
+    covariance: Array, size: int, rows: Array, columns: IntArray, used: int, block: int
 ) -> int:
     """Condition P on m simultaneous readings, and find the correction of the state.
 

@@ -151,10 +151,7 @@ def _found_again(
 
 
 def _recognised(
-    view: MapView,
-    is_lost: BoolArray,
-    within: float,
-    rules: Constellations,
+    view: MapView, is_lost: BoolArray, within: float, rules: Constellations
 ) -> Pairs:
     """Return landmarks of a constellation that is recognised."""
     away = np.hypot(*(view.landmarks - view.mean[:2]).T)

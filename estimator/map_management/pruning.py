@@ -72,11 +72,7 @@ class MapPruner:
         return {view.ids[slot] for slot in np.flatnonzero(mask).tolist()}
 
     def prune(
-        self,
-        readings: Array,
-        plan: ScanAssociation,
-        seen: set[int],
-        missed: set[int],
+        self, readings: Array, plan: ScanAssociation, seen: set[int], missed: set[int]
     ) -> tuple[list[int], list[tuple[int, int]]]:
         """Remove and merge landmarks; return the removed ids and pairs (kept, gone).
 

@@ -16,11 +16,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ..association.scan_association import (
-    LABEL_BITS,
-    NO_LABEL,
-    ScanAssociation,
-)
+from ..association.scan_association import LABEL_BITS, NO_LABEL, ScanAssociation
 from ..interface import (
     ScanDecisions,
     SlamEstimator,
@@ -103,9 +99,7 @@ class RecentScans:
         if self.scans and (removed or merged):
             last = self.scans[-1]
             self.scans[-1] = replace(
-                last,
-                removed=(*last.removed, *removed),
-                merged=(*last.merged, *merged),
+                last, removed=(*last.removed, *removed), merged=(*last.merged, *merged)
             )
 
     def with_scan(

@@ -198,11 +198,7 @@ def provenance(command: str) -> dict[str, str]:
     """Return the attributes that name the command and the versions of packages."""
     own = {"slamgym": __version__, "python": platform.python_version()}
     found = own | {package: version(package) for package in _PACKAGES}
-    return {
-        "versions": json.dumps(found),
-        "command": command,
-        "comment": _FROM_TRUTH,
-    }
+    return {"versions": json.dumps(found), "command": command, "comment": _FROM_TRUTH}
 
 
 def _fill(

@@ -321,10 +321,7 @@ def measure_landmarks(
         Of these [m²].
     """
     truth = true_landmarks[ids]
-    states = (
-        np.append(true_pose, truth.ravel()),
-        np.append(pose, landmarks.ravel()),
-    )
+    states = (np.append(true_pose, truth.ravel()), np.append(pose, landmarks.ravel()))
     _, centred = invariant_squares(invariant_error(*states))
     accuracy = position_accuracy(landmarks, truth)
     return {

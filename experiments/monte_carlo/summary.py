@@ -566,10 +566,7 @@ def efficiency_summary(scores: EstimatorScores) -> dict[str, Any] | None:
 def _entry(found: Efficiency) -> dict[str, Any] | None:
     if not np.isfinite(found.value):
         return None
-    return {
-        "value": finite(found.value),
-        "interval": [*map(finite, found.interval)],
-    }
+    return {"value": finite(found.value), "interval": [*map(finite, found.interval)]}
 
 
 def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
@@ -607,11 +604,7 @@ def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
         **{name: mean(scores.per_run(f"{PREFIX}{name}")) for name in COUNTS + SHARES},
         "gospa": {**parts, "cutoff": CUTOFF},
         "resolution": float(scores.results.attrs.get("resolution", 0.0)),
-        "bad_runs": {
-            "count": bad,
-            "share": bad / len(scores.good),
-            "margin": MARGIN,
-        },
+        "bad_runs": {"count": bad, "share": bad / len(scores.good), "margin": MARGIN},
         "median_ate": {"hidden": _median(hidden), "known": _median(known)},
     }
 

@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from slamgym.estimator.interface import ScanDecisions
-from slamgym.evaluation import (
-    landmark_identities,
-    places_of,
-    score_association,
-)
+from slamgym.evaluation import landmark_identities, places_of, score_association
 from slamgym.evaluation.association_scores import known_places
 
 A, B, C, CLUTTER = 7, 8, 9, -1
