@@ -282,12 +282,7 @@ correlation_jit, turned_jit = njit_internal(correlation), njit_internal(turned)
 
 @njit_internal
 def write_pose_features(
-    mean: Array,
-    P: Array,
-    bounds: Rectangle,
-    pose: Array,
-    correlations: Array,
-    std: Array,
+    mean: Array, P: Array, bounds: Rectangle, pose: Array, correlated: Array, std: Array
 ) -> None:
     """Write the features of one pose."""
     left, bottom, right, top = bounds
@@ -301,9 +296,9 @@ def write_pose_features(
     ahead, aside, turn = root_jit(aa), root_jit(bb), root_jit(P[2, 2])
     std[0], std[1] = on_log_scale_jit(ahead), on_log_scale_jit(aside)
     std[2] = on_log_scale_jit(turn)
-    correlations[0] = correlation_jit(ab, ahead * aside)
-    correlations[1] = correlation_jit(cos * x_h + sin * y_h, ahead * turn)
-    correlations[2] = correlation_jit(cos * y_h - sin * x_h, aside * turn)
+    correlated[0] = correlation_jit(ab, ahead * aside)
+    correlated[1] = correlation_jit(cos * x_h + sin * y_h, ahead * turn)
+    correlated[2] = correlation_jit(cos * y_h - sin * x_h, aside * turn)
 
 
 @njit_internal

@@ -394,25 +394,21 @@ class SeparateFilters(Restorable):
             self._steps[run] = 0
 
     def update(
-        self,
-        observations: Mapping[str, AnyArray],
-        worlds: BoolArray,
-        *,
-        moved: BoolArray,
+        self, observed: Mapping[str, AnyArray], worlds: BoolArray, *, moved: BoolArray
     ) -> None:
         """Update the filters of some worlds with an observation, batched along B.
 
         Parameters
         ----------
-        observations : mapping
+        observed : mapping
             Batched observations of a landmark world.
         worlds : bool ndarray, shape (B,)
             Worlds whose filters are updated.
         moved : bool ndarray, shape (B,)
             Which of them have moved; the others take the scan from their start.
         """
-        odometry, masks = observations["odometry"], observations["mask"]
-        landmarks = observations["landmarks"]
+        odometry, masks = observed["odometry"], observed["mask"]
+        landmarks = observed["landmarks"]
         for run, slam in enumerate(self.filters):
             if not worlds[run]:
                 continue

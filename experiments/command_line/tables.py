@@ -52,15 +52,11 @@ def landmark_table(summary: dict[str, Any]) -> Table:
 
 
 def _table(
-    headings: Sequence[str], texts: Sequence[str] = ("",), **options: Any
+    headings: Sequence[str], texts: Sequence[str] = ("",), **others: Any
 ) -> Table:
     """Return a table without rows; all columns but `texts` are of numbers."""
     table = Table(
-        title_justify="left",
-        caption_justify="left",
-        box=None,
-        pad_edge=False,
-        **options,
+        title_justify="left", caption_justify="left", box=None, pad_edge=False, **others
     )
     for heading in headings:
         side: Literal["left", "right"] = "left" if heading in texts else "right"

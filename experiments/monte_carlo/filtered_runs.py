@@ -85,14 +85,11 @@ def filter_runs(
 
 
 def _in_a_batch(
-    estimator: EkfSlam,
-    settings: FilterSettings,
-    runs: SimulatedRuns,
-    threads: int | None,
+    slam: EkfSlam, settings: FilterSettings, runs: SimulatedRuns, threads: int | None
 ) -> FilteredRuns:
     count, _, landmarks = runs.visible.shape
     batch = BatchSlam(
-        estimator,
+        slam,
         count,
         landmarks,
         initial_poses=runs.initial_poses,

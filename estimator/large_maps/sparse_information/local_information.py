@@ -335,7 +335,7 @@ def marginalise_pose(pose: ConditionalPose, scan: LinearScan) -> tuple[Array, Ar
 
 
 def correct(
-    pose: ConditionalPose, scan: LinearScan
+    old: ConditionalPose, scan: LinearScan
 ) -> tuple[ConditionalPose, MapMeasurement]:
     """Condition on measurements.
 
@@ -344,17 +344,14 @@ def correct(
         H = H_l + H_p K,  N = Q + H_p Ω H_pᵀ = L Lᵀ,  Y = L⁻¹ H,  V = L⁻¹ H_p Ω
         Λ ← Λ + Yᵀ Y,  μ_p ← μ_p + Vᵀ L⁻¹ ν,  K ← K − Vᵀ Y,  Ω ← Ω − Vᵀ V
     """
-    H, N = marginalise_pose(pose, scan)
+    H, N = marginalise_pose(old, scan)
     L = np.linalg.cholesky(N)
     H_p = scan.jacobian_pose.reshape(-1, 3)
-    right = np.column_stack([H, scan.innovation.ravel(), H_p @ pose.covariance])
+    right = np.column_stack([H, scan.innovation.ravel(), H_p @ old.covariance])
     white = solve_triangular(L, right, lower=True, check_finite=False)
     Y, w, V = white[:, :-4], white[:, -4], white[:, -3:]
     corrected = ConditionalPose(
-        pose.mean + V.T @ w,
-        pose.gain - V.T @ Y,
-        pose.covariance - V.T @ V,
-        pose.reference,
+        old.mean + V.T @ w, old.gain - V.T @ Y, old.covariance - V.T @ V, old.reference
     )
     return corrected, MapMeasurement(Y, w)
 

@@ -195,10 +195,7 @@ class SubmapGraph:
 
 
 def fuse(
-    world: Gaussian,
-    local: Gaussian,
-    frame: ErrorFrame,
-    common: tuple[IntArray, IntArray],
+    world: Gaussian, local: Gaussian, frame: ErrorFrame, both: tuple[IntArray, IntArray]
 ) -> Gaussian:
     """Fuse the active submap with the map.
 
@@ -211,7 +208,7 @@ def fuse(
         error in ``frame``, that of ``world`` to the additive error.
     frame : {"additive", "invariant"}
         Coordinates of the local error.
-    common : tuple of two ndarrays
+    both : tuple of two ndarrays
         Positions of the common landmarks in both.
 
     Returns
@@ -223,11 +220,11 @@ def fuse(
     mean, own, cut = world.mean, local.mean, len(world.mean)
     V = np.empty((0, cut + len(own)))
     start = _in_invariant(world, np.arange(3))
-    if len(common[0]):
-        A, innovation = _difference(mean, own, frame, common)
-        seen = np.concatenate([start, _in_invariant(world, 3 + pairs(common[0]))])
+    if len(both[0]):
+        A, innovation = _difference(mean, own, frame, both)
+        seen = np.concatenate([start, _in_invariant(world, 3 + pairs(both[0]))])
         AP = np.hstack([A[:, : len(seen)] @ seen, A[:, len(seen) :] @ local.covariance])
-        used = np.r_[0:3, 3 + pairs(common[0]), cut : cut + len(own)]
+        used = np.r_[0:3, 3 + pairs(both[0]), cut : cut + len(own)]
         S = AP[:, used] @ A.T
         lower = _root((S + S.T) / 2)
         V = solve_triangular(
@@ -237,7 +234,7 @@ def fuse(
         mean = retract(mean, step[:cut], "invariant")
         own = retract(own, step[cut:], frame)
     moved = Gaussian(own, block_diag(start, local.covariance))
-    return _composed(world, mean, moved, V, (frame, common[1]))
+    return _composed(world, mean, moved, V, (frame, both[1]))
 
 
 def _in_invariant(world: Gaussian, rows: IntArray) -> Array:
