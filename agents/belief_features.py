@@ -322,18 +322,13 @@ def relative_spread(
 
 @njit_internal
 def write_belief_features(
-    b: int,
-    mean: Array,
-    covariance: Array,
-    slots: IntArray,
-    bounds: Rectangle,
-    features: FeatureArrays,
+    b: int, mean: Array, P: Array, slots: IntArray, box: Rectangle, into: FeatureArrays
 ) -> None:
     """Write the features of one belief into row b, see `belief_features`."""
-    corr, map_std, std, landmarks, mask, poses, pose_corr, pose_std = features
-    left, bottom, right, top = bounds
+    corr, map_std, std, landmarks, mask, poses, pose_corr, pose_std = into
+    left, bottom, right, top = box
     diagonal = math.hypot(right - left, top - bottom)
-    write_pose_features(mean, covariance, bounds, poses[b], pose_corr[b], pose_std[b])
+    write_pose_features(mean, P, box, poses[b], pose_corr[b], pose_std[b])
     cos, sin = poses[b, 2], poses[b, 3]
     for i in range(len(slots)):
         mask[b, i] = slots[i] >= 0
@@ -346,12 +341,12 @@ def write_belief_features(
         dx, dy = mean[x] - mean[0], mean[x + 1] - mean[1]
         landmarks[b, i, 0] = clip_jit((cos * dx + sin * dy) / diagonal, -1.0, 1.0)
         landmarks[b, i, 1] = clip_jit((cos * dy - sin * dx) / diagonal, -1.0, 1.0)
-        xx, xy, yy = relative_spread(covariance, x, dx, dy)
+        xx, xy, yy = relative_spread(P, x, dx, dy)
         aa, ab, bb = turned_jit(xx, xy, yy, cos, sin)
         ahead, aside = root_jit(aa), root_jit(bb)
         std[b, i, 0], std[b, i, 1] = on_log_scale_jit(ahead), on_log_scale_jit(aside)
         corr[b, i] = correlation_jit(ab, ahead * aside)
-        map_std[b, i] = on_log_scale_jit(root_jit(largest_variance(covariance, x)))
+        map_std[b, i] = on_log_scale_jit(root_jit(largest_variance(P, x)))
 
 
 @jit

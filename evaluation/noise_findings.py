@@ -338,20 +338,15 @@ def _motion_noise(
 
 
 def _sensor_noise(
-    poses: Array,
-    landmarks: Array,
-    readings: Array,
-    visible: BoolArray,
-    std: Array,
-    per_metre: float,
+    poses: Array, points: Array, read: Array, seen: BoolArray, std: Array, growth: float
 ) -> list[_Noise]:
-    run, landmark, step = np.nonzero(visible.transpose(0, 2, 1))
+    run, landmark, step = np.nonzero(seen.transpose(0, 2, 1))
     follows = (np.diff(run) == 0) & (np.diff(landmark) == 0) & (np.diff(step) == 1)
-    dx, dy = (landmarks[run, landmark] - poses[run, step, :2]).T
-    bearing, distance = readings[run, step, landmark].T
+    dx, dy = (points[run, landmark] - poses[run, step, :2]).T
+    bearing, distance = read[run, step, landmark].T
     expected = np.arctan2(dy, dx) - poses[run, step, 2], np.hypot(dx, dy)
     bearing_error = wrap_angle(bearing - expected[0])
-    range_std = std[1] + per_metre * expected[1]
+    range_std = std[1] + growth * expected[1]
     return [
         _Noise(bearing_error, float(std[0]), 1.0, run, follows),
         _Noise(distance - expected[1], range_std, 1.0, run, follows),

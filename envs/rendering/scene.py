@@ -372,14 +372,8 @@ def _points(marker: str, colour: str, label: str) -> Line2D:
     return Line2D([], [], ls="", marker=marker, ms=4, color=colour, label=label)
 
 
-def _lying_ellipse(  # noqa: PLR0917 (matplotlib's signature)
-    legend: object,
-    orig_handle: object,
-    xdescent: float,
-    ydescent: float,
-    width: float,
-    height: float,
-    fontsize: float,
+def _lying_ellipse(
+    *, xdescent: float, ydescent: float, width: float, height: float, **_: object
 ) -> Ellipse:
     centre = (width / 2 - xdescent, height / 2 - ydescent)
     return Ellipse(centre, width=width, height=height + ydescent + 2)

@@ -286,15 +286,12 @@ def _measure_map(true_pose: Array, truth: Array, belief: Belief) -> dict[str, Va
     for frame in ERROR_FRAMES:
         values = nees.landmark_nees(*states, frame=frame)
         measured[f"landmark_nees_{frame}"] = by_id(values, ids, len(truth))
+    estimated = ids, belief.landmarks, belief.landmark_covariances
     return measured | {
         "relative_map_nees": float(nees.relative_map_nees(*states)),
-        **measure_landmarks(true_pose, truth, belief.pose, *_map_of(belief)),
+        **measure_landmarks(true_pose, truth, belief.pose, *estimated),
         "landmark_mahalanobis": np.sqrt(measured["landmark_nees_additive"]),
     }
-
-
-def _map_of(belief: Belief) -> tuple[list[int], Array, Array]:
-    return list(belief.landmark_ids), belief.landmarks, belief.landmark_covariances
 
 
 def measure_landmarks(

@@ -37,7 +37,7 @@ from .manifest import (
     Job,
     Manifest,
     ShardEntry,
-    checksum,
+    digest,
     is_whole,
     read_manifest,
     write_manifest,
@@ -311,7 +311,7 @@ class ShardWork:
         options = {name: getattr(job, name) for name in layout.OPTIONS}
         layout.write(driven, path, **options)
         count = len(episodes)
-        entry = ShardEntry(path.name, episodes.start, count, checksum(path))
+        entry = ShardEntry(path.name, episodes.start, count, digest(path))
         return MadeShard(entry, path)
 
 

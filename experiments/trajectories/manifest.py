@@ -78,7 +78,7 @@ class ShardEntry:
     first_episode, episodes : int
         First episode, and number of episodes.
     sha256 : str
-        Its `checksum`.
+        Its `digest`.
     """
 
     name: str
@@ -174,7 +174,7 @@ def _checked(row: dict[str, Any], texts: Iterable[str], **least: int) -> dict[st
     return row
 
 
-def checksum(path: Path) -> str:
+def digest(path: Path) -> str:
     """Compute the SHA-256 of a shard.
 
     For a folder it is the SHA-256 of the output of ``sha256sum`` for its files, named
@@ -322,6 +322,6 @@ def _unfinished(dataset: TrajectoryDataset) -> str:
 def is_whole(folder: Path, shard: ShardEntry) -> bool:
     """Whether a shard has the checksum in the manifest."""
     try:
-        return checksum(folder / shard.name) == shard.sha256
+        return digest(folder / shard.name) == shard.sha256
     except OSError:
         return False

@@ -347,11 +347,7 @@ class Neighbourhood:
         if self._copy is None or ids is None:
             return
         refused = {*report.rejected_ids, *report.skipped_ids}
-        used = {
-            row: i
-            for row, i in enumerate(np.asarray(ids).ravel().tolist())
-            if i not in refused
-        }
+        used = {k: i for k, i in enumerate(np.ravel(ids).tolist()) if i not in refused}
         if used:
             readings = np.asarray(measurements)[list(used)]
             self._correct(self._copy, readings, list(used.values()), report.added_ids)
