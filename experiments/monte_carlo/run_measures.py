@@ -269,18 +269,11 @@ def _measure_map(true_pose: Array, truth: Array, belief: Belief) -> dict[str, Va
             f"landmark_ids must be different ones of 0 … {len(truth) - 1}, "
             f"got {tuple(ids)}"
         )
-    states = (
-        np.concatenate([true_pose, truth[ids].ravel()]),
-        belief.mean,
-        belief.covariance,
-    )
-    measured: dict[str, Value] = {
-        "state_dof": 3 + 2 * len(ids),
-        "relative_map_dof": 2 * len(ids),
-    }
+    true_state, size = np.append(true_pose, truth[ids].ravel()), 2 * len(ids)
+    states = true_state, belief.mean, belief.covariance
+    measured: dict[str, Value] = {"state_dof": 3 + size, "relative_map_dof": size}
     for frame in ERROR_FRAMES:
-        value = nees.state_nees(*states, frame=frame)
-        measured[f"state_nees_{frame}"] = float(value)
+        measured[f"state_nees_{frame}"] = float(nees.state_nees(*states, frame=frame))
     if not ids:
         return measured
     for frame in ERROR_FRAMES:

@@ -30,7 +30,6 @@ from .verdict import (
     POINT_FREEDOM,
     POSE_FREEDOM,
     EstimatorScores,
-    Verdict,
     diagnosis_summary,
     estimators_of,
     failure_groups,
@@ -150,7 +149,14 @@ def summarise_estimator(
     if not scores.is_fitted:
         verdict = judge(report, len(scores.failures), len(scores.good))
     return {
-        **_verdict(scores, verdict, report, claimed, knowable),
+        "verdict": verdict.word,
+        "reason": verdict.reason,
+        "sentence": verdict_sentence(scores.label, verdict),
+        "heading_sentence": heading_sentence(claimed, knowable),
+        "accepted": report and report.accepted,
+        "decisions": report and decisions_table(report),
+        "sentences": list(report.sentences()) if report else [],
+        "warnings": list(report.warnings()) if report else [],
         "good_runs": int(scores.good.sum()),
         "failed_runs": [failure._asdict() for failure in scores.failures],
         "failure_groups": failure_groups(scores.failures),
@@ -159,26 +165,6 @@ def summarise_estimator(
         "diagnosis": diagnosis_summary(scores, frame, verdict),
         "association": association_summary(scores),
         "unused_readings": _unused_readings(scores),
-    }
-
-
-def _verdict(
-    scores: EstimatorScores,
-    verdict: Verdict,
-    report: ConsistencyReport | None,
-    heading_std: float | None,
-    knowable: float,
-) -> dict[str, Any]:
-    """Write the verdict on an estimator, and the decisions behind it."""
-    return {
-        "verdict": verdict.word,
-        "reason": verdict.reason,
-        "sentence": verdict_sentence(scores.label, verdict),
-        "heading_sentence": heading_sentence(heading_std, knowable),
-        "accepted": None if report is None else report.accepted,
-        "decisions": None if report is None else decisions_table(report),
-        "sentences": [] if report is None else list(report.sentences()),
-        "warnings": [] if report is None else list(report.warnings()),
     }
 
 
