@@ -8,8 +8,6 @@ frame of its error, additive or invariant
 rejects even a consistent filter if the heading is uncertain.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
 

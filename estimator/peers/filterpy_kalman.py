@@ -1,7 +1,5 @@
 """filterpy's Kalman filters; a new filter object wherever the map has grown."""
 
-from __future__ import annotations
-
 import numpy as np
 from filterpy.kalman import (
     ExtendedKalmanFilter,

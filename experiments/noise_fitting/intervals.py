@@ -1,7 +1,5 @@
 """Confidence intervals of the fitted parameters."""
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple
 
 import numpy as np

@@ -3,8 +3,6 @@
 `SubmapSlam` is the public filter. `SubmapQueries` is the part of it that only reads.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
