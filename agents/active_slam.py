@@ -4,8 +4,6 @@
 together and with batched filters.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -158,7 +156,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
-    _changing = (*LandmarkWorldEnv._changing, "task", "_explorers")
+    changing = (*LandmarkWorldEnv.changing, "task", "_explorers")
 
     def __init__(
         self,
@@ -286,7 +284,7 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
     (3, 8)
     """
 
-    _changing = (*LandmarkWorldVectorEnv._changing, "task", "_explorers")
+    changing = (*LandmarkWorldVectorEnv.changing, "task", "_explorers")
 
     def __init__(
         self,
@@ -374,7 +372,7 @@ class Explorers(Restorable):
         The task of these worlds.
     """
 
-    _changing = ("_filters", "_record")
+    changing = ("_filters", "_record")
 
     def __init__(self, filters: Filters, task: ActiveSlamTask) -> None:
         self._filters, self._task = filters, task
@@ -484,15 +482,13 @@ def matched_rmse(beliefs: BatchStorage, landmarks: ComplexArray) -> Array:
 
 
 @jit
-def _write_rmse(
-    means: Array, slots: IntArray, landmarks: ComplexArray, errors: Array
-) -> None:
+def _write_rmse(means: Array, slots: IntArray, true: ComplexArray, rmse: Array) -> None:
     for b in range(len(means)):
         squares, mapped = 0.0, 0
         for i in range(slots.shape[1]):
             if slots[b, i] >= 0:
                 x = 3 + 2 * slots[b, i]
-                dx = means[b, x] - landmarks[b, i].real
-                dy = means[b, x + 1] - landmarks[b, i].imag
+                dx = means[b, x] - true[b, i].real
+                dy = means[b, x + 1] - true[b, i].imag
                 squares, mapped = squares + dx * dx + dy * dy, mapped + 1
-        errors[b] = math.sqrt(squares / mapped) if mapped else 0.0
+        rmse[b] = math.sqrt(squares / mapped) if mapped else 0.0

@@ -29,8 +29,8 @@ from .belief_features import largest_variances, world_bounds
 from .belief_space_planner import GREEDY, MPC, BeliefSpacePlanner
 from .wall_routes import CLEARANCE, AgentKnowledge, CoverageGrid, as_points
 
+#: The names that :func:`make_baseline` accepts.
 BASELINES = ("random", "coverage", "frontier", "revisit", "greedy", "mpc")
-"""The names that :func:`make_baseline` accepts."""
 
 _DOTS = 2.0  # distance of the points that a coverage around walls visits [m]
 _ALIGNED = 0.4  # heading error below which a robot drives while it turns [rad]

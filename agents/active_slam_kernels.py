@@ -139,11 +139,7 @@ def advance_world(
 
 @njit_internal
 def judge_landmarks(
-    covariance: Array,
-    slots: IntArray,
-    accuracy: float,
-    variances: Array,
-    known: BoolArray,
+    P: Array, slots: IntArray, accuracy: float, variances: Array, known: BoolArray
 ) -> int:
     """Note the worst variance of each landmark, and which are known.
 
@@ -154,7 +150,7 @@ def judge_landmarks(
         variances[i], known[i] = math.inf, False
         if slots[i] >= 0:
             mapped += 1
-            variances[i] = largest_variance(covariance, 3 + 2 * slots[i])
+            variances[i] = largest_variance(P, 3 + 2 * slots[i])
             known[i] = variances[i] <= accuracy * accuracy
     return mapped
 

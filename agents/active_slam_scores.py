@@ -9,14 +9,14 @@ from ..arrays import Array
 from .active_slam import ActiveSlamEnv, Observation
 from .active_slam_baselines import Baseline
 
+#: Chooses an action from an observation; baselines read ``env.knowledge``.
 Policy = Callable[[Observation, ActiveSlamEnv], Array]
-"""Chooses an action from an observation; baselines read ``env.knowledge``."""
 
+#: First seed of the validation maps, up to `HELD_OUT`. Training uses smaller seeds.
 VALIDATION = 1_000_000
-"""First seed of the validation maps, up to `HELD_OUT`. Training uses smaller seeds."""
 
+#: First seed of the maps for the final evaluation. No choice may depend on them.
 HELD_OUT = 2_000_000
-"""First seed of the maps for the final evaluation. No choice may depend on them."""
 
 # Columns of a table of scores, and the entries of `Episode` that they average.
 COLUMNS = {
@@ -33,22 +33,22 @@ COLUMNS = {
 class Episode(NamedTuple):
     """The result of one episode."""
 
+    #: Sum of the rewards.
     total: float
-    """Sum of the rewards."""
+    #: Whether every landmark became known.
     success: bool
-    """Whether every landmark became known."""
+    #: Share of the landmarks known at the end.
     known: float
-    """Share of the landmarks known at the end."""
+    #: Length of the episode.
     steps: int
-    """Length of the episode."""
+    #: Whether the robot touched a wall.
     crashed: bool
-    """Whether the robot touched a wall."""
+    #: Root mean square error of the map at the end [m]; nan of an empty one.
     true_rmse: float
-    """Root mean square error of the map at the end [m]; nan of an empty one."""
+    #: Whether it was a success, and the truth agrees.
     honest: bool
-    """Whether it was a success, and the truth agrees."""
+    #: True positions, shape (steps + 1, 2) [m].
     path: Array
-    """True positions, shape (steps + 1, 2) [m]."""
 
 
 class Mean(NamedTuple):

@@ -102,7 +102,7 @@ class ActiveSlamTask(Restorable):
         Numbers of landmarks in the present map, and of those known accurately.
     """
 
-    _changing = ("episodes", "outcome", "mapped", "known", "_rows")
+    changing = ("episodes", "outcome", "mapped", "known", "_rows")
 
     def __init__(
         self,
@@ -274,7 +274,7 @@ class AssociationRecord(Restorable):
         B, the number of worlds.
     """
 
-    _changing = ("_true_ids",)
+    changing = ("_true_ids",)
 
     def __init__(self, worlds: int) -> None:
         self._true_ids: tuple[list[IntArray], ...] = tuple([] for _ in range(worlds))

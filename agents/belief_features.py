@@ -282,12 +282,7 @@ correlation_jit, turned_jit = njit_internal(correlation), njit_internal(turned)
 
 @njit_internal
 def write_pose_features(
-    mean: Array,
-    covariance: Array,
-    bounds: Rectangle,
-    pose: Array,
-    correlations: Array,
-    std: Array,
+    mean: Array, P: Array, bounds: Rectangle, pose: Array, correlated: Array, std: Array
 ) -> None:
     """Write the features of one pose."""
     left, bottom, right, top = bounds
@@ -296,16 +291,14 @@ def write_pose_features(
     pose[0] = clip_jit((2 * mean[0] - left - right) / (right - left), -1.0, 1.0)
     pose[1] = clip_jit((2 * mean[1] - bottom - top) / (top - bottom), -1.0, 1.0)
     pose[2], pose[3] = cos, sin
-    aa, ab, bb = turned_jit(
-        covariance[0, 0], covariance[0, 1], covariance[1, 1], cos, sin
-    )
-    x_h, y_h = covariance[0, 2], covariance[1, 2]
-    ahead, aside, turn = root_jit(aa), root_jit(bb), root_jit(covariance[2, 2])
+    aa, ab, bb = turned_jit(P[0, 0], P[0, 1], P[1, 1], cos, sin)
+    x_h, y_h = P[0, 2], P[1, 2]
+    ahead, aside, turn = root_jit(aa), root_jit(bb), root_jit(P[2, 2])
     std[0], std[1] = on_log_scale_jit(ahead), on_log_scale_jit(aside)
     std[2] = on_log_scale_jit(turn)
-    correlations[0] = correlation_jit(ab, ahead * aside)
-    correlations[1] = correlation_jit(cos * x_h + sin * y_h, ahead * turn)
-    correlations[2] = correlation_jit(cos * y_h - sin * x_h, aside * turn)
+    correlated[0] = correlation_jit(ab, ahead * aside)
+    correlated[1] = correlation_jit(cos * x_h + sin * y_h, ahead * turn)
+    correlated[2] = correlation_jit(cos * y_h - sin * x_h, aside * turn)
 
 
 @njit_internal
@@ -329,18 +322,13 @@ def relative_spread(
 
 @njit_internal
 def write_belief_features(
-    b: int,
-    mean: Array,
-    covariance: Array,
-    slots: IntArray,
-    bounds: Rectangle,
-    features: FeatureArrays,
+    b: int, mean: Array, P: Array, slots: IntArray, box: Rectangle, into: FeatureArrays
 ) -> None:
     """Write the features of one belief into row b, see `belief_features`."""
-    corr, map_std, std, landmarks, mask, poses, pose_corr, pose_std = features
-    left, bottom, right, top = bounds
+    corr, map_std, std, landmarks, mask, poses, pose_corr, pose_std = into
+    left, bottom, right, top = box
     diagonal = math.hypot(right - left, top - bottom)
-    write_pose_features(mean, covariance, bounds, poses[b], pose_corr[b], pose_std[b])
+    write_pose_features(mean, P, box, poses[b], pose_corr[b], pose_std[b])
     cos, sin = poses[b, 2], poses[b, 3]
     for i in range(len(slots)):
         mask[b, i] = slots[i] >= 0
@@ -353,12 +341,12 @@ def write_belief_features(
         dx, dy = mean[x] - mean[0], mean[x + 1] - mean[1]
         landmarks[b, i, 0] = clip_jit((cos * dx + sin * dy) / diagonal, -1.0, 1.0)
         landmarks[b, i, 1] = clip_jit((cos * dy - sin * dx) / diagonal, -1.0, 1.0)
-        xx, xy, yy = relative_spread(covariance, x, dx, dy)
+        xx, xy, yy = relative_spread(P, x, dx, dy)
         aa, ab, bb = turned_jit(xx, xy, yy, cos, sin)
         ahead, aside = root_jit(aa), root_jit(bb)
         std[b, i, 0], std[b, i, 1] = on_log_scale_jit(ahead), on_log_scale_jit(aside)
         corr[b, i] = correlation_jit(ab, ahead * aside)
-        map_std[b, i] = on_log_scale_jit(root_jit(largest_variance(covariance, x)))
+        map_std[b, i] = on_log_scale_jit(root_jit(largest_variance(P, x)))
 
 
 @jit

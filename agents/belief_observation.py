@@ -3,8 +3,6 @@
 `BeliefObservation` wraps one world, and `BeliefObservationVector` many.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, SupportsFloat, cast
 
@@ -150,9 +148,7 @@ class BeliefObservation(
         if self.env.render_mode is not None:
             self.env.get_wrapper_attr("show_belief")(self.belief)
         features = belief_features(self._filters.storage(), self._bounds)
-        return with_features(
-            observation, {key: row[0] for key, row in features.items()}
-        )
+        return with_features(observation, {k: row[0] for k, row in features.items()})
 
 
 def scenario_of(env: Any) -> Scenario:
@@ -297,11 +293,9 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
             self._ended = ended
         return self._with_beliefs(observations), rewards, terminated, truncated, infos
 
-    def _finish(
-        self, observations: Observations, ended: BoolArray, infos: Infos
-    ) -> None:
+    def _finish(self, observed: Observations, ended: BoolArray, infos: Infos) -> None:
         """Update with the last scan of ended episodes, then with the first new one."""
-        last = {key: rows.copy() for key, rows in observations.items()}
+        last = {key: rows.copy() for key, rows in observed.items()}
         for world in np.flatnonzero(ended).tolist():
             for key, rows in last.items():
                 rows[world] = infos["final_obs"][world][key]
@@ -310,7 +304,7 @@ class BeliefObservationVector(VectorWrapper):  # see FlattenBatch
             return
         shown = self._with_beliefs(last)
         infos["final_obs"] = final_infos(shown, {}, ended)["final_obs"]
-        self._begin(observations, ended)
+        self._begin(observed, ended)
 
     def _begin(self, observations: Observations, worlds: BoolArray) -> None:
         self._restart(worlds)
@@ -398,25 +392,21 @@ class SeparateFilters(Restorable):
             self._steps[run] = 0
 
     def update(
-        self,
-        observations: Mapping[str, AnyArray],
-        worlds: BoolArray,
-        *,
-        moved: BoolArray,
+        self, observed: Mapping[str, AnyArray], worlds: BoolArray, *, moved: BoolArray
     ) -> None:
         """Update the filters of some worlds with an observation, batched along B.
 
         Parameters
         ----------
-        observations : mapping
+        observed : mapping
             Batched observations of a landmark world.
         worlds : bool ndarray, shape (B,)
             Worlds whose filters are updated.
         moved : bool ndarray, shape (B,)
             Which of them have moved; the others take the scan from their start.
         """
-        odometry, masks = observations["odometry"], observations["mask"]
-        landmarks = observations["landmarks"]
+        odometry, masks = observed["odometry"], observed["mask"]
+        landmarks = observed["landmarks"]
         for run, slam in enumerate(self.filters):
             if not worlds[run]:
                 continue

@@ -1,7 +1,5 @@
 """Estimators in the loop of an agent: construction, and checks of their beliefs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -209,6 +207,4 @@ def _first(part: str, values: AnyArray, wrong: BoolArray) -> str:
 
 
 def _has_a_method(estimator: Any) -> bool:
-    return any(hasattr(estimator, method) for method in _METHODS) or not callable(
-        estimator
-    )
+    return any(hasattr(estimator, name) for name in _METHODS) or not callable(estimator)

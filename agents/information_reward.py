@@ -14,8 +14,6 @@ other states. So P has a fixed size, and the decreases of a criterion over an ep
 add up to its first value minus its last.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, SupportsFloat
 
@@ -139,9 +137,7 @@ def effort(actions: ArrayLike, limits: ArrayLike) -> Array:
     >>> effort([[0.0, 0.0], [1.0, 0.0], [9.0, 9.0]], limits=(1.0, 2.0)).tolist()
     [0.0, 0.5, 1.0]
     """
-    bounded = np.minimum(
-        np.abs(np.asarray(actions, dtype=np.float64)) / np.asarray(limits), 1.0
-    )
+    bounded = np.minimum(np.abs(np.asarray(actions, float)) / np.asarray(limits), 1.0)
     return np.asarray(0.5 * (bounded[..., 0] ** 2 + bounded[..., 1] ** 2))
 
 

@@ -59,10 +59,10 @@ class WallRoutes:
         walls = np.array(scenario.walls).view(np.complex128)
         self._starts, self._ends = walls[:, 0], walls[:, 1]
         self._margin = scenario.robot.radius + _GAP
+        #: Whether every way is straight.
         self.is_open = not has_inner_walls(scenario)
-        """Whether every way is straight."""
+        #: Which cells the robot can get to from its start, shape (C,).
         self.reachable: BoolArray = np.ones(len(cells), dtype=np.bool_)
-        """Which cells the robot can get to from its start, shape (C,)."""
         if self.is_open:
             return
         rings = np.unique(walls)[:, None] + _WIDER * self._margin * _CORNERS
@@ -288,8 +288,8 @@ class CoverageGrid:
         hiding = walls if sensor.occlusion else walls[:0]
         view = as_view(sensor.max_range, sensor.field_of_view, hiding)
         places = np.stack([self.cells.real, self.cells.imag])
+        #: A `Floor`, as kernels take it.
         self.plan = places, walls, self.bounds, self.diagonal, tuple(view)
-        """A `Floor`, as kernels take it."""
         self._scenario = scenario
 
     @cached_property

@@ -23,13 +23,7 @@ from agents_frames import frames_line
 from agents_peers import peer_calls
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers.vector import FlattenObservation
-from interleaved import (
-    bare_steps,
-    microseconds,
-    ratio,
-    time_interleaved,
-    verdict,
-)
+from interleaved import bare_steps, microseconds, ratio, time_interleaved, verdict
 from rich.console import Console
 from rich.table import Table
 

@@ -25,11 +25,7 @@ from numpy.typing import NDArray
 
 from slamgym.estimator import EkfSlam, UpdateReport
 from slamgym.estimator.models.bearing_range import predict_measurement
-from slamgym.experiments.monte_carlo import (
-    monte_carlo,
-    runner,
-    summarise_monte_carlo,
-)
+from slamgym.experiments.monte_carlo import monte_carlo, runner, summarise_monte_carlo
 from slamgym.sim_configs import Scenario, load_scenario
 
 Array = NDArray[np.float64]
@@ -205,11 +201,7 @@ FAULTS = (
     Fault("clipped range", (MODEL,), input=clipped),
     Fault("turns first", (MODEL,), TurnsFirst),
     Fault("scan used twice", (COVARIANCE,), UsesTwice),
-    Fault(
-        "no wrap",
-        (MODEL,),
-        textbook("nu[::2] = wrap_angle(nu[::2])", ""),
-    ),
+    Fault("no wrap", (MODEL,), textbook("nu[::2] = wrap_angle(nu[::2])", "")),
     Fault(
         "covariance of the pose and the map not moved",
         (COVARIANCE,),
@@ -232,9 +224,7 @@ FAULTS = (
     ),
     Fault("odometry one step late", (MODEL,), input=late_odometry),
     Fault(
-        "no heading in H",
-        (COVARIANCE,),
-        textbook("-dx / r**2, -1)", "-dx / r**2, 0)"),
+        "no heading in H", (COVARIANCE,), textbook("-dx / r**2, -1)", "-dx / r**2, 0)")
     ),
     Fault("two identities swapped", (MODEL,), input=swapped),
     Fault(

@@ -90,9 +90,7 @@ def load_earlier(folder: Path) -> None:
     """Import slamgym from a checkout of an earlier commit, under another name."""
     package = folder / "src" / "slamgym"
     found = spec_from_file_location(
-        EARLIER,
-        package / "__init__.py",
-        submodule_search_locations=[str(package)],
+        EARLIER, package / "__init__.py", submodule_search_locations=[str(package)]
     )
     assert found is not None
     assert found.loader is not None

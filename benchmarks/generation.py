@@ -41,11 +41,7 @@ BARE_STEPS = 300_000
 
 
 def world() -> Scenario:
-    layout = {
-        "layout": "random",
-        "count": 20,
-        "bounds": [-10.0, -10.0, 10.0, 10.0],
-    }
+    layout = {"layout": "random", "count": 20, "bounds": [-10.0, -10.0, 10.0, 10.0]}
     return load_scenario("loop").with_changes(steps=STEPS, landmarks=layout)
 
 

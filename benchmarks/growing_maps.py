@@ -29,15 +29,7 @@ import matplotlib as mpl
 import numpy as np
 from growing_maps_overview import SIZES, SMALLEST, show_overview
 from growing_maps_peers import FullWithDsyrk, Isam2
-from growing_maps_timing import (
-    STRETCH,
-    Costs,
-    Reading,
-    Step,
-    least,
-    measure,
-    step_of,
-)
+from growing_maps_timing import STRETCH, Costs, Reading, Step, least, measure, step_of
 from interleaved import verdict
 from matplotlib import pyplot as plt
 from numpy.typing import NDArray

@@ -145,12 +145,8 @@ def _stonesoup_models(  # noqa: C901 (Stone Soup takes models as classes)
     noise: tuple[Array, Array], data: tuple[Array, Array, Any]
 ) -> tuple[Any, Any]:
     from stonesoup.base import Property  # noqa: PLC0415
-    from stonesoup.models.measurement.nonlinear import (  # noqa: PLC0415
-        NonLinearGaussianMeasurement,
-    )
-    from stonesoup.models.transition.nonlinear import (  # noqa: PLC0415
-        GaussianTransitionModel,
-    )
+    from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement  # noqa: PLC0415
+    from stonesoup.models.transition.nonlinear import GaussianTransitionModel  # noqa: PLC0415
     from stonesoup.types.array import StateVector  # noqa: PLC0415
 
     (R, Q), (odometry, z, slots) = noise, data

@@ -39,8 +39,8 @@ __all__ = [
     "planned_path",
 ]
 
+#: The names that :func:`make_controller` accepts.
 CONTROLLERS = ("open_loop", "waypoints", "random")
-"""The names that :func:`make_controller` accepts."""
 
 
 def make_controller(

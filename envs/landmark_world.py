@@ -98,7 +98,7 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
     """  # noqa: E501 (tables)
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": _FPS}  # noqa: RUF012
-    _changing: ClassVar[tuple[str, ...]] = (
+    changing: ClassVar[tuple[str, ...]] = (
         *("_np_random", "_np_random_seed", "_drawn_scenario", "_sensor", "_starts"),
         *("_noise", "_landmarks", "_body", "_start_estimate", "_motion_noise"),
         *("_sensor_noise", "_steps_left", "_renderer", "_key"),

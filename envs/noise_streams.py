@@ -59,7 +59,7 @@ class NoiseRows(Restorable, Generic[Row]):
     (0.1, 0.2)
     """
 
-    _changing = ("_draw", "_next", "_block", "_to_come")
+    changing = ("_draw", "_next", "_block", "_to_come")
 
     def __init__(
         self, draw: Callable[[IntArray], Iterable[Row]], first: int = 0
@@ -83,16 +83,16 @@ class SensorSettings(NamedTuple):
     Numbers are columns, shape (K, 1), or plain for one world.
     """
 
+    #: Of unit noise, shape (K, 2); (σβ, σr) [rad, m], 1 instead of σr where that grows
+    #: with the range.
     scale: Array
-    """Of unit noise, shape (K, 2); (σβ, σr) [rad, m], 1 instead of σr where that grows
-    with the range."""
+    #: σr at range 0 [m].
     range_std: float | Array
-    """σr at range 0 [m]."""
+    #: k in σr(r) = σr + k r; of K worlds, zero in all or none.
     growth: float | Array
-    """k in σr(r) = σr + k r; of K worlds, zero in all or none."""
     dropout: float | Array
+    #: P(at most k false readings), shape (K, C).
     counts_below: Array
-    """P(at most k false readings), shape (K, C)."""
     max_range: float | Array
     field_of_view: float | Array
 
@@ -239,8 +239,8 @@ class PoseSensors:
         gps, compass = scenario.gps, scenario.compass
         sensors = gps, gps, compass
         self.present = gps is not None or compass is not None
+        #: (σx, σy, σθ) [m, m, rad]; 0 where there is no sensor.
         self.std = np.array([0.0 if each is None else each.std for each in sensors])
-        """(σx, σy, σθ) [m, m, rad]; 0 where there is no sensor."""
         self._every = np.array([0 if each is None else each.every for each in sensors])
 
     def read(self, keys: WordArray, steps: IntArray, poses: Array) -> Array:
@@ -309,8 +309,8 @@ def _poisson_cdf(mean: float, largest: int) -> Array:
 # The transformation keeps the rank of every number, so a world with heavy tails uses
 # the random numbers of the same world without them.
 
+#: Bound of normal noise in standard deviations; the probability beyond is 1e-23.
 MANY_STD = 10.0
-"""Bound of normal noise in standard deviations; the probability beyond is 1e-23."""
 
 
 def heavy_tails(unit: Array, degrees: float) -> Array:

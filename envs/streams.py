@@ -72,8 +72,8 @@ class EpisodeStarts:
         start, self._layout = scenario.start, scenario.landmarks
         self._pose, self._std = np.array(start.pose), np.array(start.std)
         self._draws_truth = start.drawn == "truth"
+        #: Whether every episode has new landmarks.
         self.redraws_landmarks = self._layout.is_redrawn
-        """Whether every episode has new landmarks."""
 
     def poses(self, keys: WordArray) -> tuple[Array, Array]:
         """Return true and estimated start poses, each of shape (K, 3) [m, m, rad]."""

@@ -54,10 +54,10 @@ Belief and UpdateReport are in slamgym.estimator; the mean is (x, y, θ, l1x, l1
 class Finding(NamedTuple):
     """One result of the checks."""
 
+    #: "required" to run at all, "correct" for right beliefs, or "recommended".
     level: Level
-    """"required" to run at all, "correct" for right beliefs, or "recommended"."""
+    #: The method, what is expected of it, and what it did.
     message: str
-    """The method, what is expected of it, and what it did."""
 
     def __str__(self) -> str:
         return f"{self.level}: {self.message}"
@@ -76,8 +76,8 @@ class CallError(Exception):
 
     def __init__(self, message: str, cause: object = None) -> None:
         super().__init__(message)
+        #: Equal for calls that failed for the same reason.
         self.cause = cause or message
-        """Equal for calls that failed for the same reason."""
 
 
 Check = Callable[[Factory], Iterator[str | CallError]]
@@ -248,15 +248,13 @@ def same_beliefs(one: Belief, other: Belief) -> bool:
     )
 
 
-def _called(
-    name: str, function: Callable[..., Any], *arguments: Any, **keywords: Any
-) -> Any:
+def _called(name: str, function: Callable[..., Any], *values: Any, **named: Any) -> Any:
     """Call a function of the user; describe the call if it fails."""
     try:
-        return function(*arguments, **keywords)
+        return function(*values, **named)
     except Exception as error:
-        shown = [_shown(value) for value in arguments]
-        shown += [f"{key}={_shown(value)}" for key, value in keywords.items()]
+        shown = [_shown(value) for value in values]
+        shown += [f"{key}={_shown(value)}" for key, value in named.items()]
         kind, place = type(error).__name__, _place(error)
         message = f"{name}({', '.join(shown)}) raised {kind}: {error}{place}"
         raise CallError(message, (name, kind, place or str(error))) from error
@@ -652,6 +650,7 @@ def check_repeated_runs(factory: Factory) -> Iterator[str]:
         yield "reset() should forget the run, but the next one differs from a first one"
 
 
+#: The checks of each level, in the order of their findings.
 CHECKS: dict[Level, tuple[Check, ...]] = {
     "required": (
         check_interface,
@@ -682,4 +681,3 @@ CHECKS: dict[Level, tuple[Check, ...]] = {
         check_repeated_runs,
     ),
 }
-"""The checks of each level, in the order of their findings."""

@@ -59,15 +59,15 @@ class _Call(NamedTuple):
     """One call: its equation, and what the equation needs."""
 
     method: str
+    #: Of both Jacobians and the covariance of the noise.
     equation: Callable[..., _Gaussian]
-    """Of both Jacobians and the covariance of the noise."""
     jacobians: tuple[Array, Array]
     rows: tuple[str, ...]
     columns: tuple[tuple[str, ...], tuple[str, ...]]
+    #: The right one by "", wrong ones by the mistake that leads to them.
     noises: dict[str, Array]
-    """The right one by "", wrong ones by the mistake that leads to them."""
+    #: Results of other mistakes.
     others: dict[str, _Gaussian]
-    """Results of other mistakes."""
 
     def right(self) -> _Gaussian:
         return self.equation(*self.jacobians, self.noises[""])
@@ -76,13 +76,11 @@ class _Call(NamedTuple):
         """Yield frequent mistakes, each with the belief that it leads to."""
         noise = self.noises[""]
         for which, columns in enumerate(self.columns):
-            for (i, row), (j, column) in product(
-                enumerate(self.rows), enumerate(columns)
-            ):
+            for (i, row), (j, col) in product(enumerate(self.rows), enumerate(columns)):
                 for factor, text in ((-1, "has the wrong sign"), (0, "is missing")):
                     changed = [jacobian.copy() for jacobian in self.jacobians]
                     changed[which][..., i, j] *= factor
-                    yield f"∂{row}/∂{column} {text}", self.equation(*changed, noise)
+                    yield f"∂{row}/∂{col} {text}", self.equation(*changed, noise)
         for text, wrong in self.noises.items():
             yield text, self.equation(*self.jacobians, wrong)
         yield from self.others.items()

@@ -15,13 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
+from .models import rigid_motion
 from .models.bearing_range import wrap_angle
-from .models.rigid_motion import (
-    ErrorFrame,
-    additive_error,
-    invariant_covariance,
-    invariant_error,
-)
 from .support.undo import Undo, to_the_end, undo_all, undone_on_error
 
 __all__ = [
@@ -131,8 +126,8 @@ class SupportsDecisions(Protocol):
 class SmoothedPath(Protocol):
     """Beliefs about the poses of a drive, given all of its readings."""
 
+    #: At every scan, shape (N, 3) [m, m, rad].
     poses: Array
-    """At every scan, shape (N, 3) [m, m, rad]."""
 
     @property
     def pose_covariances(self) -> Array:
@@ -183,8 +178,8 @@ class SupportsMemoryEstimate(Protocol):
 class SupportsBeliefLimit(Protocol):
     """An estimator that refuses a dense belief of too many landmarks."""
 
+    #: Largest number of landmarks of a dense belief.
     belief_limit: int
-    """Largest number of landmarks of a dense belief."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -194,14 +189,14 @@ class Belief:
     The state is (x, y, θ, l1x, l1y, …), landmarks in the order of ``landmark_ids``.
     """
 
+    #: Shape (3 + 2n,), heading in [-π, π); a column may be given.
     mean: Array
-    """Shape (3 + 2n,), heading in [-π, π); a column may be given."""
+    #: Shape (3 + 2n, 3 + 2n), of the additive error.
     covariance: Array
-    """Shape (3 + 2n, 3 + 2n), of the additive error."""
+    #: Given as any sequence or array, kept as a tuple.
     landmark_ids: tuple[int, ...]
-    """Given as any sequence or array, kept as a tuple."""
-    frame: ErrorFrame = "additive"
-    """Coordinates in which the filter takes its error to be Gaussian."""
+    #: Coordinates in which the filter takes its error to be Gaussian.
+    frame: rigid_motion.ErrorFrame = "additive"
 
     def __post_init__(self) -> None:
         mean = np.array(self.mean, dtype=np.float64).ravel()
@@ -229,7 +224,7 @@ class Belief:
         covariance: Array,
         slots: Mapping[int, int],
         landmark_ids: Sequence[int],
-        frame: ErrorFrame = "additive",
+        frame: rigid_motion.ErrorFrame = "additive",
     ) -> Belief:
         """Return the belief over the pose and some landmarks of a larger state.
 
@@ -298,13 +293,13 @@ class Belief:
                 f"(n, 2), got {np.shape(true_pose)} and {np.shape(true_landmarks)}"
             )
         if self._chosen(frame) == "invariant":
-            return invariant_error(truth, self.mean)
-        return additive_error(truth, self.mean)
+            return rigid_motion.invariant_error(truth, self.mean)
+        return rigid_motion.additive_error(truth, self.mean)
 
     def error_covariance(self, frame: str | None = None) -> Array:
         """Return the covariance (3 + 2n, 3 + 2n) that belongs to :meth:`error`."""
         if self._chosen(frame) == "invariant":
-            return invariant_covariance(self.mean, self.covariance)
+            return rigid_motion.invariant_covariance(self.mean, self.covariance)
         return self.covariance
 
     def __repr__(self) -> str:
@@ -321,14 +316,14 @@ class Belief:
 class MapView(NamedTuple):
     """The present belief of a filter, without a copy: not to keep or to change."""
 
+    #: In the order of the state; there may be room behind it.
     mean: Array
-    """In the order of the state; there may be room behind it."""
+    #: Of the additive error; there may be room behind it.
     covariance: Array
-    """Of the additive error; there may be room behind it."""
+    #: Landmarks in the order of the state.
     ids: Sequence[int]
-    """Landmarks in the order of the state."""
+    #: All landmarks in the map, where the view holds only those around the robot.
     whole: Sequence[int] | None = None
-    """All landmarks in the map, where the view holds only those around the robot."""
 
     @property
     def mapped(self) -> Sequence[int]:
@@ -457,14 +452,14 @@ def describe_filter(slam: _HasMarginals) -> str:
 class ScanDecisions(NamedTuple):
     """Final assignment of the readings of one scan to landmarks."""
 
+    #: The landmark of each row; None where the filter did not use the row.
     row_ids: tuple[int | None, ...]
-    """The landmark of each row; None where the filter did not use the row."""
+    #: Landmarks that entered the map with this scan; the row of each confirmed it.
     added: tuple[int, ...] = ()
-    """Landmarks that entered the map with this scan; the row of each confirmed it."""
+    #: Landmarks that left the map after it.
     removed: tuple[int, ...] = ()
-    """Landmarks that left the map after it."""
+    #: Landmarks merged after it, (kept, gone); the second ones left the map.
     merged: tuple[tuple[int, int], ...] = ()
-    """Landmarks merged after it, (kept, gone); the second ones left the map."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -474,40 +469,40 @@ class UpdateReport:
     ``innovation`` rows belong to ``associated_ids``; ν and S are those at the prior.
     """
 
+    #: νᵀ S⁻¹ ν, χ² distributed when the filter is consistent.
     nis: float = 0.0
-    """νᵀ S⁻¹ ν, χ² distributed when the filter is consistent."""
+    #: Of the NIS: twice the number of associated readings.
     degrees_of_freedom: int = 0
-    """Of the NIS: twice the number of associated readings."""
+    #: Mapped landmarks whose readings corrected the belief.
     associated_ids: tuple[int, ...] = ()
-    """Mapped landmarks whose readings corrected the belief."""
+    #: Landmarks that entered the map.
     added_ids: tuple[int, ...] = ()
-    """Landmarks that entered the map."""
+    #: Mapped landmarks whose readings the chi-square gate rejected.
     rejected_ids: tuple[int, ...] = ()
-    """Mapped landmarks whose readings the chi-square gate rejected."""
+    #: Landmarks whose readings are too close to use (range below ``min_range``).
     skipped_ids: tuple[int, ...] = ()
-    """Landmarks whose readings are too close to use (range below ``min_range``)."""
+    #: Mapped landmarks within 10 σ of the robot, where linearising is unsafe.
     near_ids: tuple[int, ...] = ()
-    """Mapped landmarks within 10 σ of the robot, where linearising is unsafe."""
+    #: ν, shape (m, 2), rows (bearing, range) [rad, m].
     innovation: Array = field(default_factory=lambda: np.empty((0, 2)))
-    """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
+    #: L, shape (2m, 2m), lower triangular, L Lᵀ = S; or a function that returns it.
     factor: Array | Callable[[], Array] = field(
         default_factory=lambda: np.empty((0, 0))
     )
-    """L, shape (2m, 2m), lower triangular, L Lᵀ = S; or a function that returns it."""
+    #: Landmarks that were tentative before: among ``added_ids``, or among those
+    #: associated where the filter has applied their earlier sightings.
     confirmed_ids: tuple[int, ...] = ()
-    """Landmarks that were tentative before: among ``added_ids``, or among those
-    associated where the filter has applied their earlier sightings."""
+    #: Landmarks marginalised: missed too often, or beyond the map's capacity.
     removed_ids: tuple[int, ...] = ()
-    """Landmarks marginalised: missed too often, or beyond the map's capacity."""
+    #: Pairs (kept, gone) of landmarks that were merged.
     merged_ids: tuple[tuple[int, int], ...] = ()
-    """Pairs (kept, gone) of landmarks that were merged."""
+    #: The landmark associated with each row of the scan, None for a row without one;
+    #: empty without landmark management.
     row_ids: tuple[int | None, ...] = ()
-    """The landmark associated with each row of the scan, None for a row without one;
-    empty without landmark management."""
+    #: Rows of the scan associated with a landmark that is not confirmed yet.
     tentative_rows: tuple[int, ...] = ()
-    """Rows of the scan associated with a landmark that is not confirmed yet."""
+    #: Rows left out: they fit more than one landmark, or their range is too short.
     ambiguous_rows: tuple[int, ...] = ()
-    """Rows left out: they fit more than one landmark, or their range is too short."""
 
     @property
     def innovation_factor(self) -> Array:

@@ -15,14 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 from numpy.typing import ArrayLike
 
 from ..suggestions import closest
+from .filters import ekf
 from .filters.batch import BatchSlam
-from .filters.ekf import (
-    EkfSlam,
-    FirstEstimatesEkfSlam,
-    InvariantEkfSlam,
-    IteratedEkfSlam,
-    ObservabilityConstrainedEkfSlam,
-)
 from .filters.ideal import IdealEkfSlam
 from .filters.robocentric import RobocentricEkfSlam
 from .filters.unscented import UnscentedSlam
@@ -211,7 +205,7 @@ def make_batch(
     estimator = make_estimator(
         name, motion_std=motion_std, measurement_std=measurement_std, **options
     )
-    if not isinstance(estimator, EkfSlam):
+    if not isinstance(estimator, ekf.EkfSlam):
         raise ValueError(f"{name} cannot run in batches")
     return BatchSlam(
         estimator,
@@ -254,7 +248,7 @@ def _known_options(factory: EstimatorFactory) -> list[str]:
     if not isinstance(factory, type):
         return _keywords(factory)[0]
     names: list[str] = []
-    for maker in (*factory.__mro__[:-1], EkfSlam):  # the base filter of a large map
+    for maker in (*factory.__mro__[:-1], ekf.EkfSlam):  # the base filter of a large map
         own, passes_others = _keywords(maker)
         names += [name for name in own if name not in names]
         if not passes_others:
@@ -290,11 +284,11 @@ def accepted_options(
 _LARGE = f"{__package__}.large_maps"
 
 _factories |= {
-    "ekf": EkfSlam,
-    "invariant": InvariantEkfSlam,
-    "first_estimates": FirstEstimatesEkfSlam,
-    "observability_constrained": ObservabilityConstrainedEkfSlam,
-    "iterated": IteratedEkfSlam,
+    "ekf": ekf.EkfSlam,
+    "invariant": ekf.InvariantEkfSlam,
+    "first_estimates": ekf.FirstEstimatesEkfSlam,
+    "observability_constrained": ekf.ObservabilityConstrainedEkfSlam,
+    "iterated": ekf.IteratedEkfSlam,
     "unscented": UnscentedSlam,
     "robocentric": RobocentricEkfSlam,
     "ideal": IdealEkfSlam,

@@ -16,8 +16,6 @@ stands at the end of the run::
 Readings before the confirming one count where the filter applied them in the end.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -36,24 +34,24 @@ CLUTTER = -1  # the true landmark of a reading that has none
 class AssociationScores(NamedTuple):
     """Counts of readings, and sizes of maps."""
 
+    #: Readings given to the mapped landmark that they are of.
     correct: int
-    """Readings given to the mapped landmark that they are of."""
+    #: Readings of a true landmark given to a mapped landmark of another place.
     wrong: int
-    """Readings of a true landmark given to a mapped landmark of another place."""
+    #: New landmarks of a place that was not in the map.
     new_correct: int
-    """New landmarks of a place that was not in the map."""
+    #: New landmarks of a place that was in the map already.
     duplicate: int
-    """New landmarks of a place that was in the map already."""
+    #: New landmarks confirmed by clutter.
     ghost: int
-    """New landmarks confirmed by clutter."""
+    #: Readings of a place in the map that were given to no landmark.
     missed: int
-    """Readings of a place in the map that were given to no landmark."""
+    #: Clutter given to a mapped landmark.
     clutter_used: int
-    """Clutter given to a mapped landmark."""
+    #: Landmarks in the map at the end.
     map_size: int
-    """Landmarks in the map at the end."""
+    #: Places seen often enough to be known, by the rule of confirmation.
     true_map_size: int
-    """Places seen often enough to be known, by the rule of confirmation."""
 
     @property
     def precision(self) -> float:
@@ -371,20 +369,20 @@ CUTOFF = 1.0  # an estimate farther than this from a true landmark is not of it 
 class Gospa(NamedTuple):
     """The metric and its three parts: distance² = localisation + missed + false."""
 
+    #: The metric [m].
     distance: float
-    """The metric [m]."""
+    #: Σ ‖x − y‖² over the pairs [m²].
     localisation: float
-    """Σ ‖x − y‖² over the pairs [m²]."""
+    #: c²/2 for each true landmark without an estimate [m²].
     missed: float
-    """c²/2 for each true landmark without an estimate [m²]."""
+    #: c²/2 for each estimate without a true landmark [m²].
     false: float
-    """c²/2 for each estimate without a true landmark [m²]."""
+    #: Number of pairs.
     pairs: int
-    """Number of pairs."""
+    #: Number of missed landmarks.
     missed_count: int
-    """Number of missed landmarks."""
+    #: Number of false landmarks.
     false_count: int
-    """Number of false landmarks."""
 
 
 def gospa(

@@ -5,8 +5,6 @@ sum is not chi-square, and such a test rejects a consistent filter far more ofte
 stated.  Every sum here is over independent numbers: one per run, or innovations.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 
@@ -16,33 +14,19 @@ from numpy.typing import ArrayLike
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.models.rigid_motion import ErrorFrame
 from ..estimator.support import argument_checks
-from .hypothesis_tests import (
-    EQUIVALENCE_MARGIN,
-    Band,
-    EquivalenceTest,
-    FamilyTest,
-    HypothesisTest,
-    bootstrap_test,
-    equivalence_test,
-    family_test,
-    final_step_test,
-    nis_test,
-    runs_to_detect,
-    time_average_test,
-    whiteness_test,
-)
+from . import hypothesis_tests as tests
 
+#: Number of runs below which the report warns that it finds large errors only.
 FEW_RUNS = 20
-"""Number of runs below which the report warns that it finds large errors only."""
+#: Number of runs below which the t-test rejects too often to count in the verdict.
 FEW_AVERAGES = 10
-"""Number of runs below which the t-test rejects too often to count in the verdict."""
 FACTORS = (1.1, 1.2, 1.5)
 _GRID = 10
 _LAGS = 10
 _ERROR_RATE = 0.05
 _MOST_NAMES = 10
-_NOTHING = HypothesisTest(np.nan, Band(np.nan, np.nan), np.nan, _ERROR_RATE)
-"""The outcome of a test without data."""
+#: The outcome of a test without data.
+_NOTHING = tests.HypothesisTest(np.nan, tests.Band(np.nan, np.nan), np.nan, _ERROR_RATE)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,37 +37,37 @@ class ConsistencyReport:
     ``str(report)`` gives one sentence per test.
     """
 
+    #: Error coordinates of the NEES.
     frame: str
-    """Error coordinates of the NEES."""
     degrees_of_freedom: int
+    #: Number of runs, failed ones included.
     runs: int
-    """Number of runs, failed ones included."""
+    #: Rows with nan in place of a NEES or NIS; no test counts them.
     failed_runs: tuple[int, ...]
-    """Rows with nan in place of a NEES or NIS; no test counts them."""
+    #: Leading steps at which no run has a NEES, as at a start known for certain.
     undefined_steps: int
-    """Leading steps at which no run has a NEES, as at a start known for certain."""
-    final_step: HypothesisTest
-    time_average: HypothesisTest
-    bootstrap: HypothesisTest
-    family: FamilyTest
+    final_step: tests.HypothesisTest
+    time_average: tests.HypothesisTest
+    bootstrap: tests.HypothesisTest
+    family: tests.FamilyTest
+    #: Steps of the grid of ``family``.
     family_steps: IntArray
-    """Steps of the grid of ``family``."""
-    nis: HypothesisTest
-    whiteness: HypothesisTest
-    equivalence: EquivalenceTest
+    nis: tests.HypothesisTest
+    whiteness: tests.HypothesisTest
+    equivalence: tests.EquivalenceTest
+    #: Mean of the runs' time averages.
     mean_ratio: float
-    """Mean of the runs' time averages."""
+    #: Median of the runs' time averages.
     median_ratio: float
-    """Median of the runs' time averages."""
+    #: Share of the runs whose time average is above 3.
     share_above_3: float
-    """Share of the runs whose time average is above 3."""
+    #: Fewest runs without which the mean of the others is inside the margin, 0 if it is
+    #: anyway.
     deciding_runs: int
-    """Fewest runs without which the mean of the others is inside the margin, 0 if it is
-    anyway."""
+    #: Mean without these runs.
     ratio_of_others: float
-    """Mean without these runs."""
+    #: (factor, number of runs with which the final step finds it in 90 % of cases).
     runs_needed: tuple[tuple[float, int], ...]
-    """(factor, number of runs with which the final step finds it in 90 % of cases)."""
 
     def __repr__(self) -> str:
         return (
@@ -123,13 +107,11 @@ class ConsistencyReport:
         """Return what weakens the report: failed runs, few runs."""
         found = []
         if self.failed_runs:
-            count = len(self.failed_runs)
+            n = len(self.failed_runs)
             names = ", ".join(map(str, self.failed_runs[:_MOST_NAMES]))
-            if count > _MOST_NAMES:
-                names += f" and {count - _MOST_NAMES} more"
-            found.append(
-                f"{count} of {self.runs} runs failed and are left out: {names}."
-            )
+            if n > _MOST_NAMES:
+                names += f" and {n - _MOST_NAMES} more"
+            found.append(f"{n} of {self.runs} runs failed and are left out: {names}.")
         if self.used_runs < FEW_RUNS:
             found.append(few_runs(self.used_runs))
         return tuple(found)
@@ -137,7 +119,7 @@ class ConsistencyReport:
     def sentences(self) -> tuple[str, ...]:
         """Return the warnings, then one sentence per test with its error rate."""
         frame, grid, near = f"{self.frame} frame", self.family, self.equivalence
-        low, high = EQUIVALENCE_MARGIN
+        low, high = tests.EQUIVALENCE_MARGIN
         needed = ", ".join(f"{factor:g}: {runs}" for factor, runs in self.runs_needed)
         innovations = (
             _sentence("NIS over all scans, χ²", "ratio", self.nis),
@@ -209,14 +191,16 @@ def evaluate_consistency(
         runs=len(failed),
         failed_runs=tuple(np.flatnonzero(failed).tolist()),
         undefined_steps=first,
-        final_step=final_step_test(scores[:, -1], dof),
-        time_average=time_average_test(averages, dof),
-        bootstrap=bootstrap_test(averages, dof, rng=rng),
-        family=family_test(scores[:, grid], dof),
+        final_step=tests.final_step_test(scores[:, -1], dof),
+        time_average=tests.time_average_test(averages, dof),
+        bootstrap=tests.bootstrap_test(averages, dof, rng=rng),
+        family=tests.family_test(scores[:, grid], dof),
         family_steps=grid + first,
-        nis=nis_test(scans, freedom) if has_nis else _NOTHING,
-        whiteness=whiteness_test(scans, freedom, lags=lags) if has_nis else _NOTHING,
-        equivalence=equivalence_test(averages, dof),
+        nis=tests.nis_test(scans, freedom) if has_nis else _NOTHING,
+        whiteness=tests.whiteness_test(scans, freedom, lags=lags)
+        if has_nis
+        else _NOTHING,
+        equivalence=tests.equivalence_test(averages, dof),
         mean_ratio=float(averages.mean() / dof),
         median_ratio=float(np.median(averages) / dof),
         share_above_3=float(np.mean(averages > 3 * dof)),
@@ -230,7 +214,7 @@ def _deciding_runs(ratios: Array) -> tuple[int, float]:
     """Return how many of the largest ratios lift the mean, and that of the others."""
     smallest = np.sort(ratios)
     means = np.cumsum(smallest) / np.arange(1, len(smallest) + 1)
-    inside = np.flatnonzero(means <= EQUIVALENCE_MARGIN.high)
+    inside = np.flatnonzero(means <= tests.EQUIVALENCE_MARGIN.high)
     kept = int(inside[-1]) + 1 if len(inside) else len(means)
     return len(means) - kept, float(means[kept - 1])
 
@@ -247,7 +231,7 @@ def assert_consistent(report: ConsistencyReport) -> None:
 
 @cache
 def _runs_needed(dof: int) -> tuple[tuple[float, int], ...]:
-    return tuple((factor, runs_to_detect(factor, dof)) for factor in FACTORS)
+    return tuple((factor, tests.runs_to_detect(factor, dof)) for factor in FACTORS)
 
 
 def _same_shape(
@@ -279,7 +263,7 @@ def _gaps(nees: Array, nis: Array, freedom: IntArray) -> tuple[int, BoolArray]:
     return first, failed
 
 
-def _sentence(title: str, name: str, test: HypothesisTest) -> str:
+def _sentence(title: str, name: str, test: tests.HypothesisTest) -> str:
     found = f"{title}: {name} {test.statistic:.3f}"
     if np.isnan(test.p_value):
         return f"{found}, nothing decided: too few runs, or all equal."

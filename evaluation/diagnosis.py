@@ -37,6 +37,7 @@ from .noise_findings import (
 HONEST, CANNOT_TELL = "honest", "cannot tell"
 LINEARISATION, ASSOCIATION = "linearisation", "association"
 WRONG_COVARIANCE, WRONG_MODEL = "wrong covariance", "wrong model"
+#: All answers of :func:`diagnose`.
 CAUSES = (
     HONEST,
     *(
@@ -56,12 +57,11 @@ CAUSES = (
     ASSOCIATION,
     CANNOT_TELL,
 )
-"""All answers of :func:`diagnose`."""
+#: Probabilities of a false answer about the noise, and about the filter.
 NOISE_RATE, FILTER_RATE = 0.02, 0.02
-"""Probabilities of a false answer about the noise, and about the filter."""
 _ERROR_RATE = 0.05
+#: NIS per degree from which on a filter does not use the noise that it is given.
 LARGEST_NIS = 1.15
-"""NIS per degree from which on a filter does not use the noise that it is given."""
 FEWEST_RUNS = 20
 _WITHOUT_SMALL_NOISE = (
     "The cause is the linearisation, a wrong model or a wrong covariance; the same "
@@ -72,27 +72,27 @@ _WITHOUT_SMALL_NOISE = (
 class Diagnosis(NamedTuple):
     """The answer of :func:`diagnose`."""
 
+    #: One of `CAUSES`.
     cause: str
-    """One of `CAUSES`."""
+    #: Of the test that points to it, or the smallest; adjusted for their number.
     p_value: float
-    """Of the test that points to it, or the smallest; adjusted for their number."""
     sentence: str
+    #: Further causes that the noise shows, the one with the largest effect first.
     others: tuple[str, ...] = ()
-    """Further causes that the noise shows, the one with the largest effect first."""
+    #: How many of the first runs to repeat with less noise (`SmallNoise`), 0 for none:
+    #: they name the cause, as far as it can be named.
     repeat: int = 0
-    """How many of the first runs to repeat with less noise (`SmallNoise`), 0 for none:
-    they name the cause, as far as it can be named."""
 
 
 class SmallNoise(NamedTuple):
     """The same runs with less noise in the world, and in what the filter assumes."""
 
+    #: Time average of the NEES of the pose in each run, (M,); nan where not run.
     nees: ArrayLike
-    """Time average of the NEES of the pose in each run, (M,); nan where not run."""
+    #: That of the heading, (M,).
     heading_nees: ArrayLike
-    """That of the heading, (M,)."""
+    #: Of all noises, and of the deviations of the first pose.
     factor: float = 0.1
-    """Of all noises, and of the deviations of the first pose."""
 
 
 def diagnose(
@@ -324,15 +324,15 @@ def p_text(p_value: float) -> str:
 # average of a run, or its number of wrong associations.
 
 POSE = 3
+#: NEES per degree from which on a filter is overconfident.
 LEAST_RATIO = 1.1
-"""NEES per degree from which on a filter is overconfident."""
+#: Share of the smallest possible variance below which a reported one is false.
 KNOWABLE = 0.9
-"""Share of the smallest possible variance below which a reported one is false."""
+#: Quantile of χ²(3) beyond which a run is lost, and its rate that is accepted.
 LOST_LEVEL, LOST_RATE = 1e-4, 1e-3
-"""Quantile of χ²(3) beyond which a run is lost, and its rate that is accepted."""
+#: Shares of the excess: with less noise, that of the linearisation falls below the
+#: first, and that of a wrong model exceeds the second.
 SHRINKS, GROWS = 0.5, 3.0
-"""Shares of the excess: with less noise, that of the linearisation falls below the
-first, and that of a wrong model exceeds the second."""
 SMALLEST_NOISE = 0.01
 _CLEARLY, _MOST = 2.0, 0.75
 _FEWEST_OF_A_KIND = 5
@@ -343,12 +343,12 @@ class Errors(NamedTuple):
     """How far the covariances are from the errors."""
 
     p_value: float
+    #: NEES per degree over runs and steps, of pose or heading: farthest from 1.
     ratio: float
-    """NEES per degree over runs and steps, of pose or heading: farthest from 1."""
+    #: Number of lost runs.
     lost: int
-    """Number of lost runs."""
+    #: "pose" or "heading".
     of: str
-    """"pose" or "heading"."""
 
     @property
     def text(self) -> str:
@@ -364,12 +364,12 @@ class Blame(NamedTuple):
     """Whether wrong associations make the errors larger."""
 
     p_value: float
+    #: Of the runs with a wrong association.
     share: float
-    """Of the runs with a wrong association."""
+    #: The finding, if it is significant.
     text: str
-    """The finding, if it is significant."""
+    #: Whether the errors with known identities are known.
     is_paired: bool
-    """Whether the errors with known identities are known."""
 
 
 def errors_of(pose: Array, heading: Array) -> Errors:

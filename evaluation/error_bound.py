@@ -16,8 +16,6 @@ References
    discrete-time nonlinear filtering, IEEE Trans. Signal Processing 46(5), 1998.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -33,25 +31,25 @@ from ..jit import jit, njit_internal
 class PosteriorBound(NamedTuple):
     """Least mean squared errors of B runs, given their true paths; invariant frame."""
 
+    #: Of the position after each scan, shape (B, T) [m²].
     position: Array
-    """Of the position after each scan, shape (B, T) [m²]."""
+    #: Of the heading after each scan, shape (B, T) [rad²].
     heading: Array
-    """Of the heading after each scan, shape (B, T) [rad²]."""
+    #: Of the position in the additive frame, to first order, shape (B, T) [m²].
     raw_position: Array
-    """Of the position in the additive frame, to first order, shape (B, T) [m²]."""
+    #: At the end: of a landmark about the centre of the map, shape (B,) [m²].
     map: Array
-    """At the end: of a landmark about the centre of the map, shape (B,) [m²]."""
+    #: Of (x, y, θ, l1x, …) at the end of each run, shape (3 + 2n, 3 + 2n) for the n
+    #: landmarks that it read, in the order of their rows.
     covariances: tuple[Array, ...]
-    """Of (x, y, θ, l1x, …) at the end of each run, shape (3 + 2n, 3 + 2n) for the n
-    landmarks that it read, in the order of their rows."""
 
 
 class Efficiency(NamedTuple):
     """Bound divided by mean squared error, 1 for an estimate that cannot be better."""
 
     value: float
+    #: 95 %, by the scatter of the runs.
     interval: tuple[float, float]
-    """95 %, by the scatter of the runs."""
 
 
 def posterior_bound(
@@ -291,28 +289,22 @@ def _follow(
 
 @njit_internal
 def _move(
-    poses: Array,
-    landmarks: Array,
-    t: int,
-    variance: Array,
-    entry: Array,
-    P: Array,
-    size: int,
+    poses: Array, points: Array, t: int, noise: Array, entry: Array, P: Array, size: int
 ) -> None:
-    """Add the noise of the motion to scan t."""
+    """Add the noise of the motion to scan t, with the variances ``noise``."""
     cos, sin = np.cos(poses[t - 1, 2]), np.sin(poses[t - 1, 2])
     entry[0, 0], entry[1, 0] = cos, sin
     entry[0, 1], entry[1, 1] = -sin, cos
     entry[0, 2], entry[1, 2], entry[2, 2] = poses[t, 1], -poses[t, 0], 1.0
     for i in range(size // 2 - 1):
-        entry[3 + 2 * i, 2], entry[4 + 2 * i, 2] = landmarks[i, 1], -landmarks[i, 0]
+        entry[3 + 2 * i, 2], entry[4 + 2 * i, 2] = points[i, 1], -points[i, 0]
     for i in range(2):
         for j in range(2):
             for k in range(2):
-                P[i, j] += entry[i, k] * entry[j, k] * variance[k]
+                P[i, j] += entry[i, k] * entry[j, k] * noise[k]
     turn = entry[:, 2].copy()
     for i in range(size):
-        turned, row = turn[i] * variance[2], P[i]
+        turned, row = turn[i] * noise[2], P[i]
         for j in range(size):
             row[j] += turned * turn[j]
 
@@ -335,28 +327,21 @@ def _fix(P: Array, size: int, axis: int, lever: float, variance: float) -> None:
 
 @njit_internal
 def _read(
-    P: Array,
-    size: int,
-    pending: Array,
-    count: int,
-    c: int,
-    gx: float,
-    gy: float,
-    variance: float,
+    P: Array, size: int, due: Array, m: int, c: int, gx: float, gy: float, noise: float
 ) -> None:
     """Take in one number, (gx, gy) (ξ_l − ξ_p) plus noise, of the landmark at c.
 
-    It becomes pending, after ``count`` others.
+    It becomes due, after ``m`` others; the variance of its noise is ``noise``.
     """
-    now = np.empty((4, size))  # rows of P after what is pending
+    now = np.empty((4, size))  # rows of P after what is due
     for n, at in enumerate((c, c + 1, 0, 1)):
         now[n] = P[at, :size]
-        for k in range(count):
-            now[n] -= pending[1, k, at] * pending[0, k, :size]
-    row, share = pending[0, count], pending[1, count]
+        for k in range(m):
+            now[n] -= due[1, k, at] * due[0, k, :size]
+    row, share = due[0, m], due[1, m]
     for j in range(size):
         row[j] = gx * (now[0, j] - now[2, j]) + gy * (now[1, j] - now[3, j])
-    total = gx * (row[c] - row[0]) + gy * (row[c + 1] - row[1]) + variance
+    total = gx * (row[c] - row[0]) + gy * (row[c + 1] - row[1]) + noise
     for i in range(size):
         share[i] = row[i] / total
 

@@ -23,12 +23,12 @@ class HypothesisTest(NamedTuple):
     """Result of a test: whether a statistic is one that a consistent filter has."""
 
     statistic: float
+    #: Values of the statistic that are accepted.
     interval: Band
-    """Values of the statistic that are accepted."""
+    #: nan if the test could not decide.
     p_value: float
-    """nan if the test could not decide."""
+    #: Probability of rejecting a consistent filter.
     error_rate: float
-    """Probability of rejecting a consistent filter."""
 
     @property
     def accepted(self) -> bool:
@@ -39,16 +39,16 @@ class HypothesisTest(NamedTuple):
 class FamilyTest(NamedTuple):
     """Result of one test over a grid of steps, by Holm's method."""
 
+    #: ANEES ratio at each step of the grid, shape (k,).
     statistic: Array
-    """ANEES ratio at each step of the grid, shape (k,)."""
+    #: Band that holds all ratios together (Bonferroni).
     interval: Band
-    """Band that holds all ratios together (Bonferroni)."""
+    #: Smallest adjusted p-value.
     p_value: float
-    """Smallest adjusted p-value."""
+    #: Whether each step of the grid is rejected, shape (k,).
     rejected: BoolArray
-    """Whether each step of the grid is rejected, shape (k,)."""
+    #: Largest probability of rejecting a consistent filter at any step.
     error_rate: float
-    """Largest probability of rejecting a consistent filter at any step."""
 
     @property
     def accepted(self) -> bool:
@@ -237,8 +237,8 @@ class Band(NamedTuple):
 # ----------
 # .. [1] P. Hall, On the removal of skewness by transformation, JRSS B 54(1), 1992.
 
+#: Ratios of NEES to its expectation that count as consistent.
 EQUIVALENCE_MARGIN = Band(0.8, 1.25)
-"""Ratios of NEES to its expectation that count as consistent."""
 # Smallest number of runs with enough different resamples for a bootstrap.
 FEWEST_RESAMPLED = 5
 
@@ -247,12 +247,12 @@ class EquivalenceTest(NamedTuple):
     """Result of a test that shows a ratio to be near 1."""
 
     statistic: float
+    #: 90 % confidence interval of the ratio.
     interval: Band
-    """90 % confidence interval of the ratio."""
+    #: "consistent", "not consistent" or "not shown".
     verdict: str
-    """"consistent", "not consistent" or "not shown"."""
+    #: Probability of "consistent" for a filter at or beyond the margin.
     error_rate: float
-    """Probability of "consistent" for a filter at or beyond the margin."""
 
     @property
     def accepted(self) -> bool:

@@ -8,8 +8,6 @@ frame of its error, additive or invariant
 rejects even a consistent filter if the heading is uncertain.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..arrays import Array
@@ -20,8 +18,8 @@ from ..estimator.models.rigid_motion import (
     invariant_error,
 )
 
+#: Conditional variance, as a share of the variance, below which it counts as zero.
 SINGULAR = 1e-10
-"""Conditional variance, as a share of the variance, below which it counts as zero."""
 
 _FEW = 4  # up to this size, all covariances are factored together
 

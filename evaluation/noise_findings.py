@@ -8,8 +8,6 @@ well as over runs. Every test of `noise_findings` therefore has a known distribu
 any number of runs or steps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
@@ -30,8 +28,8 @@ _NOISE = {
 }
 
 
+#: The five noises: εx, εy, εα of the motion, εβ, εr of the readings.
 CHANNELS = ("along", "sideways", "turn", "bearing", "range")
-"""The five noises: εx, εy, εα of the motion, εβ, εr of the readings."""
 
 
 _SYMBOLS = dict(zip(CHANNELS, ("σx", "σy", "σα", "σβ", "σr"), strict=True))
@@ -53,14 +51,14 @@ class Finding(NamedTuple):
     """The result of one test on one noise."""
 
     cause: str
+    #: Two-sided, not adjusted for other tests.
     p_value: float
-    """Two-sided, not adjusted for other tests."""
+    #: Estimate of the relative change in NEES; ranks findings.
     impact: float
-    """Estimate of the relative change in NEES; ranks findings."""
+    #: Whether it is large enough to change NEES.
     matters: bool
-    """Whether it is large enough to change NEES."""
+    #: What is wrong, to follow "because".
     text: str
-    """What is wrong, to follow "because"."""
 
 
 def noise_findings(sums: Array) -> list[Finding]:
@@ -213,14 +211,14 @@ def _kurtosis_score(kurtosis: float, n: float) -> float:
     return float((1 - 2 / (9 * a) - np.cbrt(cube)) / np.sqrt(2 / (9 * a)))
 
 
+#: Sums over w, the standardised noise of a channel in a run: 1, w, w², w³, w⁴, and g w,
+#: g², where a bias b adds b g: g = d/σx along, so that b is a scale, else 1/σ. That of
+#: d which has no noise counts, odometry or true distance. The last two are the number
+#: of pairs of successive steps, of the same landmark, and the sum of w w' over them.
 MOMENTS = (
     *("count", "first", "second", "third", "fourth"),
     *("slope", "leverage", "pairs", "lagged"),
 )
-"""Sums over w, the standardised noise of a channel in a run: 1, w, w², w³, w⁴, and
-g w, g², where a bias b adds b g: g = d/σx along, so that b is a scale, else 1/σ. That
-of d which has no noise counts, odometry or true distance. The last two are the number
-of pairs of successive steps, of the same landmark, and the sum of w w' over them."""
 _ROUNDING = 1e-9
 _LEAST_STD = 1e-6  # in place of 0, where the world has noise
 
@@ -232,8 +230,8 @@ class _Noise(NamedTuple):
     std: Array | float
     lever: Array | float
     runs: IntArray
+    #: Whether a number, but the first, is of the step after that of the one before.
     follows: BoolArray
-    """Whether a number, but the first, is of the step after that of the one before."""
 
 
 def noise_sums(
@@ -342,20 +340,15 @@ def _motion_noise(
 
 
 def _sensor_noise(
-    poses: Array,
-    landmarks: Array,
-    readings: Array,
-    visible: BoolArray,
-    std: Array,
-    per_metre: float,
+    poses: Array, points: Array, read: Array, seen: BoolArray, std: Array, growth: float
 ) -> list[_Noise]:
-    run, landmark, step = np.nonzero(visible.transpose(0, 2, 1))
+    run, landmark, step = np.nonzero(seen.transpose(0, 2, 1))
     follows = (np.diff(run) == 0) & (np.diff(landmark) == 0) & (np.diff(step) == 1)
-    dx, dy = (landmarks[run, landmark] - poses[run, step, :2]).T
-    bearing, distance = readings[run, step, landmark].T
+    dx, dy = (points[run, landmark] - poses[run, step, :2]).T
+    bearing, distance = read[run, step, landmark].T
     expected = np.arctan2(dy, dx) - poses[run, step, 2], np.hypot(dx, dy)
     bearing_error = wrap_angle(bearing - expected[0])
-    range_std = std[1] + per_metre * expected[1]
+    range_std = std[1] + growth * expected[1]
     return [
         _Noise(bearing_error, float(std[0]), 1.0, run, follows),
         _Noise(distance - expected[1], range_std, 1.0, run, follows),

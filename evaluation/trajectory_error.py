@@ -5,8 +5,6 @@ positions are compared twice: as they are (raw), and after the rotation and tran
 that bring them closest to the truth (aligned). Scale is never adapted.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +18,10 @@ from ..estimator.support.argument_checks import as_floats
 class Alignment(NamedTuple):
     """A rigid motion of the plane, e ↦ C(φ) e + c."""
 
+    #: φ, counter-clockwise, in [-π, π] [rad].
     angle: float
-    """φ, counter-clockwise, in [-π, π] [rad]."""
+    #: c, shape (2,) [m].
     translation: Array
-    """c, shape (2,) [m]."""
 
     def apply(self, positions: Array) -> Array:
         """Move positions, shape (n, 2)."""
@@ -35,12 +33,12 @@ class Alignment(NamedTuple):
 class PositionAccuracy(NamedTuple):
     """Distances between estimated and true positions, raw and aligned."""
 
+    #: Shape (n,) [m].
     raw_errors: Array
-    """Shape (n,) [m]."""
+    #: Shape (n,) [m].
     aligned_errors: Array
-    """Shape (n,) [m]."""
+    #: The motion that takes the estimate onto the truth.
     alignment: Alignment
-    """The motion that takes the estimate onto the truth."""
 
     @property
     def raw_rmse(self) -> float:
@@ -56,10 +54,10 @@ class PositionAccuracy(NamedTuple):
 class LandmarkDistances(NamedTuple):
     """Distance of each landmark estimate to its ground truth."""
 
+    #: ‖e‖, shape (n,) [m].
     euclidean: Array
-    """‖e‖, shape (n,) [m]."""
+    #: sqrt(eᵀ P⁻¹ e), shape (n,): the same distance in standard deviations.
     mahalanobis: Array
-    """sqrt(eᵀ P⁻¹ e), shape (n,): the same distance in standard deviations."""
 
 
 def align_positions(estimate: ArrayLike, truth: ArrayLike) -> Alignment:
@@ -280,12 +278,10 @@ def _unwrapped(headings: Array) -> Array:
 def _paired(**positions: ArrayLike) -> tuple[Array, Array]:
     """Check two arrays of positions; their names are those the caller knows."""
     arrays = {name: as_floats(name, value) for name, value in positions.items()}
-    for name, array in arrays.items():
-        if array.ndim != 2 or array.shape[1] != 2 or not len(array):
-            raise ValueError(
-                f"{name} must be n >= 1 positions, got shape {array.shape}"
-            )
-        if not np.isfinite(array).all():
+    for name, rows in arrays.items():
+        if rows.ndim != 2 or rows.shape[1] != 2 or not len(rows):
+            raise ValueError(f"{name} must be n >= 1 positions, got shape {rows.shape}")
+        if not np.isfinite(rows).all():
             raise ValueError(f"{name} must be finite, got nan or inf")
     first, second = arrays.values()
     if len(first) != len(second):

@@ -33,12 +33,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from slamgym.agents import (
-    BASELINES,
-    ActiveSlamEnv,
-    ActiveSlamVectorEnv,
-    make_baseline,
-)
+from slamgym.agents import BASELINES, ActiveSlamEnv, ActiveSlamVectorEnv, make_baseline
 from slamgym.agents import active_slam_scores as scores
 from slamgym.envs import FlattenBatch, to_stable_baselines
 

@@ -20,10 +20,7 @@ from slamgym.estimator import SlamEstimator
 from slamgym.evaluation import score_association
 from slamgym.sim_configs import action_sequence
 
-POLICIES = {
-    "nearest": {"association": "nearest", "backdate": False},
-    "default": {},
-}
+POLICIES = {"nearest": {"association": "nearest", "backdate": False}, "default": {}}
 
 
 def main() -> None:

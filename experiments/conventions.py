@@ -21,19 +21,19 @@ from ..estimator.models.rigid_motion import (
 )
 from ..evaluation.nees import pose_nees
 
+#: Drives from which on covariances are read in other conventions.
 FEWEST_DRIVES = 5
-"""Drives from which on covariances are read in other conventions."""
+#: Drives that are read so.
 MOST_DRIVES = 200
-"""Drives that are read so."""
 _STEPS, _SHIFT = 24, 3
+#: An honest square is within a factor _NEAR of 1 or _ERRORS standard errors, not beyond
+#: the factor _FAR.
 _NEAR, _FAR, _ERRORS = 1.5, 2.5, 3.0
-"""An honest square is within a factor _NEAR of 1 or _ERRORS standard errors, not beyond
-the factor _FAR."""
 _GAIN = 1.0  # of log-likelihood of a pose [nats]
+#: NEES / 3 of a drive that another truth may fit, and how many of them are compared.
 _LOST, _MOST_LOST = 10.0, 50
-"""NEES / 3 of a drive that another truth may fit, and how many of them are compared."""
+#: NEES / 3 of a pose that is no error of a filter, and the largest share of such.
 _STRAY, _FEW = 100.0, 0.1
-"""NEES / 3 of a pose that is no error of a filter, and the largest share of such."""
 _SMALLER = 4.0  # by which errors fall in the right convention
 _TURN = np.diag([1.0, 1.0, np.pi / 180])  # of headings in degrees
 
@@ -41,23 +41,23 @@ _TURN = np.diag([1.0, 1.0, np.pi / 180])  # of headings in degrees
 class Reading(NamedTuple):
     """Poses (B, K, 3) and covariances (B, K, 3, 3) as read in some convention."""
 
+    #: What the file has; empty as it was declared.
     name: str
-    """What the file has; empty as it was declared."""
     poses: Array
+    #: Of the additive error.
     covariances: Array
-    """Of the additive error."""
 
 
 class _Fit(NamedTuple):
     """How well a reading agrees with the truth."""
 
+    #: Divided by 3; nan for what is no covariance.
     nees: float
-    """Divided by 3; nan for what is no covariance."""
     is_honest: bool
+    #: Mean logarithm of the density of a pose, without constants.
     likelihood: float
-    """Mean logarithm of the density of a pose, without constants."""
+    #: Root of the median squared error of position [m] and heading [rad].
     errors: tuple[float, float]
-    """Root of the median squared error of position [m] and heading [rad]."""
 
 
 def mistake_in(
@@ -287,8 +287,8 @@ _LINEAR = {
 }
 
 
+#: Name, poses, covariances as in the file, and the Jacobian of the poses by its own.
 _Read = tuple[str, Array, Array, Array]
-"""Name, poses, covariances as in the file, and the Jacobian of the poses by its own."""
 
 
 def _pose_readings(

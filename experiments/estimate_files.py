@@ -24,17 +24,17 @@ class Estimate(NamedTuple):
     """The estimates of one drive, as in their file."""
 
     file: str
+    #: Shape (T, 3) [m, m, rad].
     poses: Array
-    """Shape (T, 3) [m, m, rad]."""
+    #: Shape (T, 3, 3).
     covariances: Array
-    """Shape (T, 3, 3)."""
+    #: Shape (T,); None if pose k is that of step k.
     times: Array | None = None
-    """Shape (T,); None if pose k is that of step k."""
+    #: Whether the times are in seconds, not steps.
     in_seconds: bool = False
-    """Whether the times are in seconds, not steps."""
     landmark_ids: IntArray = np.zeros(0, np.int64)
+    #: Of the final map, shape (n, 2) [m].
     landmarks: Array = np.zeros((0, 2))
-    """Of the final map, shape (n, 2) [m]."""
     landmark_covariances: Array = np.zeros((0, 2, 2))
 
 

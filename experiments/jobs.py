@@ -7,8 +7,6 @@ writer. A manifest lists its other files with their digests; what slamgym did no
 there, or what was changed since, is refused or set aside, and never lost.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json
@@ -38,13 +36,13 @@ Result = TypeVar("Result")
 Progress = Callable[[int, int], object]
 Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]  # joblib's delayed
 Workers = Callable[[Iterable[Call]], Iterable[Any]]
+#: Computes a block. It may report steps that are done by the function that it gets;
+#: a worker gets None.
 Work = Callable[[range, Callable[[int], object] | None], Result]
-"""Computes a block. It may report steps that are done by the function that it gets;
-a worker gets None."""
 
 BACKENDS = ("loky", "threading", "dask", "ray")
+#: How long a worker lives on without the process that engaged it [s].
 _PATIENCE = 0.5
-"""How long a worker lives on without the process that engaged it [s]."""
 
 
 def blocks_of(runs: range, size: int) -> list[range]:
@@ -225,12 +223,12 @@ def _call(call: Call) -> Any:
 # --------------------------------------------------------------------------------------
 # The folder of a job: it has one writer, and belongs to one job.
 
+#: Names of what a writer that was killed at once may have left half written.
 _LEFTOVER = re.compile(
     r"\.writing-[0-9a-f]{8}"
     r"|\.{1,2}(job|manifest|results|report|summary|slamgym_files|runs-\d{7,}-\d{7,})"
     r"(\.[0-9a-f]{8}){1,2}\.(json|nc|html|npz)"
 )
-"""Names of what a writer that was killed at once may have left half written."""
 _ATTEMPTS, _BETWEEN = 20, 0.1  # [s]
 
 
@@ -328,17 +326,17 @@ def naming(
 # --------------------------------------------------------------------------------------
 # The files that slamgym wrote to a folder, with the proof that nobody changed them.
 
+#: The list of the files that slamgym wrote to its folder.
 MANIFEST = ".slamgym_files.json"
-"""The list of the files that slamgym wrote to its folder."""
 
 
 class OwnFile(NamedTuple):
     """An entry of the manifest."""
 
+    #: Path relative to the folder, with slashes.
     name: str
-    """Path relative to the folder, with slashes."""
+    #: In bytes.
     size: int
-    """In bytes."""
     sha256: str
 
 
@@ -427,8 +425,8 @@ def set_aside(path: Path, reason: str) -> None:
 # --------------------------------------------------------------------------------------
 # Lock a folder, so that one process at a time writes to it.
 
+#: The lock file; it names the process that writes to the folder.
 WRITER = ".slamgym_writer"
-"""The lock file; it names the process that writes to the folder."""
 
 
 @contextlib.contextmanager

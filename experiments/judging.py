@@ -59,13 +59,13 @@ if TYPE_CHECKING:
 
 Place: TypeAlias = str | PathLike[str]
 
+#: The errors of covariances; the invariant error is the right-invariant one.
 FRAMES = {"additive": "additive", "invariant": "invariant", "right": "invariant",
           "left": "left"}  # fmt: skip
-"""The errors of covariances; the invariant error is the right-invariant one."""
 _BOUNDS = ("position_bound", "position_bound_raw", "heading_bound", "map_bound")
 _UNKNOWN = np.array(np.nan)
+#: For estimates without a map: what came later may be in their poses.
 _NO_BOUND = PosteriorBound(_UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, ())
-"""For estimates without a map: what came later may be in their poses."""
 NO_FILE = "there is no file of estimates"
 _AT_ONCE = 100  # drives in memory
 _ON_TIME = 0.01  # of a step
@@ -158,23 +158,23 @@ class _Chunk(NamedTuple):
     """Some drives with all estimates of them, and what a filter could know."""
 
     runs: SimulatedRuns
+    #: By label; the reason where there is none.
     estimates: dict[str, list[Estimate | str]]
-    """By label; the reason where there is none."""
     bound: PosteriorBound
     noise: Array
+    #: Seconds of a step.
     dt: float = 1.0
-    """Seconds of a step."""
 
 
 class _Task(NamedTuple):
     """What is judged."""
 
     title: str
+    #: As TOML; empty for drives from elsewhere.
     scenario: str
-    """As TOML; empty for drives from elsewhere."""
     seed: int
+    #: Seeds, or names of files.
     names: list[Any]
-    """Seeds, or names of files."""
     chunks: Iterator[_Chunk]
 
 
@@ -182,8 +182,8 @@ class _Part(NamedTuple):
     """Measures of the drives of a chunk, and what names mistakes."""
 
     block: Block
+    #: Truth, poses and covariances as in the files, and starts.
     arrays: tuple[Array, Array, Array, Array]
-    """Truth, poses and covariances as in the files, and starts."""
 
 
 # --------------------------------------------------------------------------------------
@@ -378,10 +378,7 @@ def _within(estimate: Estimate, path: Array) -> tuple[Estimate, Array]:
 
 
 def _measured(
-    chunk: _Chunk,
-    files: Sequence[Estimate | str],
-    frame: str,
-    align: Any,
+    chunk: _Chunk, files: Sequence[Estimate | str], frame: str, align: Any
 ) -> _Part:
     """Measure the estimates of one estimator on the drives of a chunk."""
     truth = chunk.runs.true_poses

@@ -47,33 +47,33 @@ _UNITS = dict(zip(SIGMAS, ("m", "m", "rad", "rad", "m"), strict=True))
 class NoiseRow(NamedTuple):
     """The numbers of one run of a noise study; None if the truth is unknown."""
 
+    #: The noise that was changed, one of `SIGMAS`; "none" for the reference.
     sigma: str
-    """The noise that was changed, one of `SIGMAS`; "none" for the reference."""
+    #: Its factor; 1 for the reference.
     factor: float
-    """Its factor; 1 for the reference."""
+    #: Its value then [m or rad]; None for the reference.
     std: float | None
-    """Its value then [m or rad]; None for the reference."""
+    #: Area of the final pose's 3σ ellipse [m²].
     pose_area: float
-    """Area of the final pose's 3σ ellipse [m²]."""
+    #: Mean area of the final landmarks' 3σ ellipses [m²]; None without landmarks.
     landmark_area: float | None
-    """Mean area of the final landmarks' 3σ ellipses [m²]; None without landmarks."""
+    #: Root mean square error of the final landmarks [m].
     landmark_rmse: float | None
-    """Root mean square error of the final landmarks [m]."""
+    #: The same after the rigid motion that fits the map best to the truth [m].
     landmark_rmse_aligned: float | None
-    """The same after the rigid motion that fits the map best to the truth [m]."""
+    #: Root mean square error of the path [m].
     ate: float | None
-    """Root mean square error of the path [m]."""
+    #: Mean NEES of the pose divided by 3; 1 is expected of a consistent filter.
     nees_per_degree: float | None
-    """Mean NEES of the pose divided by 3; 1 is expected of a consistent filter."""
+    #: NIS by its degrees of freedom, which needs no truth; 1 is expected.
     nis_per_degree: float | None
-    """NIS by its degrees of freedom, which needs no truth; 1 is expected."""
 
 
 class NoiseRun(NamedTuple):
     """One run of a noise study."""
 
+    #: Of its panel, for example "σx × 10 = 2.5 m".
     title: str
-    """Of its panel, for example "σx × 10 = 2.5 m"."""
     row: NoiseRow
     trace: RunTrace
 
@@ -185,36 +185,36 @@ class NoiseEffect(NamedTuple):
     A figure is nan where too few runs succeeded.
     """
 
+    #: Place of the change: both, world or filter; "nothing" for the reference.
     changed: str
-    """Place of the change: both, world or filter; "nothing" for the reference."""
+    #: The noise, one of `SIGMAS`; "none" for the reference.
     sigma: str
-    """The noise, one of `SIGMAS`; "none" for the reference."""
+    #: Its factor; 1 for the reference.
     factor: float
-    """Its factor; 1 for the reference."""
+    #: Label of the estimator.
     estimator: str
-    """Label of the estimator."""
+    #: Number of runs behind the figures.
     runs: int
-    """Number of runs behind the figures."""
+    #: Runs left out: they failed, or their NEES or NIS is not finite or above 1e100.
     failed: int
-    """Runs left out: they failed, or their NEES or NIS is not finite or above 1e100."""
+    #: NEES of the pose divided by 3, in the invariant frame; 1 is expected.
     nees_per_degree: float
-    """NEES of the pose divided by 3, in the invariant frame; 1 is expected."""
+    #: Its standard error, from the averages of the runs, which are independent.
     nees_per_degree_error: float
-    """Its standard error, from the averages of the runs, which are independent."""
+    #: Median of the runs' averages, which a few bad runs do not dominate.
     nees_per_degree_median: float
-    """Median of the runs' averages, which a few bad runs do not dominate."""
+    #: NIS by its degrees of freedom; 1 is expected.
     nis_per_degree: float
-    """NIS by its degrees of freedom; 1 is expected."""
+    #: Root mean square error of the position, not aligned [m].
     position_rmse: float
-    """Root mean square error of the position, not aligned [m]."""
+    #: Root mean square error of the path after the best rigid motion [m].
     ate_aligned: float
-    """Root mean square error of the path after the best rigid motion [m]."""
+    #: The same of the final map [m].
     landmark_rmse_aligned: float
-    """The same of the final map [m]."""
+    #: Mean area of the final 3σ ellipse of the position [m²].
     pose_area: float
-    """Mean area of the final 3σ ellipse of the position [m²]."""
+    #: Mean area of the landmarks' final 3σ ellipses [m²].
     landmark_area: float
-    """Mean area of the landmarks' final 3σ ellipses [m²]."""
 
 
 def noise_effects(
@@ -324,10 +324,10 @@ FACTORS = (10.0, 0.1)
 class Variation(NamedTuple):
     """One noise and its factor."""
 
+    #: One of `SIGMAS`; "none" for the reference.
     sigma: str
-    """One of `SIGMAS`; "none" for the reference."""
+    #: 1 for the reference.
     factor: float
-    """1 for the reference."""
 
     def __str__(self) -> str:
         """Return for example "σx × 10"."""

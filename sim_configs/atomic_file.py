@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+#: Files and folders that this process is writing, to be removed if it must end.
 unfinished: set[Path] = set()
-"""Files and folders that this process is writing, to be removed if it must end."""
 
 
 @contextmanager

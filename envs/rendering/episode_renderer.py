@@ -35,7 +35,7 @@ class EpisodeRenderer(Restorable):
         Largest number of frames per second in the window [1/s].
     """
 
-    _changing = ("_landmarks", "_path", "_present", "_belief")
+    changing = ("_landmarks", "_path", "_present", "_belief")
 
     def __init__(self, scenario: Scenario, mode: str, fps: float) -> None:
         if mode not in RENDER_MODES:

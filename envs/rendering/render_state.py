@@ -4,8 +4,6 @@ The functions below it compute what is drawn: the limits of the axes, the area t
 sensor sees, and the ellipses of a belief.
 """
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -17,8 +15,8 @@ from ..controllers import planned_path
 from ..robot import wrap_angle
 
 RenderMode = Literal["human", "rgb_array"]
+#: The values of ``render_mode``: a window, or arrays of pixels.
 RENDER_MODES: tuple[RenderMode, ...] = ("human", "rgb_array")
-"""The values of ``render_mode``: a window, or arrays of pixels."""
 
 
 class BeliefLike(Protocol):
@@ -44,22 +42,22 @@ class BeliefLike(Protocol):
 class RenderState(NamedTuple):
     """The state of a world that one frame shows."""
 
+    #: True (x, y, θ), shape (3,) [m, m, rad].
     pose: Array
-    """True (x, y, θ), shape (3,) [m, m, rad]."""
+    #: True positions up to the present one, shape (k, 2) [m].
     path: Array
-    """True positions up to the present one, shape (k, 2) [m]."""
+    #: Readings of this step as `drawn_readings`, shape (m, 2) [rad, m].
     measurements: Array
-    """Readings of this step as `drawn_readings`, shape (m, 2) [rad, m]."""
+    #: Whether a wall stopped the robot in this step.
     collision: bool
-    """Whether a wall stopped the robot in this step."""
+    #: Belief of an estimator, or None.
     belief: BeliefLike | None
-    """Belief of an estimator, or None."""
+    #: Since the start of the episode [s].
     time: float
-    """Since the start of the episode [s]."""
+    #: Steps since the start of the episode.
     step: int
-    """Steps since the start of the episode."""
+    #: Which measurements are of no landmark, shape (m,); None for none of them.
     clutter: BoolArray | None = None
-    """Which measurements are of no landmark, shape (m,); None for none of them."""
 
 
 # --------------------------------------------------------------------------------------

@@ -109,25 +109,20 @@ class Scene:
         self._moving.clutter.set_data(*ends[false].T)
 
     def _show_belief(self, belief: BeliefLike | None) -> None:
-        moving = self._moving
-        for artist in (
-            moving.map_ellipses,
-            moving.map,
-            moving.pose_ellipse,
-            moving.estimate,
-        ):
-            artist.set_visible(belief is not None)
+        parts = self._moving
+        for each in (parts.map_ellipses, parts.map, parts.pose_ellipse, parts.estimate):
+            each.set_visible(belief is not None)
         if belief is None:
             return
         landmarks = np.reshape(belief.landmarks, (-1, 2))
         n = len(landmarks)
         blocks = np.reshape(np.asarray(belief.covariance)[3:, 3:], (n, 2, n, 2))
         spread = np.einsum("iaib->iab", blocks)  # marginal covariance of each landmark
-        moving.map.set_data(*landmarks.T)
-        set_ellipses(moving.map_ellipses, landmarks, spread)
-        moving.estimate.set_xy(arrow_at(belief.pose, self._arrow_length()))
+        parts.map.set_data(*landmarks.T)
+        set_ellipses(parts.map_ellipses, landmarks, spread)
+        parts.estimate.set_xy(arrow_at(belief.pose, self._arrow_length()))
         spread = np.asarray(belief.pose_covariance)[None, :2, :2]
-        set_ellipses(moving.pose_ellipse, belief.pose[None, :2], spread)
+        set_ellipses(parts.pose_ellipse, belief.pose[None, :2], spread)
 
     def _show_limits(self) -> None:
         self._axes.set(xlim=self._limits.x, ylim=self._limits.y)
@@ -138,19 +133,17 @@ class Scene:
             legend.remove()
         moving = self._moving
         robot = Line2D([], [], ls="", marker=">", color=INK, ms=7, label="robot")
-        named: list[Artist] = [robot, moving.path, *self._still]
-        named.append(moving.readings)
+        keys: list[Artist] = [robot, moving.path, *self._still]
+        keys.append(moving.readings)
         if self._scenario.sensor.clutter > 0:
-            named.append(moving.clutter)
+            keys.append(moving.clutter)
         if self._view_is_limited():
-            named.append(moving.view)
+            keys.append(moving.view)
         if self._legend_has_belief:
-            named.append(EllipseKind("pose belief, 3σ", POSE, fill=0.14).legend_key())
-            named.append(
-                EllipseKind("landmark belief, 3σ", MAP, fill=0.14).legend_key()
-            )
+            keys.append(EllipseKind("pose belief, 3σ", POSE, fill=0.14).legend_key())
+            keys.append(EllipseKind("landmark belief, 3σ", MAP, fill=0.14).legend_key())
         self._figure.legend(
-            handles=named,
+            handles=keys,
             handler_map=ELLIPSE_HANDLER,
             loc="lower center",
             bbox_to_anchor=(0.52, 0.0),
@@ -379,14 +372,8 @@ def _points(marker: str, colour: str, label: str) -> Line2D:
     return Line2D([], [], ls="", marker=marker, ms=4, color=colour, label=label)
 
 
-def _lying_ellipse(  # noqa: PLR0917 (matplotlib's signature)
-    legend: object,
-    orig_handle: object,
-    xdescent: float,
-    ydescent: float,
-    width: float,
-    height: float,
-    fontsize: float,
+def _lying_ellipse(
+    *, xdescent: float, ydescent: float, width: float, height: float, **_: object
 ) -> Ellipse:
     centre = (width / 2 - xdescent, height / 2 - ydescent)
     return Ellipse(centre, width=width, height=height + ydescent + 2)

@@ -66,12 +66,7 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
     ((3, 28, 2), (3, 3))
     """
 
-    _changing: ClassVar[tuple[str, ...]] = (
-        "_seeds",
-        "_worlds",
-        "_steps_left",
-        "_ended",
-    )
+    changing: ClassVar[tuple[str, ...]] = ("_seeds", "_worlds", "_steps_left", "_ended")
     _renderers: Sequence[EpisodeRenderer] = ()  # for close after a failed constructor
 
     def __init__(

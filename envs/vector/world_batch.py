@@ -89,7 +89,7 @@ class WorldBatch(Restorable):
            [1.5, 0.3]])
     """
 
-    _changing = (
+    changing = (
         *("measurements", "mask", "odometry", "poses", "collisions", "landmark_ids"),
         "pose_readings",
         *("_drawn", "_keys", "_steps", "_bodies", "_start_estimates", "_landmarks"),
@@ -364,7 +364,7 @@ class DrawnWorlds(Restorable):
         Those of their sensors.
     """
 
-    _changing = ("scenarios", "motion_std", "settings")
+    changing = ("scenarios", "motion_std", "settings")
 
     def __init__(
         self, scenario: Scenario, count: int, given: Sequence[Scenario] = ()

@@ -32,14 +32,14 @@ from ..kernels.assignment_search import compare_pairs, search_clique
 from ..models.rigid_motion import left_jacobian
 from ..support import argument_checks
 
+#: Most pairs of landmarks that are compared.
 LARGEST_GRAPH = 800
-"""Most pairs of landmarks that are compared."""
+#: Squared difference of two distances over its variance; χ² of 1 degree, 99.9 %.
 DISTANCE_GATE = 10.83
-"""Squared difference of two distances over its variance; χ² of 1 degree, 99.9 %."""
+#: A second place with a larger share of the landmarks is a rival.
 RIVAL_SHARE = 0.75
-"""A second place with a larger share of the landmarks is a rival."""
+#: How much farther apart a rival's pairs are than the worst pair of the match.
 RIVAL_GAP = 3.0
-"""How much farther apart a rival's pairs are than the worst pair of the match."""
 
 
 @dataclass(frozen=True)
@@ -52,20 +52,20 @@ class Constellations:
         If a value is out of range.
     """
 
+    #: Smallest number of landmarks that make a constellation.
     least: int = 6
-    """Smallest number of landmarks that make a constellation."""
+    #: A second place is a rival if it matches almost as many landmarks: fewer by less
+    #: than this number, or more than three quarters of them.  The constellation is then
+    #: not used.
     margin: int = 3
-    """A second place is a rival if it matches almost as many landmarks: fewer by less
-    than this number, or more than three quarters of them.  The constellation is then
-    not used."""
+    #: A landmark whose position relative to the robot is less certain than this is not
+    #: associated with single readings [m].
     lost_std: float = 2.0
-    """A landmark whose position relative to the robot is less certain than this is not
-    associated with single readings [m]."""
+    #: Limit of the search; beyond it no constellation is recognised.
     search_nodes: int = 20_000
-    """Limit of the search; beyond it no constellation is recognised."""
+    #: Whether single readings are not associated with uncertain landmarks either while
+    #: the map holds too few landmarks, around the robot or elsewhere, to recognise one.
     always: bool = False
-    """Whether single readings are not associated with uncertain landmarks either while
-    the map holds too few landmarks, around the robot or elsewhere, to recognise one."""
 
     def __post_init__(self) -> None:
         argument_checks.whole("constellations.least", self.least, 3)
@@ -129,10 +129,7 @@ def tables(places: TwoPlaces) -> tuple[Array, Array]:
     """Return distance, variance and direction between landmarks of each map."""
     m = len(places.local)
     P = _blocks(places.covariance)
-    return (
-        _table(places.local, P[:m, :m]),
-        _table(places.older, P[m:, m:]),
-    )
+    return (_table(places.local, P[:m, :m]), _table(places.older, P[m:, m:]))
 
 
 def _table(points: Array, P: Array) -> Array:
@@ -200,43 +197,43 @@ def _blocks(covariance: Array) -> Array:
 #
 # so the heading is free in both: after long drift its covariance is the least reliable.
 
+#: Probability that the right match fails the test of its shape or displacement.
 TAIL = 1e-4
-"""Probability that the right match fails the test of its shape or displacement."""
+#: Largest χ² of a further pair given the matched ones; 2 degrees, 99.9 %.
 PAIR_GATE = 13.8
-"""Largest χ² of a further pair given the matched ones; 2 degrees, 99.9 %."""
+#: Least share of landmarks between the matched ones that must have a partner.
 PARTNERS = 0.6
-"""Least share of landmarks between the matched ones that must have a partner."""
 
 
 class TwoPlaces(NamedTuple):
     """Landmarks around the robot, and an older part of the map."""
 
+    #: Positions â, shape (m, 2) [m].
     local: Array
-    """Positions â, shape (m, 2) [m]."""
+    #: Positions b̂, shape (n, 2) [m].
     older: Array
-    """Positions b̂, shape (n, 2) [m]."""
+    #: Of the invariant errors ξ of both, shape (2 (m + n), 2 (m + n)); local first.
     covariance: Array
-    """Of the invariant errors ξ of both, shape (2 (m + n), 2 (m + n)); local first."""
+    #: Largest plausible turn of the local map [rad].
     largest_turn: float
-    """Largest plausible turn of the local map [rad]."""
 
 
 class Match(NamedTuple):
     """Landmarks of two maps that are the same."""
 
+    #: Shape (k,).
     local: IntArray
-    """Shape (k,)."""
+    #: Shape (k,).
     older: IntArray
-    """Shape (k,)."""
 
 
 class Misfit(NamedTuple):
     """χ² of a match, with the heading free."""
 
+    #: Of 2k − 3 degrees of freedom.
     shape: float
-    """Of 2k − 3 degrees of freedom."""
+    #: Of 2 degrees of freedom.
     displacement: float
-    """Of 2 degrees of freedom."""
 
 
 def turn_between(places: TwoPlaces, match: Match) -> float:

@@ -27,31 +27,31 @@ from ..kernels.assignment_search import (
 from ..models.bearing_range import wrap_angle, wrap_angle_jit
 from ..support import argument_checks
 
+#: Assignments of a scan e^8 times less likely than the best one are not considered.
 BRANCH_SPREAD = 16.0
-"""Assignments of a scan e^8 times less likely than the best one are not considered."""
 
 TINY = float(np.finfo(np.float64).tiny)
 
+#: Beliefs with the same landmarks are one if no coordinate changes by more σ.
 SAME = 1.0
-"""Beliefs with the same landmarks are one if no coordinate changes by more σ."""
 
 
 class Assignment(NamedTuple):
     """Landmarks of the readings of one scan."""
 
+    #: −2 ln of the likelihood, up to a constant of the scan; 0 by nearest neighbour.
     cost: float
-    """−2 ln of the likelihood, up to a constant of the scan; 0 by nearest neighbour."""
+    #: Place in the map of each reading's landmark, `NEW` or `AMBIGUOUS`, shape (m,).
     slots: IntArray
-    """Place in the map of each reading's landmark, `NEW` or `AMBIGUOUS`, shape (m,)."""
 
 
 class Assignments(NamedTuple):
     """The assignments to consider for one scan."""
 
+    #: The most likely first.
     ranked: list[Assignment]
-    """The most likely first."""
+    #: Landmarks that some reading may belong to, shape (k,).
     explained: IntArray
-    """Landmarks that some reading may belong to, shape (k,)."""
 
 
 def assign_scan(
@@ -130,10 +130,7 @@ def _is_superfluous(
 def assign_nearest(policy: AssociationPolicy, fit: Distances) -> IntArray:
     """Assign each reading to its most likely landmark, as the policy's gates allow."""
     return nearest_neighbours(
-        fit,
-        match=policy.match_gate,
-        new=policy.new_gate,
-        ambiguity=policy.ambiguity,
+        fit, match=policy.match_gate, new=policy.new_gate, ambiguity=policy.ambiguity
     )
 
 
@@ -204,38 +201,39 @@ class AssociationPolicy:
         If a value is out of range.
     """
 
+    #: How readings without identity are assigned to landmarks: "nearest", each reading
+    #: to its most likely landmark; "joint", the most likely assignment of the whole
+    #: scan; "compatibility", the most pairs that are jointly compatible (JCBB);
+    #: "hypotheses", several joint assignments, followed until the readings decide
+    #: between them; "auto", hypotheses, but joint in filters for large maps and those
+    #: that observe the truth.
     association: str = "auto"
-    """How readings without identity are assigned to landmarks: "nearest", each reading
-    to its most likely landmark; "joint", the most likely assignment of the whole scan;
-    "compatibility", the most pairs that are jointly compatible (JCBB); "hypotheses",
-    several joint assignments, followed until the readings decide between them; "auto",
-    hypotheses, but joint in filters for large maps and those that observe the truth."""
+    #: Readings per scan from no landmark of the map, clutter and new landmarks
+    #: [1 / (rad m)]; None: estimate it from the scans so far.
     density: float | None = None
-    """Readings per scan from no landmark of the map, clutter and new landmarks
-    [1 / (rad m)]; None: estimate it from the scans so far."""
+    #: Most hypotheses at a time.
     hypotheses: int = 10
-    """Most hypotheses at a time."""
+    #: Most assignments of one scan that a hypothesis splits into.
     branches: int = 4
-    """Most assignments of one scan that a hypothesis splits into."""
+    #: Limit of the search for joint assignments; beyond it the best found so far is
+    #: taken.
     search_nodes: int = 2000
-    """Limit of the search for joint assignments; beyond it the best found so far is
-    taken."""
+    #: A joint assignment pairs a reading and a landmark up to this νᵀ S⁻¹ ν, given the
+    #: other pairs.
     pair_gate: float = 15.0
-    """A joint assignment pairs a reading and a landmark up to this νᵀ S⁻¹ ν, given the
-    other pairs."""
+    #: Whether the sightings before the confirming one count: the filter then repeats
+    #: the scans since the first sighting, with the new landmark in them.
     backdate: bool = True
-    """Whether the sightings before the confirming one count: the filter then repeats
-    the scans since the first sighting, with the new landmark in them."""
+    #: A reading is of a landmark only up to this νᵀ S⁻¹ ν; χ² of 2 dof, here 99 %.
     match_gate: float = 9.21
-    """A reading is of a landmark only up to this νᵀ S⁻¹ ν; χ² of 2 dof, here 99 %."""
+    #: A reading is of a new landmark only beyond this from all that are known.
     new_gate: float = 25.0
-    """A reading is of a new landmark only beyond this from all that are known."""
+    #: Left out where two landmarks differ by less than this in −2 ln likelihood.
     ambiguity: float = 1.0
-    """Left out where two landmarks differ by less than this in −2 ln likelihood."""
+    #: (k, n): seen in k of n successive scans, a landmark enters the map.
     confirm: tuple[int, int] = (3, 8)
-    """(k, n): seen in k of n successive scans, a landmark enters the map."""
+    #: Whether landmarks that come with an identity enter at first sight.
     trust_ids: bool = True
-    """Whether landmarks that come with an identity enter at first sight."""
 
     def __post_init__(self) -> None:
         argument_checks.one_of("association", self.association, ASSOCIATIONS)
@@ -284,14 +282,14 @@ class Noise(NamedTuple):
     array([[0.04, 0.25]])
     """
 
+    #: σβ [rad].
     bearing_std: float
-    """σβ [rad]."""
+    #: σr [m].
     range_std: float
-    """σr [m]."""
+    #: k.
     range_std_per_metre: float = 0.0
-    """k."""
+    #: b [m].
     bearing_std_metres: float = 0.0
-    """b [m]."""
 
     def variances(self, ranges: Array) -> Array:
         """Return the variances of bearing and range at ranges (m,) > 0, (m, 2)."""
@@ -341,13 +339,12 @@ NEW, AMBIGUOUS = -1, -2
 class Distances(NamedTuple):
     """How well each of m readings fits each of n landmarks."""
 
+    #: νᵀ S⁻¹ ν, shape (m, n); infinite where beyond what was asked for.
     squared: Array
-    """νᵀ S⁻¹ ν, shape (m, n); infinite where beyond what was asked for."""
+    #: νᵀ S⁻¹ ν + ln det S, shape (m, n): −2 ln of the likelihood, but for a constant.
+    #:
+    #: Of two landmarks at the same distance in σ, the more certain one is more likely.
     unlikelihood: Array
-    """νᵀ S⁻¹ ν + ln det S, shape (m, n): −2 ln of the likelihood, but for a constant.
-
-    Of two landmarks at the same distance in σ, the more certain one is more likely.
-    """
 
 
 def innovation_distances(
@@ -523,15 +520,15 @@ def nearest_neighbours(
 class Solutions(NamedTuple):
     """The best assignments, the cheapest first."""
 
+    #: Shape (M,).
     costs: Array
-    """Shape (M,)."""
+    #: Landmark 0 … J − 1 of each reading or `UNPAIRED`, shape (M, m).
     marks: IntArray
-    """Landmark 0 … J − 1 of each reading or `UNPAIRED`, shape (M, m)."""
+    #: Least νᵀ S⁻¹ ν of each unpaired reading to a landmark without a reading, given
+    #: the pairs, shape (M, m).
     distances: Array
-    """Least νᵀ S⁻¹ ν of each unpaired reading to a landmark without a reading, given
-    the pairs, shape (M, m)."""
+    #: False where the search stopped at its limit of nodes.
     is_complete: bool
-    """False where the search stopped at its limit of nodes."""
 
 
 def predicted_readings(

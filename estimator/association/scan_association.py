@@ -37,8 +37,8 @@ from .tentative_landmarks import TENTATIVE, TentativeLandmarks
 
 NO_LABEL = -1
 
+#: A label is the scan of the first sighting, shifted by these bits, plus its row.
 LABEL_BITS = 20
-"""A label is the scan of the first sighting, shifted by these bits, plus its row."""
 
 
 class ScanAssociation:
@@ -62,16 +62,16 @@ class ScanAssociation:
         self._next_id, self.scan = candidates.next_id, candidates.scan
         self._density, self._longest = candidates.density, 0.0
         self._detections = candidates.detections
+        #: For each row the landmark that the filter associates it with, if any.
         self.row_ids: list[int | None] = [None] * rows
-        """For each row the landmark that the filter associates it with, if any."""
+        #: Labels of landmarks that were tentative before this scan.
         self.confirmed: dict[int, int] = {}
-        """Labels of landmarks that were tentative before this scan."""
+        #: For each row the label of its tentative landmark, if any.
         self.labels: list[int] = [NO_LABEL] * rows
-        """For each row the label of its tentative landmark, if any."""
         self.tentative_rows: list[int] = []
         self.ambiguous_rows: list[int] = []
+        #: Landmarks that some row may belong to, so that they are not missing.
         self.explained: set[int] = set()
-        """Landmarks that some row may belong to, so that they are not missing."""
 
     @property
     def candidates(self) -> Candidates:
@@ -213,13 +213,13 @@ class Detections(NamedTuple):
     True
     """
 
+    #: Shape (SECTORS, RINGS).
     seen: Array
-    """Shape (SECTORS, RINGS)."""
+    #: Shape (SECTORS, RINGS).
     expected: Array
-    """Shape (SECTORS, RINGS)."""
+    #: For landmarks that may have been in view since they were last seen, the
+    #: probability of missing them so often if nothing hides them.
     missed: Mapping[int, float]
-    """For landmarks that may have been in view since they were last seen, the
-    probability of missing them so often if nothing hides them."""
 
     @classmethod
     def none(cls) -> Detections:
@@ -264,10 +264,10 @@ class UnexplainedDensity(NamedTuple):
 
     readings: float = 1.0
     scans: float = 2.0
+    #: Longest range read so far [m].
     longest: float = 1.0
-    """Longest range read so far [m]."""
+    #: How many landmarks were confirmed.
     landmarks: float = 1.0
-    """How many landmarks were confirmed."""
 
     @property
     def value(self) -> float:
@@ -300,18 +300,18 @@ class UnexplainedDensity(NamedTuple):
 class Candidates:
     """Landmarks that are not in the map yet, and the next identity to assign."""
 
+    #: Landmarks without an identity.
     tentative: TentativeLandmarks = field(default_factory=TentativeLandmarks.none)
-    """Landmarks without an identity."""
+    #: Given identities that are not trusted yet, and the scans that showed them.
     waiting: Mapping[int, Sequence[int]] = field(default_factory=dict)
-    """Given identities that are not trusted yet, and the scans that showed them."""
+    #: Above all identities so far.
     next_id: int = 0
-    """Above all identities so far."""
+    #: Number of scans so far.
     scan: int = 0
-    """Number of scans so far."""
+    #: Of readings that belong to no landmark of the map.
     density: UnexplainedDensity = field(default_factory=UnexplainedDensity)
-    """Of readings that belong to no landmark of the map."""
+    #: Which landmarks the scans have shown; counted for hypotheses only.
     detections: Detections = field(default_factory=Detections.none)
-    """Which landmarks the scans have shown; counted for hypotheses only."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all, as arrays."""
@@ -361,13 +361,14 @@ class Candidates:
         )
 
 
+#: Weight of a scan relative to the one after it, in running averages.
 MEMORY = 0.98
-"""Weight of a scan relative to the one after it, in running averages."""
 
 
+#: Cells over the bearings, and over the ranges up to the longest reading.
 SECTORS, RINGS = 16, 8
-"""Cells over the bearings, and over the ranges up to the longest reading."""
 
+#: What a saved state holds about the landmarks that are not in the map yet.
 CANDIDATES: saved_states.Table = {
     **TENTATIVE,
     "waiting": (saved_states.WHOLE, -1, 2),
@@ -378,19 +379,18 @@ CANDIDATES: saved_states.Table = {
     "expected": (saved_states.NUMBERS, SECTORS, RINGS),
     "missed": (saved_states.NUMBERS, -1, 2),
 }
-"""What a saved state holds about the landmarks that are not in the map yet."""
 
+#: Weights of a Gaussian at 0, +2 σ and −2 σ, which keep its variance.
 NODES = np.array([3 / 4, 1 / 8, 1 / 8])
-"""Weights of a Gaussian at 0, +2 σ and −2 σ, which keep its variance."""
 
+#: Probability that something hides a landmark until it is seen again.
 HIDDEN = 0.0003
-"""Probability that something hides a landmark until it is seen again."""
 
+#: Largest P_D: something may stand before a landmark.
 SUREST = 0.95
-"""Largest P_D: something may stand before a landmark."""
 
+#: A bearing whose two σ are wider than this says nothing [rad].
 WIDEST = np.pi / 4
-"""A bearing whose two σ are wider than this says nothing [rad]."""
 
 
 @jit
@@ -457,8 +457,8 @@ def _place_in_scan(mean: Array, P: Array, j: int) -> tuple[float, float, float, 
     return wrap_angle_jit(bearing) + np.pi, distance, 2 * std[0], 2 * std[1]
 
 
+#: −2 ln of the likelihood of an association, up to a constant, and its completion.
 Option = tuple[float, Callable[[], ScanAssociation]]
-"""−2 ln of the likelihood of an association, up to a constant, and its completion."""
 
 
 def associate(
@@ -530,8 +530,8 @@ class Sensor(NamedTuple):
     """The properties of the sensor that association uses."""
 
     noise: Noise
+    #: Readings closer than this have no usable bearing [m].
     min_range: float
-    """Readings closer than this have no usable bearing [m]."""
 
     @classmethod
     def checked(cls, measurement_std: ArrayLike, options: Mapping[str, Any]) -> Sensor:

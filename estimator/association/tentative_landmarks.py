@@ -40,14 +40,14 @@ class TentativeLandmarks(NamedTuple):
     [2]
     """
 
+    #: q, shape (t, 2) [m].
     places: Array
-    """q, shape (t, 2) [m]."""
+    #: C, shape (t, 2, 2) [m²].
     covariances: Array
-    """C, shape (t, 2, 2) [m²]."""
+    #: One bit per scan, the latest scan lowest: whether the landmark was seen, (t,).
     seen: Masks
-    """One bit per scan, the latest scan lowest: whether the landmark was seen, (t,)."""
+    #: Unique number of each, shape (t,).
     labels: IntArray
-    """Unique number of each, shape (t,)."""
 
     @classmethod
     def none(cls) -> "TentativeLandmarks":
@@ -161,10 +161,10 @@ def _masks(name: str, value: Any, shape: tuple[int, ...]) -> Masks:
     return seen
 
 
+#: What a saved state holds about them, in the order of the fields.
 TENTATIVE: saved_states.Table = {
     "places": (saved_states.NUMBERS, "t", 2),
     "covariances": (saved_states.NUMBERS, "t", 2, 2),
     "seen": (saved_states.Kind(np.uint64, _masks), "t"),
     "labels": (saved_states.WHOLE, "t"),
 }
-"""What a saved state holds about them, in the order of the fields."""

@@ -60,11 +60,10 @@ class BatchOfBeliefs(Restorable):
         self._covariances = aligned_zeros(self.runs, capacity, capacity)
         self._slots = np.full((self.runs, landmarks), -1, dtype=np.int64)
         self._mapped = np.zeros(self.runs, dtype=np.int64)
+        #: Step of the last :meth:`run` at which a run stopped, -1 if it did not.
+        #:
+        #: A stopped run remains stopped, at step 0 of every later :meth:`run`.
         self.failed_at = np.full(self.runs, NEVER, dtype=np.int64)
-        """Step of the last :meth:`run` at which a run stopped, -1 if it did not.
-
-        A stopped run remains stopped, at step 0 of every later :meth:`run`.
-        """
         begin_runs(tuple(self._arrays()), self.failed_at == NEVER, poses.copy(), std**2)
 
     def reset(
@@ -227,8 +226,9 @@ class BatchSlam(BatchOfBeliefs):
         self.runs = argument_checks.whole("runs", runs, 1)
         self.landmarks = argument_checks.whole("landmarks", landmarks, 0)
         only_placing(estimator.sensor, "a batch")
-        self.sensor, self.rules = estimator.sensor, estimator.rules
-        """What distinguishes this filter's updates from another's."""
+        self.sensor = estimator.sensor
+        #: What distinguishes this filter's updates from another's.
+        self.rules = estimator.rules
         self.rule_values = estimator.rule_values.copy()
         self.motion_values = estimator.motion_values
         self.motion = estimator.motion
@@ -527,10 +527,7 @@ class LoadedBeliefs(NamedTuple):
 
 
 def checked_beliefs(
-    beliefs: BatchBeliefs,
-    references: ArrayLike | None,
-    runs: BoolArray,
-    landmarks: int,
+    beliefs: BatchBeliefs, references: ArrayLike | None, runs: BoolArray, landmarks: int
 ) -> LoadedBeliefs:
     """Return beliefs of B runs over L landmarks, or refuse those of the chosen runs."""
     count, size = len(runs), 3 + 2 * landmarks
@@ -594,14 +591,14 @@ def first_poses(name: str, poses: ArrayLike, count: int) -> Array:
 class BatchTrace(NamedTuple):
     """The belief of every run about its pose, after every step; B runs, T steps."""
 
+    #: (x, y, θ), shape (B, T, 3) [m, m, rad], heading in [-π, π).
     poses: Array
-    """(x, y, θ), shape (B, T, 3) [m, m, rad], heading in [-π, π)."""
+    #: Shape (B, T, 3, 3).
     pose_covariances: Array
-    """Shape (B, T, 3, 3)."""
+    #: νᵀ S⁻¹ ν of each scan, shape (B, T).
     nis: Array
-    """νᵀ S⁻¹ ν of each scan, shape (B, T)."""
+    #: Of the NIS, shape (B, T).
     degrees_of_freedom: IntArray
-    """Of the NIS, shape (B, T)."""
 
     @classmethod
     def empty(cls, runs: int, steps: int) -> BatchTrace:
@@ -617,12 +614,12 @@ class BatchTrace(NamedTuple):
 class BatchBeliefs(NamedTuple):
     """The present belief of every run; the states are (x, y, θ, l0x, l0y, …)."""
 
+    #: Shape (B, 3 + 2L), landmarks by id, zeros where not mapped; θ in [-π, π).
     means: Array
-    """Shape (B, 3 + 2L), landmarks by id, zeros where not mapped; θ in [-π, π)."""
+    #: Of the additive error, shape (B, 3 + 2L, 3 + 2L), zeros where not mapped.
     covariances: Array
-    """Of the additive error, shape (B, 3 + 2L, 3 + 2L), zeros where not mapped."""
+    #: Which landmarks are in the map, shape (B, L).
     mapped: BoolArray
-    """Which landmarks are in the map, shape (B, L)."""
 
     @classmethod
     def of(cls, beliefs: Sequence[Belief], landmarks: int) -> BatchBeliefs:
@@ -672,12 +669,12 @@ class BatchStorage(NamedTuple):
     Entries beyond the mapped landmarks are arbitrary.
     """
 
+    #: Shape (B, capacity): (x, y, θ), then the landmarks by slot; θ is not wrapped.
     means: Array
-    """Shape (B, capacity): (x, y, θ), then the landmarks by slot; θ is not wrapped."""
+    #: Of the additive error, shape (B, capacity, capacity).
     covariances: Array
-    """Of the additive error, shape (B, capacity, capacity)."""
+    #: Shape (B, L): landmark i has column 3 + 2 slots[i]; -1 where not mapped.
     slots: IntArray
-    """Shape (B, L): landmark i has column 3 + 2 slots[i]; -1 where not mapped."""
 
     @classmethod
     def of(cls, means: Array, covariances: Array, slots: IntArray) -> BatchStorage:

@@ -47,12 +47,12 @@ class PoseReading(NamedTuple):
     wrapped.
     """
 
+    #: z, shape (k,), or (B, k) of B runs.
     value: Array
-    """z, shape (k,), or (B, k) of B runs."""
+    #: H, shape (k, 3).
     matrix: Array
-    """H, shape (k, 3)."""
+    #: R, shape (k, k), positive definite.
     covariance: Array
-    """R, shape (k, k), positive definite."""
 
     @classmethod
     def checked(
@@ -135,16 +135,16 @@ def gate_of(rules: Rules, size: int) -> float:
 class ObservedMap(NamedTuple):
     """A belief after a reading of the pose; all may have leading axes."""
 
+    #: Shape (n,).
     mean: Array
-    """Shape (n,)."""
+    #: Shape (n, n).
     covariance: Array
-    """Shape (n, n)."""
+    #: ν at the prior, shape (k,).
     innovation: Array
-    """ν at the prior, shape (k,)."""
+    #: L, shape (k, k), L Lᵀ = S.
     factor: Array
-    """L, shape (k, k), L Lᵀ = S."""
+    #: νᵀ S⁻¹ ν, shape ().
     nis: Array
-    """νᵀ S⁻¹ ν, shape ()."""
 
 
 def observe(
@@ -238,10 +238,10 @@ def slopes_at(H: Array, moved: Array) -> Array:
 class ObservesPoses:
     """A filter on a Gaussian map that takes readings of its pose."""
 
+    #: The belief, in the arrays that steps change.
     map: GaussianMap
-    """The belief, in the arrays that steps change."""
+    #: What distinguishes this filter's updates from another's.
     rules: Rules
-    """What distinguishes this filter's updates from another's."""
 
     @property
     def frame(self) -> ErrorFrame:

@@ -51,18 +51,12 @@ from ..kernels.kalman_gain import (
 from ..models.sensors import Sensor
 from ..support import saved_states
 from ..support.argument_checks import LOWEST_ID, RESERVED_IDS
-from ..support.saved_states import (
-    NUMBERS,
-    WHOLE,
-    Table,
-    with_prefix,
-    without_prefix,
-)
+from ..support.saved_states import NUMBERS, WHOLE, Table, with_prefix, without_prefix
 from .conditioning import composed
 from .gaussian_map import GaussianMap
 
+#: Past poses kept; beyond it, the one nearest to the pose before it goes.
 MOST_POSES = 40
-"""Past poses kept; beyond it, the one nearest to the pose before it goes."""
 CERTAIN = 10.0  # distance of a placed landmark, in its standard deviations
 BENT = 0.1  # second-order change of its readings, in theirs
 UNLIKELY = 23.0  # 2 log 10⁵: excess of the cost of other places
@@ -73,18 +67,18 @@ SAME = 0.02  # places this near, relative to their distance, are one
 class Waiting(NamedTuple):
     """The readings that wait."""
 
+    #: Landmark and past pose of each, shape (w, 2).
     ids: IntArray = np.zeros((0, 2), dtype=np.int64)
-    """Landmark and past pose of each, shape (w, 2)."""
+    #: Shape (w, 2).
     readings: Array = np.zeros((0, 2))
-    """Shape (w, 2)."""
 
     def where(self, chosen: BoolArray) -> Waiting:
         """Return some of the readings."""
         return Waiting(self.ids[chosen], self.readings[chosen])
 
 
+#: What saved readings must be.
 WAITING_STATE: Table = {"ids": (WHOLE, "w", 2), "readings": (NUMBERS, "w", 2)}
-"""What saved readings must be."""
 
 
 def is_landmark(landmark_id: int) -> bool:
@@ -113,11 +107,7 @@ def read_waiting(state: Mapping[str, Any], mapped: Collection[int]) -> dict[str,
 
 
 def collect(
-    gaussian: GaussianMap,
-    sensor: Sensor,
-    rules: Rules,
-    waiting: Waiting,
-    new: Waiting,
+    gaussian: GaussianMap, sensor: Sensor, rules: Rules, waiting: Waiting, new: Waiting
 ) -> tuple[Waiting, tuple[int, ...]]:
     """Take in readings of landmarks that are not mapped, and place those it can.
 

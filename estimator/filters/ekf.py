@@ -47,23 +47,18 @@ from ..support.saved_states import with_prefix
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
 from .conditioning import ObservesPoses
 from .delayed_landmarks import Waiting, collect, is_landmark, read_waiting
-from .gaussian_map import (
-    MAP_STATE,
-    GaussianMap,
-    UpdateKernel,
-    not_positive_definite,
-)
+from .gaussian_map import MAP_STATE, GaussianMap, UpdateKernel, not_positive_definite
 
 
 class MapFilter(ObservesPoses):
     """A filter without its steps: reset, belief, saved state, map editing."""
 
+    #: The belief, in the arrays that steps change.
     map: GaussianMap
-    """The belief, in the arrays that steps change."""
+    #: What distinguishes this filter's updates from another's.
     rules: Rules
-    """What distinguishes this filter's updates from another's."""
+    #: Readings that wait, of a sensor that does not place landmarks one by one.
     waiting: Waiting | None = None
-    """Readings that wait, of a sensor that does not place landmarks one by one."""
 
     __repr__ = describe_filter
 
@@ -202,8 +197,8 @@ class MapFilter(ObservesPoses):
         """Return the report of the last update once more."""
         return self.map.last_report() if self._report is None else self._report
 
+    #: That of the last update, where the map has changed since.
     _report: UpdateReport | None = None
-    """That of the last update, where the map has changed since."""
 
     def memory_for(self, landmarks: int) -> int:
         """Return the least memory of a map with this many landmarks [bytes]."""
@@ -288,8 +283,8 @@ class EkfSlam(MapFilter):
     _linearisation: ClassVar[int] = AT_ESTIMATE
     _frame: ClassVar[int] = ADDITIVE
 
+    #: The kernel: screen, correct, add new landmarks.
     _update_map: ClassVar[UpdateKernel] = staticmethod(update_map)
-    """The kernel: screen, correct, add new landmarks."""
 
     def __init__(
         self,

@@ -54,8 +54,8 @@ from .conditioning import coincide
 set_attribute = object.__setattr__  # of frozen dataclasses
 FIRST_LANDMARKS = FIRST_READINGS = 8  # that a new map has room for
 
+#: Takes block, readings and ids in; returns the status.
 UpdateKernel = Callable[..., int]
-"""Takes block, readings and ids in; returns the status."""
 
 
 class GaussianMap:
@@ -84,10 +84,10 @@ class GaussianMap:
     ({7: 0}, array([2., 0.]))
     """
 
+    #: The memory, as kernels take it.
     block: Array
-    """The memory, as kernels take it."""
+    #: Its parts by name.
     parts: Parts
-    """Its parts by name."""
     _slots: dict[int, int]
     _last: Callable[[], ScanReport | None]
 
@@ -352,13 +352,13 @@ class GaussianMap:
         self.hold(BeliefArrays(*saved), np.asarray(state["landmark_ids"]).tolist())
 
 
+#: What a saved map must be.
 MAP_STATE: Table = {
     "landmark_ids": (IDS, "n"),
     "mean": (NUMBERS, "3+2n"),
     "covariance": (COVARIANCE, "3+2n", "3+2n"),
     "reference": (NUMBERS, "3+2n"),
 }
-"""What a saved map must be."""
 
 
 def without_landmarks(array: Array, slots: Iterable[int]) -> Array:
@@ -387,10 +387,7 @@ def without_landmarks(array: Array, slots: Iterable[int]) -> Array:
 def workspace_for(rules: Rules, readings: int, capacity: int) -> Workspace:
     """Allocate what updates by these rules need, with this many readings at most."""
     return new_workspace(
-        readings,
-        capacity,
-        iterated=rules.iterations > 1,
-        spoilable=readings > BLOCK,
+        readings, capacity, iterated=rules.iterations > 1, spoilable=readings > BLOCK
     )
 
 

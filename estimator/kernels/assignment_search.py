@@ -255,32 +255,32 @@ def search_assignments(
 
 UNPAIRED = -1
 
+#: A landmark is sure to be where the map has it up to this det S / det Q.
 SURE = 9.0
-"""A landmark is sure to be where the map has it up to this det S / det Q."""
 
+#: Cost that a pair saves where the number of pairs counts before all else.
 PAIR_BONUS = 1e6
-"""Cost that a pair saves where the number of pairs counts before all else."""
 
 
 class Problem(NamedTuple):
     """Readings of one scan and the landmarks that they may belong to."""
 
+    #: ν = z − h(x), shape (m, J, 2), bearings in [-π, π).
     innovations: Array
-    """ν = z − h(x), shape (m, J, 2), bearings in [-π, π)."""
+    #: C = H P Hᵀ of all expected readings, shape (2J, 2J).
     joint: Array
-    """C = H P Hᵀ of all expected readings, shape (2J, 2J)."""
+    #: Diagonal of Q for each pair, shape (m, J, 2).
     variances: Array
-    """Diagonal of Q for each pair, shape (m, J, 2)."""
+    #: Pairs to consider, shape (m, J).
     feasible: BoolArray
-    """Pairs to consider, shape (m, J)."""
+    #: λ of each reading, shape (m,).
     missing: Array
-    """λ of each reading, shape (m,)."""
+    #: Largest νᵀ S⁻¹ ν of a pair, given the pairs before it.
     gate: float
-    """Largest νᵀ S⁻¹ ν of a pair, given the pairs before it."""
+    #: Largest νᵀ S⁻¹ ν of 0 … m pairs together, shape (m + 1,).
     limits: Array
-    """Largest νᵀ S⁻¹ ν of 0 … m pairs together, shape (m + 1,)."""
+    #: Most pairs first, then the least νᵀ S⁻¹ ν, in place of the likelihood.
     pairs_first: bool
-    """Most pairs first, then the least νᵀ S⁻¹ ν, in place of the likelihood."""
 
 
 @jit

@@ -129,10 +129,7 @@ def step_runs(
 
 @jit
 def begin_runs(
-    run_arrays: tuple[Any, ...],
-    chosen: Bool,
-    poses: Array,
-    variances: Array,
+    run_arrays: tuple[Any, ...], chosen: Bool, poses: Array, variances: Array
 ) -> None:
     """Restart the chosen runs, (B,), at poses (B, 3) with variances (3,)."""
     runs = RunArrays(*run_arrays)

@@ -46,19 +46,19 @@ class Room(NamedTuple):
 class Imagined(NamedTuple):
     """The beliefs expected after K plans of T steps in B worlds."""
 
+    #: (x, y, θ) after every step, shape (B, K, T, 3) [m, m, rad].
     poses: Array
-    """(x, y, θ) after every step, shape (B, K, T, 3) [m, m, rad]."""
+    #: Of the additive error, shape (B, K, T, 3, 3).
     pose_covariances: Array
-    """Of the additive error, shape (B, K, T, 3, 3)."""
+    #: log det of the joint covariance of the mapped landmarks in the end, (B, K); with
+    #: H horizons after each of them, (B, K, H).
     log_det: Array
-    """log det of the joint covariance of the mapped landmarks in the end, (B, K); with
-    H horizons after each of them, (B, K, H)."""
+    #: Larger eigenvalue of the covariance of each landmark in the end, (B, K, L) [m²],
+    #: or after each horizon, (B, K, H, L); inf where it is not mapped.
     worst_variances: Array
-    """Larger eigenvalue of the covariance of each landmark in the end, (B, K, L) [m²],
-    or after each horizon, (B, K, H, L); inf where it is not mapped."""
+    #: Expected number of landmarks seen for the first time until each step,
+    #: (B, K, T).
     new_landmarks: Array
-    """Expected number of landmarks seen for the first time until each step,
-    (B, K, T)."""
 
 
 @jit

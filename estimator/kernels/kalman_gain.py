@@ -26,12 +26,7 @@ BLOCK = 6  # readings absorbed at a time below it
 
 @njit_internal
 def absorb(
-    covariance: Array,
-    size: int,
-    rows: Array,
-    columns: IntArray,
-    used: int,
-    block: int,
+    covariance: Array, size: int, rows: Array, columns: IntArray, used: int, block: int
 ) -> int:
     """Condition P on m simultaneous readings, and find the correction of the state.
 
@@ -456,8 +451,8 @@ class Rules(NamedTuple):
 
 
 ITERATIONS = Rules._fields.index("iterations")
+#: Column of the first of the four standard deviations of a reading in the rules.
 FIRST_STD = Rules._fields.index("bearing_std")
-"""Column of the first of the four standard deviations of a reading in the rules."""
 AFTER_STDS = Rules._fields.index("min_range")
 NUMBERS_READ = Rules._fields.index("numbers")
 

@@ -630,11 +630,7 @@ def _project(reference: Array, column: int, H: Array) -> None:
 
 @njit_internal
 def add_landmark(
-    belief: BeliefArrays,
-    size: int,
-    z0: float,
-    z1: float,
-    rules: Rules,
+    belief: BeliefArrays, size: int, z0: float, z1: float, rules: Rules
 ) -> None:
     """Append the landmark of one reading, eq. 1.3, with its correlation to all else.
 

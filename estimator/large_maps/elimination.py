@@ -136,20 +136,17 @@ def _by_node(slots: IntArray, nodes: IntArray) -> dict[int, IntArray]:
 
 
 def _eliminate(
-    matrix: InformationMatrix,
-    own: IntArray,
-    beyond: BoolArray,
-    children: list[_Eliminated],
+    matrix: InformationMatrix, own: IntArray, far: BoolArray, below: list[_Eliminated]
 ) -> _Eliminated:
-    """Eliminate a node's own landmarks; ``beyond`` marks those not below the node."""
+    """Eliminate a node's own landmarks; ``far`` marks those not below the node."""
     counts, links, blocks = matrix.rows(own)
-    inherited = [child.node.rest[::2] // 2 for child in children]
-    is_rest = np.zeros(len(beyond), dtype=bool)
-    for slots in (links[beyond[links]], *inherited):
+    inherited = [child.node.rest[::2] // 2 for child in below]
+    is_rest = np.zeros(len(far), dtype=bool)
+    for slots in (links[far[links]], *inherited):
         is_rest[slots] = True
     is_rest[own] = False
     rest = np.flatnonzero(is_rest)
-    place = np.full(len(beyond), -1)
+    place = np.full(len(far), -1)
     place[own] = np.arange(len(own))
     place[rest] = np.arange(len(own), len(own) + len(rest))
     p, r = 2 * len(own), 2 * len(rest)
@@ -158,22 +155,19 @@ def _eliminate(
     row = np.repeat(np.arange(len(own)), counts)[here >= 0]
     quads = top.reshape(len(own), 2, len(own) + len(rest), 2)
     quads[row, :, here[here >= 0], :] = blocks[here >= 0]
-    for child, slots in zip(children, inherited, strict=True):
+    for child, slots in zip(below, inherited, strict=True):
         add_update(top, remainder, pairs(place[slots]), child.update)
     node = eliminate_in_place(top, remainder, pairs(own), pairs(rest))
-    return _Eliminated(node, remainder if children else None)
+    return _Eliminated(node, remainder if below else None)
 
 
 class RestFactor:
     """Factor of all landmarks except the local ones, made when it is first used."""
 
     def __init__(
-        self,
-        elimination: LandmarkElimination,
-        matrix: InformationMatrix,
-        local: IntArray,
+        self, order: LandmarkElimination, matrix: InformationMatrix, local: IntArray
     ) -> None:
-        self._elimination, self._matrix, self._local = elimination, matrix, local
+        self._elimination, self._matrix, self._local = order, matrix, local
         self._done: tuple[list[Node], Array, IntArray] | None = None
 
     def _eliminated(self) -> tuple[list[Node], Array, IntArray]:
@@ -393,10 +387,8 @@ class LandmarkDissection:
             order = these[np.argsort(points[these, axis], kind="stable")]
             low, high = order[: len(order) // 2], order[len(order) // 2 :]
             side[low], side[high] = 1, 2
-            low_separator = low[_is_linked(low, part.indptr, part.indices, side == 2)]
-            high_separator = high[
-                _is_linked(high, part.indptr, part.indices, side == 1)
-            ]
+            low_separator = low[_linked(low, part.indptr, part.indices, side == 2)]
+            high_separator = high[_linked(high, part.indptr, part.indices, side == 1)]
             side[these] = 0
             if len(low_separator) <= len(high_separator):
                 low = np.setdiff1d(low, low_separator)
@@ -407,7 +399,7 @@ class LandmarkDissection:
         self.nodes[slots] = nodes
 
 
-def _is_linked(
+def _linked(
     rows: IntArray, starts: IntArray, links: IntArray, others: BoolArray
 ) -> BoolArray:
     """Return which rows of a sparse matrix link to one of the others."""
@@ -481,8 +473,8 @@ class SubmapElimination:
     def __init__(
         self, parts: list[Part], size: int, quadratic: Callable[[int], Quadratic]
     ) -> None:
+        #: c.
         self.cost = 0.0
-        """c."""
         self._nodes: list[Node] = []
         self._solved = np.zeros(size)  # L⁻¹ g
         updates: list[tuple[Array, Array]] = []

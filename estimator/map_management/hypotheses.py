@@ -37,26 +37,26 @@ from ..support.undo import (
 from .managed_slam import ManagedSlam
 from .policy import LandmarkPolicy, as_policy
 
+#: Cost, the hypothesis that it continues, and what completes the association.
 Option = tuple[float, int, Callable[[], ScanAssociation]]
-"""Cost, the hypothesis that it continues, and what completes the association."""
 
+#: Hypotheses e^20 times less probable than the best one are discarded.
 SPREAD = 40.0
-"""Hypotheses e^20 times less probable than the best one are discarded."""
 
+#: Associations tried in a scan, for each hypothesis kept.
 TRIED = 4
-"""Associations tried in a scan, for each hypothesis kept."""
 
+#: A hypothesis is reported until another one is e^5 times more probable.
 DECISIVE = 10.0
-"""A hypothesis is reported until another one is e^5 times more probable."""
 
+#: Most hypotheses whose poses overlap.
 PER_BASIN = 3
-"""Most hypotheses whose poses overlap."""
 
+#: Least variance of a pose that counts [m², rad²].
 NIL = 1e-12
-"""Least variance of a pose that counts [m², rad²]."""
 
+#: Two poses overlap up to this Bhattacharyya distance in every coordinate.
 OVERLAP = 0.5
-"""Two poses overlap up to this Bhattacharyya distance in every coordinate."""
 
 
 def manage(
@@ -77,8 +77,8 @@ def manage(
 class Hypothesis:
     """One sequence of associations, and the filter that has followed it."""
 
+    #: −2 ln of its probability, relative to the best hypothesis.
     cost: float
-    """−2 ln of its probability, relative to the best hypothesis."""
     slam: ManagedSlam
 
 
@@ -182,10 +182,10 @@ class HypothesisSlam:
         noise = motion_std, measurement_std
         make = partial(ManagedSlam, estimator, *noise, management=self._policy)
         self._pool = FilterPool(partial(make, **options))
+        #: The reported hypothesis, then the others, the most probable first.
         self.hypotheses = [Hypothesis(0.0, self._pool.fresh())]
-        """The reported hypothesis, then the others, the most probable first."""
+        #: Number of steps taken.
         self.steps = 0
-        """Number of steps taken."""
         self._report: UpdateReport | None = None
 
     @property

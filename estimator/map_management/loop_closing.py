@@ -24,24 +24,24 @@ from ...arrays import Array, BoolArray, IntArray
 from ..association.constellations import Constellations, TwoPlaces, match_constellations
 from ..interface import MapView
 
+#: Landmarks that are the same: (kept, gone).
 Pairs = list[tuple[int, int]]
-"""Landmarks that are the same: (kept, gone)."""
 
+#: Landmarks count as local within this many times the reach of the readings.
 LOCAL_REACH = 3.0
-"""Landmarks count as local within this many times the reach of the readings."""
+#: Largest χ² of the offset of two landmarks that may be the same; 2 degrees.
 OFFSET_GATE = 25.0
-"""Largest χ² of the offset of two landmarks that may be the same; 2 degrees."""
+#: Largest χ² of the offset of two landmarks that are the same; 2 degrees, 99 %.
 SAME_GATE = 9.21
-"""Largest χ² of the offset of two landmarks that are the same; 2 degrees, 99 %."""
+#: Landmarks around the robot are those more certain than this times lost ones.
 LOCAL_STD = 0.5
-"""Landmarks around the robot are those more certain than this times lost ones."""
+#: An offset is accurate if its σ is less than this times that of lost landmarks.
 ACCURATE = 0.25
-"""An offset is accurate if its σ is less than this times that of lost landmarks."""
+#: How many σ beyond the reach of a reading its landmark may be.
 NEAR_STDS = 10.0
-"""How many σ beyond the reach of a reading its landmark may be."""
 TURN_STDS = 4.0
+#: The heading may be wrong by this number of σ, and by this angle [rad].
 SLACK = 0.2
-"""The heading may be wrong by this number of σ, and by this angle [rad]."""
 
 
 class LoopCloser:
@@ -55,8 +55,8 @@ class LoopCloser:
 
     def __init__(self, rules: Constellations | None) -> None:
         self._rules = rules
+        #: Mapped landmarks that may be older, lost ones.
         self.doubtful: set[int] = set()
-        """Mapped landmarks that may be older, lost ones."""
 
     def lost(self, view: MapView) -> BoolArray:
         """Return which landmarks of a view are lost, shape (n,).
@@ -151,10 +151,7 @@ def _found_again(
 
 
 def _recognised(
-    view: MapView,
-    is_lost: BoolArray,
-    within: float,
-    rules: Constellations,
+    view: MapView, is_lost: BoolArray, within: float, rules: Constellations
 ) -> Pairs:
     """Return landmarks of a constellation that is recognised."""
     away = np.hypot(*(view.landmarks - view.mean[:2]).T)

@@ -116,10 +116,10 @@ class ManagedSlam:
         merging = self._policy.merge_within is not None
         self._editor = MapEditor(self._filter, merging=merging)
         self._pruner = MapPruner(self._policy, self._editor, self._sensor.noise)
+        #: Landmarks that are not in the map yet.
         self.candidates = Candidates()
-        """Landmarks that are not in the map yet."""
+        #: Number of steps taken.
         self.steps = 0
-        """Number of steps taken."""
         self._report: UpdateReport | None = None
         window = self._policy.confirm[1] if self._policy.backdate else 0
         self._recent = RecentScans(

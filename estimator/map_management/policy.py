@@ -44,19 +44,19 @@ class LandmarkPolicy(AssociationPolicy):
     (0,)
     """
 
+    #: Field of view of the sensor; required by ``remove_after``.
     view: FieldOfView | None = None
-    """Field of view of the sensor; required by ``remove_after``."""
+    #: Remove a landmark missed in this many scans since it was last seen.
     remove_after: int | None = None
-    """Remove a landmark missed in this many scans since it was last seen."""
+    #: Smallest distance of two landmarks [m]; landmarks estimated closer are merged.
     merge_within: float | None = None
-    """Smallest distance of two landmarks [m]; landmarks estimated closer are merged."""
+    #: Largest Dᵀ C⁻¹ D, of the offset D, at which two landmarks may be one.
     merge_gate: float = 9.21
-    """Largest Dᵀ C⁻¹ D, of the offset D, at which two landmarks may be one."""
+    #: How landmarks around the robot are recognised as older ones after long drift;
+    #: None: never.
     constellations: Constellations | None = field(default_factory=Constellations)
-    """How landmarks around the robot are recognised as older ones after long drift;
-    None: never."""
+    #: Largest number of landmarks; beyond it the least informative are removed.
     capacity: int | None = None
-    """Largest number of landmarks; beyond it the least informative are removed."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -156,20 +156,20 @@ class FieldOfView:
     [True, False, False]
     """
 
+    #: Largest range [m].
     max_range: float
-    """Largest range [m]."""
+    #: Smallest range [m].
     min_range: float = 0.0
-    """Smallest range [m]."""
+    #: Full angle, centred on the heading [rad].
     angle: float = 2 * pi
-    """Full angle, centred on the heading [rad]."""
+    #: Landmarks nearer than this to a range limit are not expected [m].
     range_margin: float = 0.5
-    """Landmarks nearer than this to a range limit are not expected [m]."""
+    #: Landmarks nearer than this to an edge of the angle are not expected [rad].
     bearing_margin: float = 0.05
-    """Landmarks nearer than this to an edge of the angle are not expected [rad]."""
+    #: A landmark within this angle of a nearer reading may be hidden by it [rad].
     shadow: float = 0.0
-    """A landmark within this angle of a nearer reading may be hidden by it [rad]."""
+    #: Function of a pose (3,) and landmarks (n, 2): True, shape (n,), if not hidden.
     visible: Visibility | None = None
-    """Function of a pose (3,) and landmarks (n, 2): True, shape (n,), if not hidden."""
 
     def __post_init__(self) -> None:
         for name in ("min_range", "range_margin", "bearing_margin", "shadow"):

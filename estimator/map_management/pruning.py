@@ -72,11 +72,7 @@ class MapPruner:
         return {view.ids[slot] for slot in np.flatnonzero(mask).tolist()}
 
     def prune(
-        self,
-        readings: Array,
-        plan: ScanAssociation,
-        seen: set[int],
-        missed: set[int],
+        self, readings: Array, plan: ScanAssociation, seen: set[int], missed: set[int]
     ) -> tuple[list[int], list[tuple[int, int]]]:
         """Remove and merge landmarks; return the removed ids and pairs (kept, gone).
 
@@ -178,6 +174,7 @@ class MapPruner:
         vars(self._records).update(saved)
 
 
+#: What a saved state holds about the landmarks of a map.
 RECORDS: saved_states.Table = {
     "ids": (saved_states.IDS, "n"),
     "sightings": (saved_states.COUNTS, "n"),
@@ -187,7 +184,6 @@ RECORDS: saved_states.Table = {
     "aliases": (saved_states.WHOLE, -1, 2),
     "doubtful": (saved_states.IDS, -1),
 }
-"""What a saved state holds about the landmarks of a map."""
 
 
 class LandmarkMerger:
@@ -209,10 +205,10 @@ class LandmarkMerger:
         self, policy: LandmarkPolicy, editor: MapEditor, records: LandmarkRecords
     ) -> None:
         self._policy, self._editor, self._records = policy, editor, records
+        #: Landmarks known to differ.
         self.apart: set[tuple[int, int]] = set()
-        """Landmarks known to differ."""
+        #: Landmarks merged into others: gone to kept.
         self.aliases: dict[int, int] = {}
-        """Landmarks merged into others: gone to kept."""
 
     def note_scan(self, view: MapView, ids: Sequence[int]) -> None:
         """Record that landmarks seen in one scan are different ones."""

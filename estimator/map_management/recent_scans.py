@@ -17,11 +17,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ..association.scan_association import (
-    LABEL_BITS,
-    NO_LABEL,
-    ScanAssociation,
-)
+from ..association.scan_association import LABEL_BITS, NO_LABEL, ScanAssociation
 from ..filters.conditioning import PoseReading
 from ..interface import (
     ScanDecisions,
@@ -69,8 +65,8 @@ class RecentScans:
         """Start a new run."""
         self.scans: list[RecentScan] = []
         self.motions: tuple[Motion, ...] = ()
+        #: About every scan since the start, or since a saved state was loaded.
         self.decisions: list[ScanDecisions] = []
-        """About every scan since the start, or since a saved state was loaded."""
 
     def copy_from(self, other: RecentScans) -> None:
         """Continue from the scans of another run with the same kind of filter."""
@@ -110,9 +106,7 @@ class RecentScans:
         if self.scans and (removed or merged):
             last = self.scans[-1]
             self.scans[-1] = replace(
-                last,
-                removed=(*last.removed, *removed),
-                merged=(*last.merged, *merged),
+                last, removed=(*last.removed, *removed), merged=(*last.merged, *merged)
             )
 
     def with_scan(
@@ -286,6 +280,7 @@ def _drop_contradicted(
 # One of the last scans of a run, kept so that it can be repeated.
 
 MOTIONS = (saved_states.NUMBERS, -1, 3)
+#: What the saved state of a scan holds, beside the state of the filter.
 SCAN: saved_states.Table = {
     "number": (saved_states.COUNTS,),
     "motions": MOTIONS,
@@ -295,14 +290,13 @@ SCAN: saved_states.Table = {
     "removed": (saved_states.WHOLE, -1),
     "merged": (saved_states.WHOLE, -1, 2),
 }
-"""What the saved state of a scan holds, beside the state of the filter."""
+#: What a saved state holds about the last scans, beside these.
 WINDOW: saved_states.Table = {"motions": MOTIONS, "count": (saved_states.COUNTS,)}
-"""What a saved state holds about the last scans, beside these."""
 
 NO_LANDMARK = np.iinfo(np.int64).min
 
+#: (d, α) [m, rad] and dt; or one of the rows of a reading of the pose.
 Motion = tuple[float, float, float]
-"""(d, α) [m, rad] and dt; or one of the rows of a reading of the pose."""
 
 
 def move(slam: Any, motions: Sequence[Motion]) -> None:
@@ -320,20 +314,20 @@ class RecentScan:
     """One scan, the motion before it, and its association."""
 
     number: int
+    #: Odometry, and readings of the pose.
     motions: tuple[Motion, ...]
-    """Odometry, and readings of the pose."""
+    #: Rows (β, r), shape (m, 2).
     readings: Array
-    """Rows (β, r), shape (m, 2)."""
+    #: Landmark of each row, None where the filter does not use it.
     row_ids: tuple[int | None, ...]
-    """Landmark of each row, None where the filter does not use it."""
+    #: Label of the tentative landmark of each row, or `NO_LABEL`.
     labels: tuple[int, ...]
-    """Label of the tentative landmark of each row, or `NO_LABEL`."""
+    #: State of the filter before the scan, where a tentative landmark begins in it.
     before: Mapping[str, Any] | None = None
-    """State of the filter before the scan, where a tentative landmark begins in it."""
+    #: Landmarks removed after it.
     removed: tuple[int, ...] = ()
-    """Landmarks removed after it."""
+    #: Landmarks merged after it: (kept, gone).
     merged: tuple[tuple[int, int], ...] = ()
-    """Landmarks merged after it: (kept, gone)."""
 
     @property
     def begins(self) -> bool:

@@ -91,8 +91,8 @@ def _ahead(distance: Real, turn: Real) -> tuple[Real, Real, Real]:
     return distance, 0.0, turn
 
 
+#: Drive d along the heading, then turn by α: b = (d, 0, α).
 UNICYCLE = Motion("unicycle", ("d", "alpha"), ("m", "rad"), _ahead)
-"""Drive d along the heading, then turn by α: b = (d, 0, α)."""
 
 
 def differential(track_width: float) -> Motion:
@@ -188,12 +188,12 @@ def _length(name: str, value: float) -> float:
     return argument_checks.above(name, value, 0.0)
 
 
+#: The shipped drives by name: functions of their lengths.
 MOTIONS: dict[str, Callable[..., Motion]] = {
     "unicycle": lambda: UNICYCLE,
     "differential": differential,
     "bicycle": bicycle,
 }
-"""The shipped drives by name: functions of their lengths."""
 
 
 def find_motion(motion: str | Motion) -> Motion:
@@ -242,18 +242,15 @@ def find_motion(motion: str | Motion) -> Motion:
 class MotionNoise(NamedTuple):
     """A drive with the variances of its noise, and whether there is noise at rest."""
 
+    #: (σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²].
     variance: Array
-    """(σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²]."""
+    #: False: odometry that moves nothing adds no noise.
     at_rest: bool = True
-    """False: odometry that moves nothing adds no noise."""
     motion: Motion = UNICYCLE
 
     @classmethod
     def checked(
-        cls,
-        motion_std: ArrayLike,
-        noise_at_rest: bool,
-        motion: str | Motion = UNICYCLE,
+        cls, motion_std: ArrayLike, noise_at_rest: bool, motion: str | Motion = UNICYCLE
     ) -> MotionNoise:
         """Return the noise of these standard deviations (3,), or refuse them."""
         std = argument_checks.standard_deviations("motion_std", motion_std, 3)

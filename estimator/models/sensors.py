@@ -229,10 +229,10 @@ BEARING = Sensor(
 )
 RANGE = Sensor("range", ("range",), ("m",), read_range, std=range_std)
 
+#: The known sensors by name.
 SENSORS: dict[str, Sensor] = {
     sensor.name: sensor for sensor in (BEARING_RANGE, POSITION, BEARING, RANGE)
 }
-"""The known sensors by name."""
 
 
 def register_sensor(sensor: Sensor) -> None:

@@ -9,12 +9,12 @@ EXTRA = "pip install 'slamgym[peers]'"
 class Peer(NamedTuple):
     """An estimator of another library, of the optional extra ``peers``."""
 
+    #: For :func:`~slamgym.estimator.make_estimator`.
     name: str
-    """For :func:`~slamgym.estimator.make_estimator`."""
+    #: Name of the package to import.
     library: str
-    """Name of the package to import."""
+    #: Its adapter, "module:Class".
     path: str
-    """Its adapter, "module:Class"."""
     description: str
 
     @property

@@ -1,7 +1,5 @@
 """filterpy's Kalman filters; a new filter object wherever the map has grown."""
 
-from __future__ import annotations
-
 import numpy as np
 from filterpy.kalman import (
     ExtendedKalmanFilter,
@@ -40,15 +38,13 @@ class FilterpyEkfSlam(KalmanPeer):
         peer.predict()
         return Moments(moved, peer.P)
 
-    def _corrected(
-        self, state: Moments, readings: Readings
-    ) -> tuple[Moments, Innovation]:
-        peer = _ekf(state, readings=len(readings.slots))
+    def _corrected(self, state: Moments, scan: Readings) -> tuple[Moments, Innovation]:
+        peer = _ekf(state, readings=len(scan.slots))
         peer.update(
-            readings.measurements.ravel(),
-            lambda mean: expected_readings(mean, readings.slots)[1],
-            lambda mean: expected_readings(mean, readings.slots)[0].ravel(),
-            R=np.diag(readings.variances.ravel()),
+            scan.measurements.ravel(),
+            lambda mean: expected_readings(mean, scan.slots)[1],
+            lambda mean: expected_readings(mean, scan.slots)[0].ravel(),
+            R=np.diag(scan.variances.ravel()),
             residual=lambda z, expected: wrapped(z - expected),
         )
         return Moments(peer.x, peer.P), Innovation(peer.y.reshape(-1, 2), peer.S)
@@ -68,15 +64,13 @@ class FilterpyUkfSlam(KalmanPeer):
         peer.predict(fx=lambda mean, _: moved_state(mean, odometry)[0])
         return Moments(peer.x, peer.P)
 
-    def _corrected(
-        self, state: Moments, readings: Readings
-    ) -> tuple[Moments, Innovation]:
-        peer = _ukf(state, readings=len(readings.slots))
+    def _corrected(self, state: Moments, scan: Readings) -> tuple[Moments, Innovation]:
+        peer = _ukf(state, readings=len(scan.slots))
         peer.sigmas_f = peer.points_fn.sigma_points(peer.x, peer.P)
         peer.update(
-            readings.measurements.ravel(),
-            R=np.diag(readings.variances.ravel()),
-            hx=lambda mean: expected_readings(mean, readings.slots)[0].ravel(),
+            scan.measurements.ravel(),
+            R=np.diag(scan.variances.ravel()),
+            hx=lambda mean: expected_readings(mean, scan.slots)[0].ravel(),
         )
         return Moments(peer.x, peer.P), Innovation(peer.y.reshape(-1, 2), peer.S)
 

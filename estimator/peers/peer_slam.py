@@ -3,8 +3,6 @@
 `PeerSlam` is the base of all adapters, and `KalmanPeer` that of Kalman filters.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -229,9 +227,7 @@ class KalmanPeer(PeerSlam):
         """Return the state moved by (d, α) with noise of these variances (3,)."""
 
     @abstractmethod
-    def _corrected(
-        self, state: Moments, readings: Readings
-    ) -> tuple[Moments, Innovation]:
+    def _corrected(self, state: Moments, scan: Readings) -> tuple[Moments, Innovation]:
         """Return the state after readings of mapped landmarks, and what was new."""
 
     def _mean(self) -> Array:

@@ -4,8 +4,6 @@ Stone Soup has no model of SLAM: it gets one of the motion and one of the readin
 the whole state, with their Jacobians, and bearings of its own type, which wrap.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
@@ -94,17 +92,15 @@ class _StoneSoupSlam(KalmanPeer):
         predictor = self._predictor(_Motion(odometry=odometry, noise=noise))
         return _moments(predictor.predict(_gaussian(state)))
 
-    def _corrected(
-        self, state: Moments, readings: Readings
-    ) -> tuple[Moments, Innovation]:
+    def _corrected(self, state: Moments, scan: Readings) -> tuple[Moments, Innovation]:
         n = len(state.mean)
         model = _Scan(
             ndim_state=n,
             mapping=tuple(range(n)),
-            noise_covar=CovarianceMatrix(np.diag(readings.variances.ravel())),
-            slots=readings.slots,
+            noise_covar=CovarianceMatrix(np.diag(scan.variances.ravel())),
+            slots=scan.slots,
         )
-        read = Detection(_typed(readings.measurements), measurement_model=model)
+        read = Detection(_typed(scan.measurements), measurement_model=model)
         found = self._updater(None).update(SingleHypothesis(_gaussian(state), read))
         expected = found.hypothesis.measurement_prediction
         nu = _column(read.state_vector - expected.state_vector).reshape(-1, 2)
@@ -151,6 +147,4 @@ def _column(vector: Any) -> Array:
 
 def _typed(readings: Array) -> Any:
     """Return readings (m, 2) as a state vector with bearings that wrap."""
-    return StateVector(
-        [value for bearing, r in readings for value in (Bearing(bearing), r)]
-    )
+    return StateVector([value for b, r in readings for value in (Bearing(b), r)])

@@ -231,26 +231,26 @@ class SmoothedDrive:
         drive: Drive,
     ) -> None:
         estimate = solution.estimate
+        #: Half the sum of the squared, normalised residuals; of a robust kernel, ρ.
         self.cost = solution.cost
-        """Half the sum of the squared, normalised residuals; of a robust kernel, ρ."""
+        #: The cost at the start.
         self.first_cost = solution.first_cost
-        """The cost at the start."""
+        #: Steps of Levenberg-Marquardt.
         self.iterations = solution.iterations
-        """Steps of Levenberg-Marquardt."""
+        #: In the order of their first reading.
         self.landmark_ids = drive.landmark_ids
-        """In the order of their first reading."""
+        #: (x, y, θ), shape (N, 3) [m, m, rad], heading in [-π, π).
         self.poses = estimate.poses.copy()
-        """(x, y, θ), shape (N, 3) [m, m, rad], heading in [-π, π)."""
         self.poses[:, 2] = wrap_angle(self.poses[:, 2])
         self._motions, self._noise = tuple(drive.motions), drive.motion_noise
+        #: Number of readings of landmarks.
         self.readings = drive.readings
-        """Number of readings of landmarks."""
+        #: Number of components of readings of the poses themselves.
         self.pose_components = drive.pose_components
-        """Number of components of readings of the poses themselves."""
         self._slots = {i: slot for slot, i in enumerate(order)}
         self._all = estimate.landmarks
+        #: Positions in the order of `landmark_ids`, shape (n, 2) [m].
         self.landmarks = self._all[self._columns(self.landmark_ids)].reshape(-1, 2)
-        """Positions in the order of `landmark_ids`, shape (n, 2) [m]."""
         self._optimiser, self._solution = optimiser, solution
         if solution.is_damped:
             _ = self._marginals  # refuses landmarks that are not determined

@@ -49,14 +49,14 @@ from .drive import Drive, DriveArrays, Sightings, landmark_order
 from .optimiser import Estimate, Noise, Optimiser, start_of
 
 NONE = -1  # the landmark of a reading that has none
+#: c: a reading costs no more; half of χ² with two degrees of freedom, 99.75 %.
 PRICE = 6.0
-"""c: a reading costs no more; half of χ² with two degrees of freedom, 99.75 %."""
+#: What a landmark costs that is well in view of a scan, but not in it.
 MISS = 1.0
-"""What a landmark costs that is well in view of a scan, but not in it."""
+#: Readings of the smallest landmark.
 LEAST = 3
-"""Readings of the smallest landmark."""
+#: Least decrease of the score that counts.
 SIGNIFICANT = 0.1
-"""Least decrease of the score that counts."""
 ROUNDS, BIRTHS, SEEDS = 8, 10, 150  # of small changes
 GAP = 30  # scans without a landmark that end a visit
 PARTS = (8, 12, 16)  # into which the drive is taken apart
@@ -68,16 +68,16 @@ TOLERANCE, ITERATIONS = 0.03, 30  # of smoothing while searching
 class Reassociation(NamedTuple):
     """A drive with repaired associations."""
 
+    #: With the readings that are given to landmarks.
     drive: Drive
-    """With the readings that are given to landmarks."""
+    #: Its poses to start smoothing from, shape (N, 3) [m, m, rad].
     poses: Array
-    """Its poses to start smoothing from, shape (N, 3) [m, m, rad]."""
+    #: The landmark of each reading, -1 for none, one array for each scan.
     ids: list[IntArray]
-    """The landmark of each reading, -1 for none, one array for each scan."""
+    #: J after the repair.
     score: float
-    """J after the repair."""
+    #: J before.
     first_score: float
-    """J before."""
 
 
 def reassociate(

@@ -72,8 +72,8 @@ class RecordedSlam:
         self._slam, self._noise = slam, noise
         self._editor = MapEditor(slam)
         self._last: Event | None = None
+        #: Number of steps taken.
         self.steps = 0
-        """Number of steps taken."""
         self._report: UpdateReport | None = None
         for name, member in optional_members(slam).items():
             setattr(self, name, member)
@@ -310,8 +310,8 @@ class SmoothingSlam(RecordedSlam):
         taken = accepted_options(find_estimator(name), settings)
         slam = make_estimator(name, **noise, **taken, **options)
         super().__init__(slam, **noise, **settings)
+        #: The robust kernel, as keywords of `batch_smoother.smooth`.
         self.kernel: dict[str, Any] = {"robust": robust, "robust_scale": robust_scale}
-        """The robust kernel, as keywords of `batch_smoother.smooth`."""
 
     def smoothed(self) -> SmoothedDrive:
         """Return the beliefs about all poses, given the drive until now."""

@@ -3,8 +3,6 @@
 Those of every step take well-formed arguments through without a copy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from math import inf, isfinite
 from typing import Any
@@ -110,35 +108,31 @@ def refuse_repeated(ids: Sequence[int]) -> None:
         )
 
 
-def identity_array(
-    landmark_ids: LandmarkIds | None, count: int, estimator: object
-) -> IntArray:
+def identity_array(ids: LandmarkIds | None, count: int, estimator: object) -> IntArray:
     """Return ids as kernels take them: one for each reading; they refuse repetition.
 
     Parameters
     ----------
-    landmark_ids : sequence of int
+    ids : sequence of int
     count : int
         Number of readings.
     estimator
         The filter that needs the ids, which may be None where there are no readings;
         None if ids are always needed.
     """
-    array: Any = landmark_ids
-    if landmark_ids is None and estimator is not None:
+    array: Any = ids
+    if ids is None and estimator is not None:
         if count:
             name = type(estimator).__name__
             raise ValueError(f"landmark_ids must be given: {name} does not associate")
         return np.empty(0, dtype=np.int64)
     if type(array) is not np.ndarray:
         try:
-            array = np.asarray(landmark_ids)
+            array = np.asarray(ids)
         except ValueError:  # a list of lists of several lengths
-            raise ValueError(
-                f"landmark_ids must be integers, got {landmark_ids!r}"
-            ) from None
+            raise ValueError(f"landmark_ids must be integers, got {ids!r}") from None
     if array.dtype is not _INT64 or not array.flags.carray or array.ndim != 1:
-        array = np.array(_as_signed(array, landmark_ids), dtype=np.int64)
+        array = np.array(_as_signed(array, ids), dtype=np.int64)
     if len(array) != count:
         raise ValueError(
             f"measurements has {count} rows but landmark_ids has {len(array)} entries"
@@ -174,24 +168,20 @@ def given_identities(
     return ids
 
 
-def asked_identities(
-    landmark_ids: LandmarkIds | None, mapped: Mapping[int, int]
-) -> list[int]:
+def asked_identities(ids: LandmarkIds | None, mapped: Mapping[int, int]) -> list[int]:
     """Return ids of mapped landmarks without repetition, all of them for None."""
-    if landmark_ids is None:
+    if ids is None:
         return list(mapped)
-    return mapped_identities(landmark_ids, mapped)
+    return mapped_identities(ids, mapped)
 
 
-def mapped_identities(
-    landmark_ids: LandmarkIds, mapped: Mapping[int, int]
-) -> list[int]:
+def mapped_identities(asked: LandmarkIds, mapped: Mapping[int, int]) -> list[int]:
     """Return ids of mapped landmarks, without repetition."""
     try:
-        count = np.size(landmark_ids)
+        count = np.size(asked)
     except ValueError:
         count = 0  # refused by the next line
-    ids = identities(landmark_ids, count)
+    ids = identities(asked, count)
     for i in ids:
         if i not in mapped:
             raise ValueError(f"landmark_ids must be of mapped landmarks, got {i}")

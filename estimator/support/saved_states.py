@@ -1,7 +1,5 @@
 """Declared saved states: what each entry must be, checked by name before it is used."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -11,25 +9,25 @@ import numpy as np
 from ...arrays import LARGEST_IN_STATE, Array, IntArray
 from .argument_checks import as_floats, identities
 
+#: Tolerance of a negative eigenvalue, relative to the trace, or to 1 if it is less.
 ROUNDING = 1e-9
-"""Tolerance of a negative eigenvalue, relative to the trace, or to 1 if it is less."""
 
 
+#: A length, or a letter for one: "n", or "3+2n" for 3 + 2n.  Its first use sets it.
 Size = int | str
-"""A length, or a letter for one: "n", or "3+2n" for 3 + 2n.  Its first use sets it."""
 
 
 class Kind(NamedTuple):
     """What the numbers of an entry are."""
 
+    #: As they are saved.
     dtype: type[np.generic]
-    """As they are saved."""
+    #: Returns a copy of a value by its name and shape, or refuses it.
     checked: Callable[[str, Any, tuple[int, ...]], Any]
-    """Returns a copy of a value by its name and shape, or refuses it."""
 
 
+#: The kind and the shape of each entry of a state, in the order of the checks.
 Table = Mapping[str, tuple[Kind, *tuple[Size, ...]]]
-"""The kind and the shape of each entry of a state, in the order of the checks."""
 
 
 def read(
@@ -116,7 +114,7 @@ def array(name: str, value: Any, shape: tuple[int, ...] | None = None) -> Array:
     """
     numbers = as_floats(f"state[{name!r}]", value)
     if shape is not None:
-        _refuse_other_shape(name, numbers.shape, shape)
+        _refuse_shape(name, numbers.shape, shape)
     if not np.isfinite(numbers).all():
         raise ValueError(f"state[{name!r}] must be finite")
     if (np.abs(numbers) > LARGEST_IN_STATE).any():
@@ -175,7 +173,7 @@ def whole_numbers(
     numbers = np.asarray(value) if not isinstance(value, str) else np.array(value)
     if numbers.dtype.kind not in "iu" and numbers.size:
         raise ValueError(f"state[{name!r}] must be whole numbers, got {value!r}")
-    _refuse_other_shape(name, numbers.shape, shape)
+    _refuse_shape(name, numbers.shape, shape)
     if least is not None and numbers.size and numbers.min() < least:
         raise ValueError(
             f"state[{name!r}] must be whole numbers >= {least}, got {numbers.min()}"
@@ -199,9 +197,7 @@ def flag(name: str, value: Any, shape: tuple[int, ...] = ()) -> bool:
     return bool(given)
 
 
-def _refuse_other_shape(
-    name: str, given: tuple[int, ...], wanted: tuple[int, ...]
-) -> None:
+def _refuse_shape(name: str, given: tuple[int, ...], wanted: tuple[int, ...]) -> None:
     if len(given) != len(wanted) or any(
         w not in (-1, g) for w, g in zip(wanted, given, strict=True)
     ):

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+#: What takes back later changes; it may be called more than once.
 Undo = Callable[[], None]
-"""What takes back later changes; it may be called more than once."""
 
 
 class undone_on_error:  # noqa: N801 (reads as a verb, in a with statement)

@@ -8,23 +8,13 @@ it imports what is heavy when it runs, so that help answers at once.
 import inspect
 from typing import Any
 
-from . import run, replay, fit_noise, monte_carlo, generate, judge, noise_study
-from . import render_video
+from . import run, replay, fit_noise, monte_carlo, generate  # noqa: F401
+from . import judge, noise_study, render_video  # noqa: F401 (each adds its command)
 from .options import Options, takes
 from .program import command, main
 from .reporter import Reporter
 
-__all__ = [
-    "fit_noise",
-    "generate",
-    "judge",
-    "main",
-    "monte_carlo",
-    "noise_study",
-    "render_video",
-    "replay",
-    "run",
-]
+__all__ = ["main"]
 
 
 @command
@@ -74,10 +64,7 @@ def estimators(*, given: Options) -> None:
         (name, "slamgym", True, inspect.getdoc(find_estimator(name)) or "")
         for name in list_estimators()
     ]
-    each += [
-        (peer.name, peer.library, peer.installed, peer.description)
-        for peer in list_peers()
-    ]
+    each += [(p.name, p.library, p.installed, p.description) for p in list_peers()]
     rows = [
         {
             "name": name,

@@ -9,13 +9,15 @@ from .program import command
 
 @dataclass(frozen=True, kw_only=True)
 class FitNoiseOptions(Options):
-    """The options of ``slamgym fit-noise``."""
+    """The options of ``slamgym fit-noise``.
 
-    write: bool = declared(
-        False,
-        "--write",
-        "Put the suggested noise into the header of LOG, a slamlog 1.",
-    )
+    Attributes
+    ----------
+    write
+        Put the suggested noise into the header of LOG, a slamlog 1.
+    """
+
+    write: bool = declared(False, "--write")
 
 
 @command

@@ -15,44 +15,33 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class GenerateOptions(Options):
-    """The options of ``slamgym generate``."""
+    """The options of ``slamgym generate``.
 
-    episodes: int = declared(
-        REQUIRED, "N", "Number of episodes; episode i has seed SEED + i.", min=1
-    )
-    format_: str = declared(
-        "npz",
-        "--format NAME",
-        "npz, parquet and minari hold everything; slamlog, g2o and tum hold what their "
-        "formats express.",
-    )
-    shard: int | None = declared(
-        None,
-        "N",
-        "Episodes in each file or folder of the data set.",
-        "100, fewer if they are large",
-        min=1,
-    )
-    smallest_std: float | None = declared(
-        None,
-        "--smallest-std S",
-        "Smallest standard deviation in files of g2o [m, rad].",
-        "0.001",
-    )
-    believer: str | None = declared(
-        None,
-        "--estimator -e NAME",
-        "A filter whose beliefs after every scan are written beside the truth (npz, "
-        "parquet and minari).",
-        "none",
-    )
-    out: Path | None = declared(
-        None,
-        "DIR",
-        "The folder to write: new, empty, or begun by the same command, which then "
-        "continues, perhaps with more episodes.",
-        "results/<name>-<controller>-<format>",
-    )
+    Attributes
+    ----------
+    episodes
+        Number of episodes; episode i has seed SEED + i.
+    format_
+        npz, parquet and minari hold everything; slamlog, g2o and tum hold what their
+        formats express.
+    shard
+        Episodes in each file or folder of the data set.
+    smallest_std
+        Smallest standard deviation in files of g2o [m, rad].
+    believer
+        A filter whose beliefs after every scan are written beside the truth (npz,
+        parquet and minari).
+    out
+        The folder to write: new, empty, or begun by the same command, which then
+        continues, perhaps with more episodes.
+    """
+
+    episodes: int = declared(REQUIRED, "N", min=1)
+    format_: str = declared("npz", "--format NAME")
+    shard: int | None = declared(None, "N", "100, fewer if they are large", min=1)
+    smallest_std: float | None = declared(None, "--smallest-std S", "0.001")
+    believer: str | None = declared(None, "--estimator -e NAME", "none")
+    out: Path | None = declared(None, "DIR", "results/<name>-<controller>-<format>")
 
 
 @command

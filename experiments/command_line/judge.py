@@ -6,54 +6,44 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from . import options
 from .monte_carlo import show_study
+from .options import FilesOfEstimates, Options, declared, takes
 from .program import BadInputError, command
 
 
 @dataclass(frozen=True, kw_only=True)
-class JudgeOptions(options.Options):
-    """The options of ``slamgym judge``."""
+class JudgeOptions(Options):
+    """The options of ``slamgym judge``.
 
-    drives: Path | None = options.declared(
-        None,
-        "DIR",
-        "The folder of slamgym generate that holds the truth.",
-        "the estimates, if generate wrote them",
-    )
-    truths: list[Path] | None = options.declared(
-        None,
-        "--truth FILE",
-        "The true path of a drive from elsewhere: TUM, or a log with ground truth; "
-        f"or a folder of such files. {options.REPEATED}",
-        "that of the drives",
-    )
-    covariances: str = options.declared(
-        "additive",
-        "additive|invariant|right|left",
-        "The error whose covariances the files hold.",
-    )
-    frame: str = options.declared(
-        "invariant", "invariant|additive", "The error whose NEES decides."
-    )
-    align: str | None = options.declared(
-        None,
-        "fit|X,Y,THETA",
-        "Move all estimates by this motion; fit brings each path closest to its "
-        "truth, and leaves no verdict.",
-        "none",
-    )
-    out: Path | None = options.declared(
-        None,
-        "DIR",
-        "The folder to write: new, empty, or with earlier output of slamgym.",
-        "results/judge-<scenario>",
-    )
+    Attributes
+    ----------
+    drives
+        The folder of slamgym generate that holds the truth.
+    truths
+        The true path of a drive from elsewhere: TUM, or a log with ground truth; or a
+        folder of such files. May be repeated.
+    covariances
+        The error whose covariances the files hold.
+    frame
+        The error whose NEES decides.
+    align
+        Move all estimates by this motion; fit brings each path closest to its truth,
+        and leaves no verdict.
+    out
+        The folder to write: new, empty, or with earlier output of slamgym.
+    """
+
+    drives: Path | None = declared(None, "DIR", "the estimates, if generate wrote them")
+    truths: list[Path] | None = declared(None, "--truth FILE", "that of the drives")
+    covariances: str = declared("additive", "additive|invariant|right|left")
+    frame: str = declared("invariant", "invariant|additive")
+    align: str | None = declared(None, "fit|X,Y,THETA", "none")
+    out: Path | None = declared(None, "DIR", "results/judge-<scenario>")
 
 
 @command
-@options.takes("drives truths covariances frame align out as_json")
-def judge(files: options.FilesOfEstimates, *, given: JudgeOptions) -> int:
+@takes("drives truths covariances frame align out as_json")
+def judge(files: FilesOfEstimates, *, given: JudgeOptions) -> int:
     """Judge estimates of any program.
 
     Decide with known error rates whether the covariances of estimates agree with

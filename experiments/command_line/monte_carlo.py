@@ -22,53 +22,44 @@ FORMATS = ("pdf", "svg", "png")
 
 @dataclass(frozen=True, kw_only=True)
 class MonteCarloOptions(options.Options):
-    """The options of ``slamgym monte-carlo``."""
+    """The options of ``slamgym monte-carlo``.
 
-    estimators: str = options.declared(
-        "ekf,invariant",
-        "--estimators -e NAMES",
-        'Filters separated by commas, such as "ekf,invariant[iterations=3]", or '
-        'your own "module:Class"; options in brackets.',
-    )
-    runs: int = options.declared(
-        200,
-        "",
-        "Number of runs. Run i is the world of seed SEED + i, so studies with "
-        "overlapping seed ranges share worlds.",
-    )
-    assume: list[str] | None = options.declared(
-        None,
-        "KEY=VALUE",
-        "A change of the scenario that only the filters assume, such as "
-        f"motion.std=[0.1,0.1,0.1]. {options.REPEATED}",
-    )
-    block_size: int = options.declared(
-        64, "N", "Number of runs computed and written together."
-    )
-    first_run: int = options.declared(
-        0, "N", "Omit the runs below N, a multiple of the block size."
-    )
-    merge: list[Path] | None = options.declared(
-        None,
-        "DIR",
-        f"Add the results of another machine for this job. {options.REPEATED}",
-    )
-    fresh: bool = options.declared(
-        False, "--fresh", "Remove earlier results in the folder first."
-    )
-    figures: str | None = options.declared(
-        None,
-        "FORMAT",
-        "Also write the figures of the report for print, 85 and 170 mm wide, as pdf, "
-        "svg or png.",
-    )
-    out: Path | None = options.declared(
-        None,
-        "DIR",
-        "The folder to write. An interrupted job there continues, and more runs are "
-        "added to existing ones.",
-        "results/monte-carlo-<scenario>",
-    )
+    Attributes
+    ----------
+    estimators
+        Filters separated by commas, such as "ekf,invariant[iterations=3]", or your own
+        "module:Class"; options in brackets.
+    runs
+        Number of runs. Run i is the world of seed SEED + i, so studies with overlapping
+        seed ranges share worlds.
+    assume
+        A change of the scenario that only the filters assume, such as
+        motion.std=[0.1,0.1,0.1]. May be repeated.
+    block_size
+        Number of runs computed and written together.
+    first_run
+        Omit the runs below N, a multiple of the block size.
+    merge
+        Add the results of another machine for this job. May be repeated.
+    fresh
+        Remove earlier results in the folder first.
+    figures
+        Also write the figures of the report for print, 85 and 170 mm wide, as pdf, svg
+        or png.
+    out
+        The folder to write. An interrupted job there continues, and more runs are added
+        to existing ones.
+    """
+
+    estimators: str = options.declared("ekf,invariant", "--estimators -e NAMES")
+    runs: int = options.declared(200, "")
+    assume: list[str] | None = options.declared(None, "KEY=VALUE")
+    block_size: int = options.declared(64, "N")
+    first_run: int = options.declared(0, "N")
+    merge: list[Path] | None = options.declared(None, "DIR")
+    fresh: bool = options.declared(False, "--fresh")
+    figures: str | None = options.declared(None, "FORMAT")
+    out: Path | None = options.declared(None, "DIR", "results/monte-carlo-<scenario>")
 
 
 @command

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _LOG, _SCENARIO = "a log", "a scenario"
 _ONE_RUN, _MANY_RUNS = "one run of a scenario", "a scenario with --runs above 1"
+#: Parameters that have an effect on one kind of study alone.
 _ONLY_FOR = {
     _LOG: (
         *("motion_std", "measurement_std", "initial_pose_std"),
@@ -36,27 +37,26 @@ _ONLY_FOR = {
     _ONE_RUN: ("controller",),
     _MANY_RUNS: ("change", "jobs"),
 }
-"""Parameters that have an effect on one kind of study alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseStudyOptions(options.Options):
-    """The options of ``slamgym noise-study``."""
+    """The options of ``slamgym noise-study``.
 
-    estimator: str = options.declared(
-        "invariant",
-        "--estimator -e NAME",
-        "A filter, as for replay; with --runs, several with commas between.",
-    )
-    runs: int = options.declared(
-        1, "", "For a scenario: with more than one, each change is a Monte Carlo."
-    )
-    change: str = options.declared(
-        "all",
-        "both|world|filter|all",
-        "With --runs: whether noises change in world and filter, in the world alone, "
-        "or in what the filter assumes.",
-    )
+    Attributes
+    ----------
+    estimator
+        A filter, as for replay; with --runs, several with commas between.
+    runs
+        For a scenario: with more than one, each change is a Monte Carlo.
+    change
+        With --runs: whether noises change in world and filter, in the world alone, or
+        in what the filter assumes.
+    """
+
+    estimator: str = options.declared("invariant", "--estimator -e NAME")
+    runs: int = options.declared(1, "")
+    change: str = options.declared("all", "both|world|filter|all")
 
 
 @program.command
@@ -129,21 +129,21 @@ class Results(NamedTuple):
     """The results of a noise study."""
 
     rows: "Sequence[NoiseRow] | Sequence[NoiseEffect]"
+    #: Of the rows in the summary; empty where they have none.
     titles: Sequence[str]
-    """Of the rows in the summary; empty where they have none."""
     figure: "Figure"
     dpi: int
+    #: What to print, one below the other.
     shown: Sequence[Any]
-    """What to print, one below the other."""
 
 
 class Study(NamedTuple):
     """A noise study to run and to write."""
 
+    #: Of its folder, by default.
     names: tuple[str, str]
-    """Of its folder, by default."""
+    #: The head of its summary.
     about: dict[str, Any]
-    """The head of its summary."""
     run: Callable[[Reporter], Results]
 
 
@@ -165,12 +165,10 @@ def one_run_study(
         with reporter.progress("filtering") as tick:
             runs = study(progress=tick)
         with reporter.progress("drawing"):
-            figure = figures.noise_study_figure(
-                [(run.title, run.trace) for run in runs]
-            )
+            drawn = figures.noise_study_figure([(run.title, run.trace) for run in runs])
         title = heading("", name, ", noise study of ", estimator)
         rows, titles = [run.row for run in runs], [run.title for run in runs]
-        return Results(rows, titles, figure, 130, (title, runs_table(runs)))
+        return Results(rows, titles, drawn, 130, (title, runs_table(runs)))
 
     about = {
         "slamgym": __version__,
@@ -191,9 +189,7 @@ def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
     runs, seed, change = given.runs, given.seed, given.change
     texts = [f"{key}={value}" for key, value in given.named_options().items()]
     texts += given.option_texts or []
-    labels = [
-        options.with_options(label, texts) for label in split_labels(given.estimator)
-    ]
+    labels = [options.with_options(one, texts) for one in split_labels(given.estimator)]
     if change != "all" and change not in CHANGED:
         raise program.BadInputError(
             unknown_choice("--change", change, ("all", *CHANGED))
@@ -222,7 +218,7 @@ def write_study(study: Study, out: Path | None, reporter: Reporter) -> None:
         found = study.run(reporter)
         figure = sign(found.figure, " · ".join(study.names))
         figures.save_figure(figure, folder / "noise_study.png", dpi=found.dpi)
-        _write_table(folder / "noise_study.csv", found.rows)
+        _write_csv(folder / "noise_study.csv", found.rows)
         rows = [_plain(row) for row in found.rows]
         if found.titles:
             titles = zip(found.titles, rows, strict=True)
@@ -232,9 +228,7 @@ def write_study(study: Study, out: Path | None, reporter: Reporter) -> None:
     reporter.finish({**summary, "out": str(place)})
 
 
-def _write_table(
-    path: Path, rows: "Sequence[NoiseRow] | Sequence[NoiseEffect]"
-) -> None:
+def _write_csv(path: Path, rows: "Sequence[NoiseRow] | Sequence[NoiseEffect]") -> None:
     """Write rows as CSV below the names of their columns, empty where None."""
     with naming_file(path), path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")

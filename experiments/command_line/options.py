@@ -7,8 +7,10 @@ and choose scenarios, logs and filters by the names that the user gives.
 import inspect
 import json
 import math
+import re
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import partial, wraps
 from pathlib import Path
@@ -29,19 +31,15 @@ if TYPE_CHECKING:
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
-REPEATED = "May be repeated."
 REQUIRED = MISSING
 
 
 def declared(
-    default: object,
-    form: str,
-    text: str,
-    shown: str | bool = True,
-    *,
-    min: int | None = None,
+    default: object, form: str, shown: str | bool = True, *, min: int | None = None
 ) -> Any:
     """Declare an option of a command as a field of :class:`Options` or a subclass.
+
+    The help is the field's text in the section "Attributes" of the class.
 
     Parameters
     ----------
@@ -50,8 +48,6 @@ def declared(
     form : str
         Its names, then the placeholder of its value, as in "--jobs -j N". Without a
         name, the option is named after the field.
-    text : str
-        The help.
     shown : str or bool
         What the help shows as the default; True for the default itself.
     min : int, optional
@@ -59,11 +55,9 @@ def declared(
     """
     words = form.split()
     names = [word for word in words if word.startswith("-")]
-    value = [word for word in words if word not in names]
-    metavar = value[0] if value else "N" if type(default) is int else None
-    option = typer.Option(
-        *names, metavar=metavar, help=text, show_default=shown, min=min
-    )
+    shown_value = next((word for word in words if word not in names), None)
+    metavar = "N" if shown_value is None and type(default) is int else shown_value
+    option = typer.Option(*names, metavar=metavar, show_default=shown, min=min)
     return field(default=default, metadata={"option": option})
 
 
@@ -90,142 +84,103 @@ class Options:
     """The options that commands share, as the user gave them; the others' defaults.
 
     A command takes some of them, see :func:`takes`. Its own ones are in a subclass.
+
+    Attributes
+    ----------
+    estimator
+        A filter (see: slamgym estimators), or your own "module:Class", with or without
+        options, as in "invariant[iterations=3]".
+    labels
+        Filters separated by commas, such as "ekf,invariant[iterations=3]", or your own
+        "module:Class". run.html and comparison.png show all of them; the other files
+        and numbers are those of the first.
+    option_texts
+        An option of all filters, such as gate_probability=0.999; options in brackets
+        take precedence. May be repeated.
+    motion_std
+        σx,σy,σα of the motion noise in the robot's frame [m, m, rad], per unit of the
+        log's time: a step or a second.
+    measurement_std
+        σβ,σr of bearing and range [rad, m].
+    initial_pose_std
+        σx,σy,σθ of the first pose [m, m, rad].
+    landmark_init
+        How a landmark enters the map: full correlates it with the pose; independent, as
+        in the homework, does not.
+    gate_probability
+        Reject readings outside this probability region of their innovation.
+    range_std_per_metre
+        Part of σr that grows with the range: σr + K r.
+    noise_at_rest
+        Whether there is motion noise while the odometry reports no motion.
+    hide_identities
+        Let the filter associate the readings of a log that identifies them.
+    robot
+        Which robot of a UTIAS folder.
+    truth
+        A graph file with the true poses of an iSAM or g2o text, by their ids.
+    noise_from_file
+        Take the noise from the information matrices of an iSAM or g2o text.
+    seed
+        Seed of all random numbers.
+    steps
+        Steps to drive.
+    controller
+        open_loop applies the scenario's controls, waypoints steers along their nominal
+        path, random drives at random.
+    set_
+        A change of the scenario, such as sensor.max_range=4. May be repeated.
+    resolution
+        In scores of association, true landmarks nearer to each other than R count as
+        one [m].
+    jobs
+        Worker processes, -1 for one on each core.
+    backend
+        Where the workers run: loky, on this machine; dask or ray, on a cluster.
+    scheduler
+        The Dask or Ray cluster.
+    out
+        The folder to write: new, empty, or with earlier output of slamgym, which is
+        replaced unless you changed it.
+    every_step
+        Draw the map after every step, into map_steps/.
+    rerun
+        Also write the content of run.html as a recording for the viewer rerun (.rrd;
+        needs slamgym[viewer]).
+    as_json
+        Print one JSON object and nothing else.
     """
 
-    estimator: str = declared(
-        "invariant",
-        "--estimator -e NAME",
-        'A filter (see: slamgym estimators), or your own "module:Class", with or '
-        'without options, as in "invariant[iterations=3]".',
-    )
-    labels: str = declared(
-        "invariant",
-        "--estimator -e NAMES",
-        'Filters separated by commas, such as "ekf,invariant[iterations=3]", or your '
-        'own "module:Class". run.html and comparison.png show all of them; the other '
-        "files and numbers are those of the first.",
-    )
-    option_texts: list[str] | None = declared(
-        None,
-        "--option KEY=VALUE",
-        "An option of all filters, such as gate_probability=0.999; options in brackets "
-        f"take precedence. {REPEATED}",
-    )
-    motion_std: str | None = declared(
-        None,
-        "A,B,C",
-        "σx,σy,σα of the motion noise in the robot's frame [m, m, rad], per unit of "
-        "the log's time: a step or a second.",
-        "from the log",
-    )
-    measurement_std: str | None = declared(
-        None, "A,B", "σβ,σr of bearing and range [rad, m].", "from the log"
-    )
-    initial_pose_std: str | None = declared(
-        None,
-        "A,B,C",
-        "σx,σy,σθ of the first pose [m, m, rad].",
-        "from the log, else 0,0,0",
-    )
-    landmark_init: str | None = declared(
-        None,
-        "full|independent",
-        "How a landmark enters the map: full correlates it with the pose; "
-        "independent, as in the homework, does not.",
-        "full",
-    )
-    gate_probability: float | None = declared(
-        None,
-        "P",
-        "Reject readings outside this probability region of their innovation.",
-        "none rejected",
-    )
-    range_std_per_metre: float | None = declared(
-        None,
-        "K",
-        "Part of σr that grows with the range: σr + K r.",
-        "from the log, else 0",
-    )
+    estimator: str = declared("invariant", "--estimator -e NAME")
+    labels: str = declared("invariant", "--estimator -e NAMES")
+    option_texts: list[str] | None = declared(None, "--option KEY=VALUE")
+    motion_std: str | None = declared(None, "A,B,C", "from the log")
+    measurement_std: str | None = declared(None, "A,B", "from the log")
+    initial_pose_std: str | None = declared(None, "A,B,C", "from the log, else 0,0,0")
+    landmark_init: str | None = declared(None, "full|independent", "full")
+    gate_probability: float | None = declared(None, "P", "none rejected")
+    range_std_per_metre: float | None = declared(None, "K", "from the log, else 0")
     noise_at_rest: bool | None = declared(
-        None,
-        "--noise-at-rest/--no-noise-at-rest",
-        "Whether there is motion noise while the odometry reports no motion.",
-        "from the log, else not",
+        None, "--noise-at-rest/--no-noise-at-rest", "from the log, else not"
     )
-    hide_identities: bool = declared(
-        False,
-        "--hide-identities",
-        "Let the filter associate the readings of a log that identifies them.",
-    )
-    robot: int | None = declared(
-        None, "K", "Which robot of a UTIAS folder.", "the lowest number"
-    )
-    truth: Path | None = declared(
-        None,
-        "FILE",
-        "A graph file with the true poses of an iSAM or g2o text, by their ids.",
-        "none",
-    )
-    noise_from_file: bool = declared(
-        False,
-        "--noise-from-file",
-        "Take the noise from the information matrices of an iSAM or g2o text.",
-    )
-    seed: int = declared(0, "", "Seed of all random numbers.", min=0)
-    steps: int | None = declared(None, "N", "Steps to drive.", "those of the scenario")
-    controller: str = declared(
-        "open_loop",
-        "NAME",
-        "open_loop applies the scenario's controls, waypoints steers along their "
-        "nominal path, random drives at random.",
-    )
-    set_: list[str] | None = declared(
-        None,
-        "--set KEY=VALUE",
-        f"A change of the scenario, such as sensor.max_range=4. {REPEATED}",
-    )
-    resolution: float = declared(
-        0.0,
-        "R",
-        "In scores of association, true landmarks nearer to each other than R count as "
-        "one [m].",
-        "each counts",
-    )
-    jobs: int | None = declared(
-        None,
-        "--jobs -j N",
-        "Worker processes, -1 for one on each core.",
-        "this process alone",
-    )
-    backend: str | None = declared(
-        None,
-        "loky|dask|ray",
-        "Where the workers run: loky, on this machine; dask or ray, on a cluster.",
-    )
-    scheduler: str | None = declared(
-        None, "ADDRESS", "The Dask or Ray cluster.", "a cluster of this machine"
-    )
-    out: Path | None = declared(
-        None,
-        "DIR",
-        "The folder to write: new, empty, or with earlier output of slamgym, which is "
-        "replaced unless you changed it.",
-        "results/<name>-<estimator>",
-    )
+    hide_identities: bool = declared(False, "--hide-identities")
+    robot: int | None = declared(None, "K", "the lowest number")
+    truth: Path | None = declared(None, "FILE", "none")
+    noise_from_file: bool = declared(False, "--noise-from-file")
+    seed: int = declared(0, "", min=0)
+    steps: int | None = declared(None, "N", "those of the scenario")
+    controller: str = declared("open_loop", "NAME")
+    set_: list[str] | None = declared(None, "--set KEY=VALUE")
+    resolution: float = declared(0.0, "R", "each counts")
+    jobs: int | None = declared(None, "--jobs -j N", "this process alone")
+    backend: str | None = declared(None, "loky|dask|ray")
+    scheduler: str | None = declared(None, "ADDRESS", "a cluster of this machine")
+    out: Path | None = declared(None, "DIR", "results/<name>-<estimator>")
     every_step: bool | None = declared(
-        None,
-        "--every-step/--no-every-step",
-        "Draw the map after every step, into map_steps/.",
-        "if there are 60 steps or fewer",
+        None, "--every-step/--no-every-step", "if there are 60 steps or fewer"
     )
-    rerun: Path | None = declared(
-        None,
-        "FILE",
-        "Also write the content of run.html as a recording for the viewer rerun (.rrd; "
-        "needs slamgym[viewer]).",
-        "none",
-    )
-    as_json: bool = declared(False, "--json", "Print one JSON object and nothing else.")
+    rerun: Path | None = declared(None, "FILE", "none")
+    as_json: bool = declared(False, "--json")
 
     def reporter(self) -> Reporter:
         """Return what prints the progress and the results."""
@@ -293,13 +248,11 @@ class Options:
                 noise_from_file=self.noise_from_file,
             )
         except OSError as error:
-            reason, file = error.strerror or error, error.filename or path
+            why, file = error.strerror or error, error.filename or path
             hint = ""
             if str(path) in list_presets():
                 hint = f"; {path} is a scenario: slamgym run {path}"
-            raise BadInputError(
-                f"cannot read the log {file}: {reason}{hint}"
-            ) from error
+            raise BadInputError(f"cannot read the log {file}: {why}{hint}") from error
         except MemoryError as error:
             raise BadInputError(f"the log {path} does not fit into memory") from error
         if "left_out" in log.header:
@@ -396,7 +349,7 @@ def takes(names: str, **defaults: Any) -> Callable[[_Function], Callable[..., An
     def expand(function: _Function) -> Callable[..., Any]:
         parameters = dict(inspect.signature(function).parameters)
         kind = parameters.pop("given").annotation
-        declared = {each.name: each for each in fields(kind)}
+        declared, texts = {each.name: each for each in fields(kind)}, _help_texts(kind)
         taken = names.split()
 
         @wraps(function)
@@ -406,7 +359,7 @@ def takes(names: str, **defaults: Any) -> Callable[[_Function], Callable[..., An
 
         every = [
             *parameters.values(),
-            *(_parameter(declared[name], defaults) for name in taken),
+            *(_parameter(declared[name], texts.get(name), defaults) for name in taken),
         ]
         run.__signature__ = inspect.Signature(every)  # type: ignore[attr-defined]
         run.__annotations__ = {each.name: each.annotation for each in every}
@@ -415,14 +368,28 @@ def takes(names: str, **defaults: Any) -> Callable[[_Function], Callable[..., An
     return expand
 
 
-def _parameter(option: Field[Any], defaults: Mapping[str, Any]) -> inspect.Parameter:
+def _help_texts(kind: type) -> dict[str, str]:
+    """Return the texts of the attributes in the docstrings of a class and its bases."""
+    texts = {}
+    for each in reversed(kind.__mro__):
+        listed = inspect.cleandoc(each.__doc__ or "").partition("\nAttributes\n")[2]
+        for name, text in re.findall(r"^(\w+)\n((?: +.*\n?)+)", listed, re.MULTILINE):
+            texts[name] = " ".join(text.split())
+    return texts
+
+
+def _parameter(
+    option: Field[Any], text: str | None, defaults: Mapping[str, Any]
+) -> inspect.Parameter:
     """Return the parameter that typer reads an option from."""
     default = defaults.get(option.name, option.default)
+    read = copy(option.metadata["option"])
+    read.help = text
     return inspect.Parameter(
         option.name,
         inspect.Parameter.KEYWORD_ONLY,
         default=inspect.Parameter.empty if default is REQUIRED else default,
-        annotation=Annotated[option.type, option.metadata["option"]],
+        annotation=Annotated[option.type, read],
     )
 
 

@@ -25,10 +25,10 @@ from ..jobs import (
 from ..logs.slamlog import LogError
 from .program import BadInputError
 
+#: Every output folder holds it; its ``files`` lists the files of the command.
 SUMMARY = "summary.json"
-"""Every output folder holds it; its ``files`` lists the files of the command."""
+#: The folder of unfinished output, inside the output folder.
 STAGING = ".slamgym_partial"
-"""The folder of unfinished output, inside the output folder."""
 
 
 @contextlib.contextmanager

@@ -89,8 +89,8 @@ _OF_SCENARIOS = {
     "--noise-at-rest": "motion.noise_at_rest=true",
 }
 
+#: How long a command may clean up after a signal before it is ended [s].
 _PATIENCE = 1.0
-"""How long a command may clean up after a signal before it is ended [s]."""
 _SHOW_CURSOR = b"\r\x1b[K\x1b[?25h"  # and clear the line of the progress bar
 
 
@@ -126,8 +126,8 @@ def _one_line(text: str) -> str:
     return "; ".join(line.strip() for line in text.splitlines() if line.strip())
 
 
+#: Messages of the blocks that can be interrupted, the innermost last.
 _remaining: list[str] = []
-"""Messages of the blocks that can be interrupted, the innermost last."""
 
 
 def _replace_unknown_characters() -> None:

@@ -22,18 +22,21 @@ _SLOWEST, _FASTEST = 4.0, 30.0  # [frames/s]
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOptions(Options):
-    """The options of ``slamgym render``."""
+    """The options of ``slamgym render``.
 
-    out: Path = declared(REQUIRED, "FILE", "The .gif or .mp4 file to write.")
-    estimator: str = declared(
-        "invariant",
-        "--estimator -e NAME",
-        'The filter whose belief is drawn, or "none".',
-        "invariant",
-    )
-    fps: float | None = declared(
-        None, "N", "Frames (steps) per second.", "so that it lasts 12 s"
-    )
+    Attributes
+    ----------
+    out
+        The .gif or .mp4 file to write.
+    estimator
+        The filter whose belief is drawn, or "none".
+    fps
+        Frames (steps) per second.
+    """
+
+    out: Path = declared(REQUIRED, "FILE")
+    estimator: str = declared("invariant", "--estimator -e NAME", "invariant")
+    fps: float | None = declared(None, "N", "so that it lasts 12 s")
 
 
 @command

@@ -13,28 +13,32 @@ from . import options, program
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayOptions(options.Options):
-    """The options of ``slamgym replay``."""
+    """The options of ``slamgym replay``.
 
-    hide_identities: bool = options.declared(
-        False,
-        "--hide-identities",
-        "Let the filter associate the readings of a log that identifies them, and "
-        "score it.",
-    )
+    Attributes
+    ----------
+    hide_identities
+        Let the filter associate the readings of a log that identifies them, and score
+        it.
+    """
+
+    hide_identities: bool = options.declared(False, "--hide-identities")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothOptions(options.Options):
-    """The options of ``slamgym smooth``."""
+    """The options of ``slamgym smooth``.
 
-    robust: str | None = options.declared(
-        None, "huber|cauchy", "Give outliers less weight.", "all weigh the same"
-    )
-    associate: bool = options.declared(
-        False,
-        "--associate",
-        "Repair the association of readings without identity by the whole drive.",
-    )
+    Attributes
+    ----------
+    robust
+        Give outliers less weight.
+    associate
+        Repair the association of readings without identity by the whole drive.
+    """
+
+    robust: str | None = options.declared(None, "huber|cauchy", "all weigh the same")
+    associate: bool = options.declared(False, "--associate")
 
 
 @program.command

@@ -176,9 +176,7 @@ def show_run(summary: dict[str, Any], place: Path, reporter: Reporter) -> None:
     )
     if summary["others"]:
         runs = (summary, *summary["others"])
-        reporter.show(
-            tables.comparison_table({run["estimator"]: run for run in runs}), ""
-        )
+        reporter.show(tables.comparison_table({r["estimator"]: r for r in runs}), "")
     if summary["association"] is not None:
         reporter.show(tables.association_table(summary["association"]), "")
     if summary["warnings"]:

@@ -52,15 +52,11 @@ def landmark_table(summary: dict[str, Any]) -> Table:
 
 
 def _table(
-    headings: Sequence[str], texts: Sequence[str] = ("",), **options: Any
+    headings: Sequence[str], texts: Sequence[str] = ("",), **others: Any
 ) -> Table:
     """Return a table without rows; all columns but `texts` are of numbers."""
     table = Table(
-        title_justify="left",
-        caption_justify="left",
-        box=None,
-        pad_edge=False,
-        **options,
+        title_justify="left", caption_justify="left", box=None, pad_edge=False, **others
     )
     for heading in headings:
         side: Literal["left", "right"] = "left" if heading in texts else "right"
@@ -95,12 +91,10 @@ def named_rows(rows: Sequence[tuple[str, str]], title: str | None = None) -> Tab
 def key_figures(summary: dict[str, Any]) -> Table:
     """Lay out the few numbers that describe the quality of a run."""
     counts, size = summary["readings"], f"{len(summary['landmarks'])} landmarks"
-    readings = (
-        f"{counts['associated']} of known landmarks, {counts['added']} of new ones"
-    )
+    used = f"{counts['associated']} of known landmarks, {counts['added']} of new ones"
     rows = [
         ("steps", f"{summary['steps']}, with {summary['scans']} scans"),
-        ("readings", _and_counts(readings, counts, _FATES)),
+        ("readings", _and_counts(used, counts, _FATES)),
         ("map", _and_counts(size, summary["map_changes"], _CHANGES)),
         ("final pose", _pose(summary["pose"], summary["pose_covariance"])),
     ]

@@ -429,8 +429,8 @@ def box_around(points: Array, means: Array, covariances: Array) -> Array:
     return np.stack([centre - size / 2, centre + size / 2])
 
 
+#: Rows (x0, y0, x1, y1) [m].
 Walls = Sequence[Sequence[float]]
-"""Rows (x0, y0, x1, y1) [m]."""
 
 
 def wall_ends(walls: Walls) -> Array:

@@ -169,23 +169,23 @@ def log_header(scenario: Scenario, seed: int) -> dict[str, str]:
 class Step(NamedTuple):
     """The motion between two times of a log, and the scan at the second one."""
 
+    #: Time of the end [s, or steps].
     t: float
-    """Time of the end [s, or steps]."""
+    #: The motion; empty before the first scan, or between scans at rest.
     motions: tuple[OdometryRow, ...]
-    """The motion; empty before the first scan, or between scans at rest."""
+    #: The scan at the end.
     scan: Scan | None
-    """The scan at the end."""
+    #: The readings of the pose after it.
     fixes: tuple[PoseRow, ...] = ()
-    """The readings of the pose after it."""
 
 
 class Prediction(NamedTuple):
     """One call of an estimator's ``predict``."""
 
+    #: (d, α) [m, rad].
     odometry: tuple[float, float]
-    """(d, α) [m, rad]."""
+    #: Duration for the motion noise.
     dt: float
-    """Duration for the motion noise."""
 
 
 def steps_of(log: SlamLog) -> Iterator[Step]:

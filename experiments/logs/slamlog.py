@@ -48,8 +48,8 @@ __all__ = [
     "write_slamlog",
 ]
 
+#: Meanings of the odometry of a unicycle.
 UNICYCLES = ("turn-last", "midpoint")
-"""Meanings of the odometry of a unicycle."""
 FORMAT_LINE = "# format: slamlog 1"
 ROW_FORMS = {
     "landmark": "landmark,id,x,y",
@@ -335,8 +335,8 @@ def _known(value: float) -> str:
 # --------------------------------------------------------------------------------------
 # The events of a log: odometry rows, and scans of simultaneous readings.
 
+#: The true id of a reading that is of no landmark.
 NO_LANDMARK = -1
-"""The true id of a reading that is of no landmark."""
 
 
 @dataclass(frozen=True)
@@ -437,8 +437,8 @@ class Scan:
             object.__setattr__(self, name, column)
 
 
+#: What a log holds, in the order in which a filter takes it.
 Event = OdometryRow | Scan | PoseRow
-"""What a log holds, in the order in which a filter takes it."""
 
 
 def float_array(name: str, value: ArrayLike, *, columns: int) -> Array:

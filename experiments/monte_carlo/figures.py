@@ -68,8 +68,8 @@ _WIDTH = 4.8  # of the figures in a report [inch]
 _LOG_FROM = 4.0
 _BINS = 70
 _FEW_DOTS = 100
+#: Of one estimator in `runs_figure`, which shows quantiles of more runs.
 MOST_DOTS = 300
-"""Of one estimator in `runs_figure`, which shows quantiles of more runs."""
 
 
 def report_figures(

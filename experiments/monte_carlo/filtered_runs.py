@@ -38,22 +38,22 @@ _MAP_NOT_FINITE = "the belief about the map is not finite"
 class Failure(NamedTuple):
     """Where and why a run failed."""
 
+    #: Step of the run.
     step: int
-    """Step of the run."""
     message: str
 
 
 class FilteredRuns(NamedTuple):
     """The beliefs of a filter in B runs."""
 
+    #: The belief after every step; nan from the step on at which a run failed.
     trace: BatchTrace
-    """The belief after every step; nan from the step on at which a run failed."""
+    #: Final beliefs; None for a run that failed.
     beliefs: list[Belief | None]
-    """Final beliefs; None for a run that failed."""
+    #: By the index of the run.
     failures: Mapping[int, Failure]
-    """By the index of the run."""
+    #: About readings without identity, by the index of the run.
     decisions: Mapping[int, RunDecisions] = {}
-    """About readings without identity, by the index of the run."""
 
 
 def filter_runs(
@@ -94,14 +94,11 @@ def filter_runs(
 
 
 def _in_a_batch(
-    estimator: EkfSlam,
-    settings: FilterSettings,
-    runs: SimulatedRuns,
-    threads: int | None,
+    slam: EkfSlam, settings: FilterSettings, runs: SimulatedRuns, threads: int | None
 ) -> FilteredRuns:
     count, _, landmarks = runs.visible.shape
     batch = BatchSlam(
-        estimator,
+        slam,
         count,
         landmarks,
         initial_poses=runs.initial_poses,

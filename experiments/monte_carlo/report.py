@@ -22,19 +22,7 @@ from rich.text import Text
 from ...evaluation.consistency_report import FEW_AVERAGES
 from ...evaluation.diagnosis import p_text
 from ...sim_configs.atomic_file import replace_when_written
-from ..figures.style import (
-    ALARM,
-    BLUE,
-    GREY,
-    INK,
-    ORANGE,
-    PALE,
-    TEAL,
-    draw_file,
-    headings_and_key,
-    lay_out,
-    page_environment,
-)
+from ..figures import style
 from ..jobs import replace_own
 from .figures import MOST_DOTS, PURPLE, SKY, grid_steps, report_figures
 from .runner import ASSUMED_FILE, python_call
@@ -73,7 +61,7 @@ def write_html_report(
 
 def html_report(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
     """Return the report's HTML; see :func:`write_html_report`."""
-    environment = page_environment(Path(__file__).parent, finalize=escaped)
+    environment = style.page_environment(Path(__file__).parent, finalize=escaped)
     entries = summary["estimators"]
     page = {
         "headline": headline(summary),
@@ -116,7 +104,7 @@ def write_figures(
         for name, figure in figures.items():
             names.append(f"{name}_{width}mm.{suffix}")
             with replace_own(folder / names[-1]) as partial:
-                draw_file(figure, partial, suffix)
+                style.draw_file(figure, partial, suffix)
     return names
 
 
@@ -212,7 +200,7 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
         Result of ``summarise_monte_carlo``.
     """
     entries = summary["estimators"]
-    headings, key = headings_and_key(list(entries))
+    headings, key = style.headings_and_key(list(entries))
     note = "Averages over runs and steps; heading and RMSE are root mean squares."
     table = Table(
         title=Text(
@@ -229,9 +217,7 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
     for heading in headings:
         table.add_column(Text(heading), justify="right", overflow="fold", min_width=7)
     verdicts = [entry["verdict"] for entry in entries.values()]
-    table.add_row(
-        "verdict", "", *(Text(word, _STYLES[KINDS[word]]) for word in verdicts)
-    )
+    table.add_row("verdict", "", *(Text(w, _STYLES[KINDS[w]]) for w in verdicts))
     for measure in measures(summary):
         cells = [Text(measure.of(entry)) for entry in entries.values()]
         table.add_row(Text(measure.name), Text(measure.right), *cells)
@@ -250,23 +236,23 @@ def _bad_run(summary: dict[str, Any]) -> str:
     )
 
 
+#: CSS variables that the page must define, by the colours of the figures.
 COLOUR_VARIABLES = {
-    INK: "--ink",
+    style.INK: "--ink",
     "#000000": "--ink",
-    GREY: "--grey",
-    PALE: "--pale",
+    style.GREY: "--grey",
+    style.PALE: "--pale",
     "#ffffff": "--paper",
-    BLUE: "--blue",
-    ORANGE: "--orange",
-    TEAL: "--teal",
+    style.BLUE: "--blue",
+    style.ORANGE: "--orange",
+    style.TEAL: "--teal",
     PURPLE: "--purple",
     SKY: "--sky",
-    ALARM: "--alarm",
+    style.ALARM: "--alarm",
 }
-"""CSS variables that the page must define, by the colours of the figures."""
 
 
-def inline_svg(figure: Figure, name: str, description: str) -> str:
+def inline_svg(figure: Figure, name: str, text: str) -> str:
     """Return a figure as an ``<svg>`` element without size, font or colour of its own.
 
     It fills the available width and keeps text as text; the same figure gives the same
@@ -278,11 +264,11 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
         A figure in the colours of `COLOUR_VARIABLES`.
     name : str
         Prefix of all ids, unique on the page.
-    description : str
+    text : str
         Text for screen readers.
     """
     buffer = io.StringIO()
-    lay_out(figure, 72)
+    style.lay_out(figure, 72)
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     svg = buffer.getvalue()
@@ -292,9 +278,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     svg = re.sub(r"<!--.*?-->", "", svg, flags=re.DOTALL)
     svg = _use_page_style(_short_numbers(_own_ids(svg, name)))
     box = re.search(r'viewBox="[^"]*"', svg)
-    attributes = (
-        f'{box[0] if box else ""} role="img" aria-label="{escape(description)}"'
-    )
+    attributes = f'{box[0] if box else ""} role="img" aria-label="{escape(text)}"'
     return re.sub(r"<svg\b[^>]*>", lambda _: f"<svg {attributes}>", svg, count=1)
 
 

@@ -29,25 +29,9 @@ from ...evaluation.noise_findings import CHANNELS, MOMENTS
 from ...sim_configs import Scenario
 from ...sim_configs.atomic_file import replace_when_written
 from ...sim_configs.scenario_files import scenario_text
-from ..jobs import (
-    claimed,
-    difference,
-    naming,
-    own_entry,
-    own_files,
-    remove_leftovers,
-    replace_own,
-    set_aside,
-)
+from .. import jobs
 from ..runs.filter_settings import EstimatorChoice
-from .run_measures import (
-    NOISE_SIZES,
-    SMALL_NOISE,
-    VARIABLES,
-    Block,
-    Variable,
-    variables_of,
-)
+from . import run_measures
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -62,7 +46,7 @@ if TYPE_CHECKING:
 # may be put into one folder.
 
 
-Blocks = Iterable[tuple[range, list[Block]]]
+Blocks = Iterable[tuple[range, list[run_measures.Block]]]
 
 _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pymunk", "xarray")
 _FROM_TRUTH = "for a consistent filter, NEES and NIS are χ² with the stated degrees"
@@ -116,7 +100,7 @@ def write_results(
         As in :func:`dataset_of`.
     """
     kept, full = "; its blocks stay, to continue from", RuntimeError  # of netCDF
-    with naming(path, kept, full), replace_own(path) as partial:
+    with jobs.naming(path, kept, full), jobs.replace_own(path) as partial:
         _write(partial, job, blocks, runs, command)
 
 
@@ -132,12 +116,14 @@ def add_to_results(path: Path, added: Mapping[str, Array]) -> None:
     """
     import netCDF4  # noqa: PLC0415
 
-    with naming(path, also=RuntimeError), replace_own(path) as partial:
+    with jobs.naming(path, also=RuntimeError), jobs.replace_own(path) as partial:
         shutil.copyfile(path, partial)
         with netCDF4.Dataset(partial, "a") as file:
             for name, values in added.items():
-                made = file.createVariable(name, "f8", _dims(SMALL_NOISE[name]))
-                made.long_name = SMALL_NOISE[name].meaning
+                made = file.createVariable(
+                    name, "f8", _dims(run_measures.SMALL_NOISE[name])
+                )
+                made.long_name = run_measures.SMALL_NOISE[name].meaning
                 made[:] = values
 
 
@@ -167,7 +153,7 @@ def load_results(path: str | Path) -> xr.Dataset:
             f"{file} is truncated, or holds no results: {error}; if there is blocks/ "
             "beside it, the same command makes the file again from them"
         ) from error
-    lacking = sorted(set(VARIABLES) - set(results.variables))
+    lacking = sorted(set(run_measures.VARIABLES) - set(results.variables))
     if lacking:
         results.close()
         raise ValueError(f"{file} is no result of a Monte Carlo: no {lacking[0]}")
@@ -211,12 +197,8 @@ def attributes(job: Job, runs: range, command: str) -> dict[str, Any]:
 def provenance(command: str) -> dict[str, str]:
     """Return the attributes that name the command and the versions of packages."""
     own = {"slamgym": __version__, "python": platform.python_version()}
-    versions = own | {package: version(package) for package in _PACKAGES}
-    return {
-        "versions": json.dumps(versions),
-        "command": command,
-        "comment": _FROM_TRUTH,
-    }
+    found = own | {package: version(package) for package in _PACKAGES}
+    return {"versions": json.dumps(found), "command": command, "comment": _FROM_TRUTH}
 
 
 def _fill(
@@ -240,7 +222,7 @@ def _stored(kind: str) -> Any:
     return {"?": "i1", "i": "i8", "U": str}.get(kind, kind)
 
 
-def _dims(variable: Variable) -> tuple[str, ...]:
+def _dims(variable: run_measures.Variable) -> tuple[str, ...]:
     return ("estimator", *variable.dims)
 
 
@@ -250,7 +232,7 @@ def _sizes(job: Job, runs: range) -> dict[str, int]:
         "run": len(runs),
         "step": job.scenario.steps + 1,
         "landmark": job.scenario.landmarks.count,
-        **NOISE_SIZES,
+        **run_measures.NOISE_SIZES,
     }
 
 
@@ -275,8 +257,8 @@ class BlockFolder(NamedTuple):
     """The blocks of a job in its folder, which `opened` makes, checks and locks."""
 
     path: Path
+    #: Of the job.
     digest: str
-    """Of the job."""
 
     def missing(self, blocks: Iterable[range]) -> list[range]:
         """Return the blocks that are still to be computed; warn of a damaged one."""
@@ -286,12 +268,12 @@ class BlockFolder(NamedTuple):
         for file in self._files_from(runs.start):
             problem = problem_with(file, self.digest)
             if problem:
-                set_aside(file, f"{problem}, and its runs are repeated")
+                jobs.set_aside(file, f"{problem}, and its runs are repeated")
             elif int(file.stem.rpartition("-")[2]) >= runs.stop:
                 return True
         return False
 
-    def add(self, runs: range, parts: list[Block]) -> None:
+    def add(self, runs: range, parts: list[run_measures.Block]) -> None:
         """Keep a block, one part per estimator."""
         arrays = {
             f"{number}/{name}": array
@@ -301,7 +283,7 @@ class BlockFolder(NamedTuple):
         file = self.path / BLOCKS / f"runs-{runs.start:07d}-{runs.stop:07d}.npz"
         whole = len(blocks_in(self.path))
         kept = f"; {whole} complete blocks stay there, to continue from"
-        with naming(file, kept), replace_when_written(file) as partial:
+        with jobs.naming(file, kept), replace_when_written(file) as partial:
             np.savez(partial, allow_pickle=False, job=self.digest, **arrays)
         for shorter in self._files_from(runs.start):
             if shorter != file:
@@ -361,12 +343,12 @@ def opened(
     OSError
         If it cannot be written.
     """
-    with claimed(path) as anything:
+    with jobs.claimed(path) as anything:
         found = identity_in(path) if anything else None
         if found and not fresh:
             refuse_other(path, found, identity)
-        with naming(f"the folder {path}"):
-            remove_leftovers(path, path / BLOCKS)
+        with jobs.naming(f"the folder {path}"):
+            jobs.remove_leftovers(path, path / BLOCKS)
             if found and fresh:
                 _clear(path, found)
             with replace_when_written(path / JOB) as partial:
@@ -378,20 +360,20 @@ def opened(
 
 def _clear(path: Path, identity: dict[str, Any]) -> None:
     """Remove the results of a job, and set aside what is not proven to be one."""
-    digest, own = digest_of(identity), own_files(path)
+    digest, own = digest_of(identity), jobs.own_files(path)
     for block in blocks_in(path):
         problem = problem_with(block, digest)
         if problem:
-            set_aside(block, problem)
+            jobs.set_aside(block, problem)
         else:
             block.unlink()
     for name in (RESULTS, REPORT, SUMMARY):
         if not os.path.lexists(path / name):
             continue
-        if own_entry(path, name, own):
+        if jobs.own_entry(path, name, own):
             (path / name).unlink()
         else:
-            set_aside(path / name, "is not as slamgym wrote it")
+            jobs.set_aside(path / name, "is not as slamgym wrote it")
 
 
 def blocks_in(path: Path) -> list[Path]:
@@ -454,7 +436,7 @@ def refuse_other(path: Path, found: dict[str, Any], asked: dict[str, Any]) -> No
     ValueError
         With the first difference.
     """
-    key = difference(found, asked)
+    key = jobs.difference(found, asked)
     if key is not None:
         raise ValueError(
             f"{path} holds results of {_described(key, found.get(key))}, "
@@ -480,18 +462,18 @@ class Job(NamedTuple):
     """What is computed, except for the number of runs."""
 
     scenario: Scenario
+    #: The scenario whose noise the estimators assume.
     assumed: Scenario
-    """The scenario whose noise the estimators assume."""
     estimators: tuple[EstimatorChoice, ...]
     seed: int
     block_size: int
+    #: True landmarks nearer to each other count as one place [m].
     resolution: float = 0.0
-    """True landmarks nearer to each other count as one place [m]."""
 
     @property
-    def variables(self) -> dict[str, Variable]:
+    def variables(self) -> dict[str, run_measures.Variable]:
         """The variables of its results."""
-        return variables_of(self.scenario)
+        return run_measures.variables_of(self.scenario)
 
     def identity(self) -> dict[str, Any]:
         """Describe the job in plain values, equal for equal jobs."""

@@ -39,10 +39,10 @@ NOISE_SIZES = {"noise": len(CHANNELS), "moment": len(MOMENTS)}
 class Variable(NamedTuple):
     """One variable of the results."""
 
+    #: Dimensions other than ``estimator``.
     dims: tuple[str, ...]
-    """Dimensions other than ``estimator``."""
+    #: numpy kind: f8, i8, ?, or U for text.
     kind: str
-    """numpy kind: f8, i8, ?, or U for text."""
     meaning: str
 
 
@@ -95,8 +95,8 @@ MAPS = ("raw", "aligned")
 
 PREFIX = "association_"
 
+#: Followed by the error frame.
 KNOWN_IDS_NEES = "known_ids_nees"
-"""Followed by the error frame."""
 
 _ASSOCIATION: dict[str, str] = {
     **{f"{PREFIX}{name}": f"{name.replace('_', ' ')}, see docs" for name in COUNTS},
@@ -110,6 +110,7 @@ _ASSOCIATION: dict[str, str] = {
     KNOWN_IDS_ATE: "path error of the same filter with known identities, raw [m]",
 }
 
+#: Those of a world that hides identities; nan where unknown.
 HIDDEN_VARIABLES: dict[str, Variable] = {
     **VARIABLES,
     **{name: Variable(RUN, "f8", meaning) for name, meaning in _ASSOCIATION.items()},
@@ -118,9 +119,10 @@ HIDDEN_VARIABLES: dict[str, Variable] = {
         for frame in ERROR_FRAMES
     },
 }
-"""Those of a world that hides identities; nan where unknown."""
 
 
+#: Of runs that were repeated with less noise to find the cause of an inconsistency; in
+#: the results, but in no block, if there are any.
 SMALL_NOISE: dict[str, Variable] = {
     **{
         f"small_noise_nees_{frame}": Variable(
@@ -131,8 +133,6 @@ SMALL_NOISE: dict[str, Variable] = {
     "small_noise_heading_nees": Variable(RUN, "f8", "mean NEES of the heading"),
     "small_noise_factor": Variable(RUN, "f8", "of all noise, nan if not repeated"),
 }
-"""Of runs that were repeated with less noise to find the cause of an inconsistency; in
-the results, but in no block, if there are any."""
 
 
 def variables_of(scenario: Scenario) -> dict[str, Variable]:
@@ -262,41 +262,29 @@ def _measure_path(truth: Array, filtered: FilteredRuns, run: int) -> dict[str, V
     return measured
 
 
-def _measure_map(
-    true_pose: Array, true_landmarks: Array, belief: Belief
-) -> dict[str, Value]:
+def _measure_map(true_pose: Array, truth: Array, belief: Belief) -> dict[str, Value]:
     ids = list(belief.landmark_ids)
-    if len(set(ids)) < len(ids) or not set(ids) <= set(range(len(true_landmarks))):
+    if len(set(ids)) < len(ids) or not set(ids) <= set(range(len(truth))):
         raise ValueError(
-            f"landmark_ids must be different ones of 0 … {len(true_landmarks) - 1}, "
+            f"landmark_ids must be different ones of 0 … {len(truth) - 1}, "
             f"got {tuple(ids)}"
         )
-    states = (
-        np.concatenate([true_pose, true_landmarks[ids].ravel()]),
-        belief.mean,
-        belief.covariance,
-    )
-    measured: dict[str, Value] = {
-        "state_dof": 3 + 2 * len(ids),
-        "relative_map_dof": 2 * len(ids),
-    }
+    true_state, size = np.append(true_pose, truth[ids].ravel()), 2 * len(ids)
+    states = true_state, belief.mean, belief.covariance
+    measured: dict[str, Value] = {"state_dof": 3 + size, "relative_map_dof": size}
     for frame in ERROR_FRAMES:
-        value = nees.state_nees(*states, frame=frame)
-        measured[f"state_nees_{frame}"] = float(value)
+        measured[f"state_nees_{frame}"] = float(nees.state_nees(*states, frame=frame))
     if not ids:
         return measured
     for frame in ERROR_FRAMES:
         values = nees.landmark_nees(*states, frame=frame)
-        measured[f"landmark_nees_{frame}"] = by_id(values, ids, len(true_landmarks))
+        measured[f"landmark_nees_{frame}"] = by_id(values, ids, len(truth))
+    estimated = ids, belief.landmarks, belief.landmark_covariances
     return measured | {
         "relative_map_nees": float(nees.relative_map_nees(*states)),
-        **measure_landmarks(true_pose, true_landmarks, belief.pose, *_map_of(belief)),
+        **measure_landmarks(true_pose, truth, belief.pose, *estimated),
         "landmark_mahalanobis": np.sqrt(measured["landmark_nees_additive"]),
     }
-
-
-def _map_of(belief: Belief) -> tuple[list[int], Array, Array]:
-    return list(belief.landmark_ids), belief.landmarks, belief.landmark_covariances
 
 
 def measure_landmarks(
@@ -323,10 +311,7 @@ def measure_landmarks(
         Of these [m²].
     """
     truth = true_landmarks[ids]
-    states = (
-        np.append(true_pose, truth.ravel()),
-        np.append(pose, landmarks.ravel()),
-    )
+    states = (np.append(true_pose, truth.ravel()), np.append(pose, landmarks.ravel()))
     _, centred = invariant_squares(invariant_error(*states))
     accuracy = position_accuracy(landmarks, truth)
     return {
@@ -345,8 +330,8 @@ def by_id(values: Array, ids: list[int], count: int) -> Array:
     return rows
 
 
+#: Path error above that with known identities [m].
 MARGIN = 1.0
-"""Path error above that with known identities [m]."""
 
 SHARES = ("precision", "recall")
 

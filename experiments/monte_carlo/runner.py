@@ -51,10 +51,10 @@ if TYPE_CHECKING:
 
 
 BLOCK_SIZE = 64
+#: Factors of all noise; the second is used if the first decides nothing.
 LESS_NOISE = 0.1, SMALLEST_NOISE
-"""Factors of all noise; the second is used if the first decides nothing."""
+#: Attribute of results, but of no file: share of the time for runs with less noise.
 SMALL_NOISE_SHARE = "small_noise_share"
-"""Attribute of results, but of no file: share of the time for runs with less noise."""
 EACH_RUN = "estimator", "run"
 _MOST_BYTES, _BYTES_OF_READING = 2**28, 17
 
@@ -281,9 +281,7 @@ class _Work:
         size = runs_at_once(self.job.scenario)
         starts = range(block.start, block.stop, size)
         spans = [range(k, min(k + size, block.stop)) for k in starts]
-        return [
-            joined(parts) for parts in zip(*map(self._measured, spans), strict=True)
-        ]
+        return [joined(each) for each in zip(*map(self._measured, spans), strict=True)]
 
     def _measured(self, span: range) -> list[Block]:
         world, first = self.job.scenario, self.job.seed + span.start

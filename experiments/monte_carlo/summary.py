@@ -30,7 +30,6 @@ from .verdict import (
     POINT_FREEDOM,
     POSE_FREEDOM,
     EstimatorScores,
-    Verdict,
     diagnosis_summary,
     estimators_of,
     failure_groups,
@@ -150,7 +149,14 @@ def summarise_estimator(
     if not scores.is_fitted:
         verdict = judge(report, len(scores.failures), len(scores.good))
     return {
-        **_verdict(scores, verdict, report, claimed, knowable),
+        "verdict": verdict.word,
+        "reason": verdict.reason,
+        "sentence": verdict_sentence(scores.label, verdict),
+        "heading_sentence": heading_sentence(claimed, knowable),
+        "accepted": report and report.accepted,
+        "decisions": report and decisions_table(report),
+        "sentences": list(report.sentences()) if report else [],
+        "warnings": list(report.warnings()) if report else [],
         "good_runs": int(scores.good.sum()),
         "failed_runs": [failure._asdict() for failure in scores.failures],
         "failure_groups": failure_groups(scores.failures),
@@ -159,26 +165,6 @@ def summarise_estimator(
         "diagnosis": diagnosis_summary(scores, frame, verdict),
         "association": association_summary(scores),
         "unused_readings": _unused_readings(scores),
-    }
-
-
-def _verdict(
-    scores: EstimatorScores,
-    verdict: Verdict,
-    report: ConsistencyReport | None,
-    heading_std: float | None,
-    knowable: float,
-) -> dict[str, Any]:
-    """Write the verdict on an estimator, and the decisions behind it."""
-    return {
-        "verdict": verdict.word,
-        "reason": verdict.reason,
-        "sentence": verdict_sentence(scores.label, verdict),
-        "heading_sentence": heading_sentence(heading_std, knowable),
-        "accepted": None if report is None else report.accepted,
-        "decisions": None if report is None else decisions_table(report),
-        "sentences": [] if report is None else list(report.sentences()),
-        "warnings": [] if report is None else list(report.warnings()),
     }
 
 
@@ -230,8 +216,8 @@ def _unused_readings(scores: EstimatorScores) -> float | None:
 Entry = dict[str, Any]
 Computation = Callable[[EstimatorScores], float | None]
 
+#: In place of a number that is unknown.
 NOTHING = "–"
-"""In place of a number that is unknown."""
 _LEAST_BOUND = math.radians(0.1)  # of a heading that is shown
 
 
@@ -291,14 +277,14 @@ def _with_error(found: dict[str, Any]) -> str:
 class Measure(NamedTuple):
     """A number of one estimator: its computation, and its row in tables."""
 
+    #: Its keys in the entry of an estimator, joined by dots.
     path: str
-    """Its keys in the entry of an estimator, joined by dots."""
+    #: None for a part of an entry that is computed as a whole.
     compute: Computation | None = None
-    """None for a part of an entry that is computed as a whole."""
+    #: Title of its row; tables omit a measure without one.
     name: str = ""
-    """Title of its row; tables omit a measure without one."""
+    #: Value of a consistent filter, or lower bound; else empty.
     right: str = ""
-    """Value of a consistent filter, or lower bound; else empty."""
     write: Callable[[Any], str] = number
 
     def of(self, entry: Entry) -> str:
@@ -362,6 +348,7 @@ def _declared(frame: ErrorFrame) -> list[Measure]:
     # fmt: on
 
 
+#: Rows of a world that hides identities, of :func:`association_summary`.
 _ASSOCIATION: tuple[tuple[Any, ...], ...] = (
     ("median_ate.hidden", "path (ATE), median run, raw [m]"),
     ("median_ate.known", "… with known identities [m]"),
@@ -380,7 +367,6 @@ _ASSOCIATION: tuple[tuple[Any, ...], ...] = (
     ("recall", "recall", "1", share),
     ("bad_runs.count", "bad runs of {runs}", "0", str),
 )
-"""Rows of a world that hides identities, of :func:`association_summary`."""
 
 
 def measures(summary: dict[str, Any]) -> list[Measure]:
@@ -566,10 +552,7 @@ def efficiency_summary(scores: EstimatorScores) -> dict[str, Any] | None:
 def _entry(found: Efficiency) -> dict[str, Any] | None:
     if not np.isfinite(found.value):
         return None
-    return {
-        "value": finite(found.value),
-        "interval": [finite(end) for end in found.interval],
-    }
+    return {"value": finite(found.value), "interval": [*map(finite, found.interval)]}
 
 
 def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
@@ -607,11 +590,7 @@ def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
         **{name: mean(scores.per_run(f"{PREFIX}{name}")) for name in COUNTS + SHARES},
         "gospa": {**parts, "cutoff": CUTOFF},
         "resolution": float(scores.results.attrs.get("resolution", 0.0)),
-        "bad_runs": {
-            "count": bad,
-            "share": bad / len(scores.good),
-            "margin": MARGIN,
-        },
+        "bad_runs": {"count": bad, "share": bad / len(scores.good), "margin": MARGIN},
         "median_ate": {"hidden": _median(hidden), "known": _median(known)},
     }
 

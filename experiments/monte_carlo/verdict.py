@@ -43,8 +43,8 @@ CONSISTENT = "consistent"
 NEARLY = "nearly consistent"
 NOT_CONSISTENT = "not consistent"
 NOT_SHOWN = "not shown"
+#: Rating of each word, which chooses its colour.
 KINDS = {CONSISTENT: "good", NEARLY: "good", NOT_CONSISTENT: "bad", NOT_SHOWN: "open"}
-"""Rating of each word, which chooses its colour."""
 
 _ERROR_RATE = 0.05
 _DECIDING = 3  # final step, time averages and grid share the error rate
@@ -59,21 +59,21 @@ _NOT_REFUSED = "the errors of the pose agree with the covariances (5 %)"
 class Verdict(NamedTuple):
     """One word and its reason."""
 
+    #: "consistent": no test rejects, and the ratio is shown to be near 1; "nearly
+    #: consistent": rejected, but shown to be near 1; "not consistent": rejected, which
+    #: happens to a consistent filter in at most 5 % of cases; "not shown": neither, or
+    #: some runs failed.
     word: str
-    """"consistent": no test rejects, and the ratio is shown to be near 1;
-    "nearly consistent": rejected, but shown to be near 1; "not consistent": rejected,
-    which happens to a consistent filter in at most 5 % of cases; "not shown": neither,
-    or some runs failed."""
+    #: Continues after the word, without a full stop.
     reason: str
-    """Continues after the word, without a full stop."""
 
 
+#: In place of a verdict on estimates that are aligned.
 FITTED = Verdict(
     NOT_SHOWN,
     "each path is aligned with its truth, and an alignment fitted to the errors "
     "makes them smaller: their NEES is not χ²",
 )
-"""In place of a verdict on estimates that are aligned."""
 
 
 def judge(report: ConsistencyReport | None, failed: int, runs: int) -> Verdict:
@@ -239,8 +239,8 @@ def _number(ratio: float) -> str:
 # --------------------------------------------------------------------------------------
 # Warnings about the results of a Monte Carlo: too few runs, and failed runs.
 
+#: Ratio of map sizes above which a map is split.
 LARGE_MAP = 1.2
-"""Ratio of map sizes above which a map is split."""
 
 _MOST_GROUPS = 3
 _LETTERS = 160  # of a message
@@ -354,8 +354,8 @@ def _group(group: Mapping[str, Any]) -> str:
 # --------------------------------------------------------------------------------------
 # The cause of an inconsistency, as an entry of the summary and as a sentence.
 
+#: The cause for estimates in another convention than their files should have.
 CONVENTION = "convention"
-"""The cause for estimates in another convention than their files should have."""
 _MISTAKES = ("wrong", "duplicate", "ghost", "clutter_used")
 
 
@@ -520,8 +520,8 @@ class FailedRun(NamedTuple):
     """A run that is left out of all figures, and the reason."""
 
     run: int
+    #: -1 where unknown.
     step: int
-    """-1 where unknown."""
     message: str
 
 
@@ -529,13 +529,13 @@ class EstimatorScores(NamedTuple):
     """One estimator's results: M successful runs, K steps after the start."""
 
     label: str
+    #: First step that has a NEES, >= 1.
     first: int
-    """First step that has a NEES, >= 1."""
+    #: Which of all runs succeeded, shape (runs,).
     good: BoolArray
-    """Which of all runs succeeded, shape (runs,)."""
     failures: tuple[FailedRun, ...]
+    #: Of all runs and steps.
     results: xr.Dataset
-    """Of all runs and steps."""
 
     @property
     def steps(self) -> IntArray:

@@ -27,32 +27,15 @@ from ...evaluation.hypothesis_tests import (
     ljung_box,
 )
 from ...evaluation.nees import pose_nees
+from ..logs import slamlog
 from ..logs.ground_truth import hides_identities, true_poses_of
-from ..logs.slamlog import (
-    FORMAT_LINE,
-    LogError,
-    SlamLog,
-    numbers,
-    read_lines,
-    write_whole,
-)
 from ..runs.filter_settings import FilterSettings, one_blas_thread
 from ..runs.log_replay import Progress
+from . import search
 from .scoring import associated_log, events_of
-from .search import (
-    BEARING,
-    IN_METRES,
-    PER_METRE,
-    RANGE,
-    FittedNoise,
-    LogLikelihood,
-    most_likely_noise,
-    noise_of,
-    with_noise,
-)
 
+#: Of the gate of the fit, as an option of filters.
 GATE_PROBABILITY = float(-np.expm1(-GATE / 2))
-"""Of the gate of the fit, as an option of filters."""
 
 
 class Fitted(NamedTuple):
@@ -60,42 +43,42 @@ class Fitted(NamedTuple):
 
     settings: FilterSettings
     log_likelihood: float
+    #: Readings beyond the gate.
     rejected: int
-    """Readings beyond the gate."""
+    #: Of the innovations in bearing and in range.
     whiteness: tuple[Whiteness, Whiteness]
-    """Of the innovations in bearing and in range."""
+    #: Of the readings, each by its own standard deviation, (M, 2); nan for the first of
+    #: each landmark.
     innovations: Array
-    """Of the readings, each by its own standard deviation, (M, 2); nan for the first of
-    each landmark."""
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseFit:
     """The noise of a log."""
 
-    log: SlamLog
-    noise: tuple[FittedNoise, ...]
-    """The standard deviations that were fitted."""
+    log: slamlog.SlamLog
+    #: The standard deviations that were fitted.
+    noise: tuple[search.FittedNoise, ...]
     before: Fitted
+    #: With the most likely noise.
     fitted: Fitted
-    """With the most likely noise."""
+    #: The same, the noise of the sensor inflated where innovations are not white; where
+    #: all are white, it is `fitted` itself.
     suggested: Fitted
-    """The same, the noise of the sensor inflated where innovations are not white; where
-    all are white, it is `fitted` itself."""
+    #: The factor of the sensor's noise at which the pose NEES is 1 per degree of
+    #: freedom; None if the truth is unknown.
     calibration: Calibration | None
-    """The factor of the sensor's noise at which the pose NEES is 1 per degree of
-    freedom; None if the truth is unknown."""
+    #: Shape (M,).
     reading_times: Array
-    """Shape (M,)."""
     readings: int
+    #: Number of times that the log was filtered.
     passes: int
-    """Number of times that the log was filtered."""
+    #: Whether a filter associated the readings; they have its identities in `log`.
     is_associated: bool = False
-    """Whether a filter associated the readings; they have its identities in `log`."""
 
 
 def fit_noise(
-    log: SlamLog,
+    log: slamlog.SlamLog,
     settings: FilterSettings,
     *,
     progress: Progress | None = None,
@@ -149,20 +132,22 @@ def fit_noise(
     return replace(_fit_known(known, settings, threads), is_associated=True)
 
 
-def _fit_known(log: SlamLog, settings: FilterSettings, threads: int | None) -> NoiseFit:
+def _fit_known(
+    log: slamlog.SlamLog, settings: FilterSettings, threads: int | None
+) -> NoiseFit:
     """Fit the noise of a log that identifies its readings."""
     timed = events_of(log)
     slam = _filter(log, settings)
-    likelihood = LogLikelihood(slam, timed.events, threads=threads)
+    likelihood = search.LogLikelihood(slam, timed.events, threads=threads)
     with one_blas_thread():
-        found = most_likely_noise(likelihood.sample(), noise_of(settings))
+        found = search.most_likely_noise(likelihood.sample(), search.noise_of(settings))
         noise = found.noise
-        before = _fitted(likelihood, settings, noise_of(settings))
+        before = _fitted(likelihood, settings, search.noise_of(settings))
         fitted = _fitted(likelihood, settings, noise)
         inflated = noise.copy()
         bearing, distance = fitted.whiteness
-        inflated[[BEARING, IN_METRES]] *= bearing.inflation
-        inflated[[RANGE, PER_METRE]] *= distance.inflation
+        inflated[[search.BEARING, search.IN_METRES]] *= bearing.inflation
+        inflated[[search.RANGE, search.PER_METRE]] *= distance.inflation
         same = np.array_equal(inflated, noise)
         suggested = fitted if same else _fitted(likelihood, settings, inflated)
         calibration = calibrate(likelihood, log, timed.times, noise)
@@ -180,7 +165,7 @@ def _fit_known(log: SlamLog, settings: FilterSettings, threads: int | None) -> N
     )
 
 
-def _filter(log: SlamLog, settings: FilterSettings) -> EkfSlam:
+def _filter(log: slamlog.SlamLog, settings: FilterSettings) -> EkfSlam:
     """Return the filter at the start of the log, without landmark management."""
     options = {k: v for k, v in settings.options.items() if k != "management"}
     slam = replace(settings, options=options).make(log.start)
@@ -193,11 +178,11 @@ def _filter(log: SlamLog, settings: FilterSettings) -> EkfSlam:
 
 
 def _fitted(
-    likelihood: LogLikelihood, settings: FilterSettings, noise: Array
+    likelihood: search.LogLikelihood, settings: FilterSettings, noise: Array
 ) -> Fitted:
     record = likelihood.record(noise[None])
     return Fitted(
-        with_noise(settings, noise),
+        search.with_noise(settings, noise),
         float(record.log_likelihoods.sum()),
         int(record.rejected[0]),
         whiteness(likelihood.events, record),
@@ -212,15 +197,15 @@ FACTORS = np.geomspace(0.25, 16.0, 19)
 class Calibration(NamedTuple):
     """The factor of the sensor's noise at which the pose NEES is as expected."""
 
+    #: 0 or infinity if none of `FACTORS` is small or large enough; likewise below.
     factor: float
-    """0 or infinity if none of `FACTORS` is small or large enough; likewise below."""
+    #: Of its 95 % interval.
     low: float
-    """Of its 95 % interval."""
     high: float
 
 
 def calibrate(
-    likelihood: LogLikelihood, log: SlamLog, times: Array, noise: Array
+    likelihood: search.LogLikelihood, log: slamlog.SlamLog, times: Array, noise: Array
 ) -> Calibration | None:
     """Return the factor of the sensor's noise at which NEES has its expected value.
 
@@ -248,7 +233,7 @@ def calibrate(
     if truth is None or not np.isfinite(truth).all(axis=1).any():
         return None
     noises = np.tile(noise, (len(FACTORS), 1))
-    noises[:, BEARING:] *= FACTORS[:, None]
+    noises[:, search.BEARING :] *= FACTORS[:, None]
     whole = replace(likelihood, most_landmarks=len(likelihood.events.readings))
     record = whole.record(noises)
     frame = likelihood.filter.frame
@@ -326,12 +311,12 @@ SIGNIFICANT = 0.01
 class Whiteness(NamedTuple):
     """The correlation in time of innovations, scan by scan and for each landmark."""
 
+    #: Of two Ljung-Box tests, the smaller one twice; nan for too few innovations.
     p_value: float
-    """Of two Ljung-Box tests, the smaller one twice; nan for too few innovations."""
+    #: Correlation of one innovation of a landmark with its next.
     first: float
-    """Correlation of one innovation of a landmark with its next."""
+    #: Suggested factor of the standard deviation, 1 for white ones.
     inflation: float
-    """Suggested factor of the standard deviation, 1 for white ones."""
 
 
 def whiteness(events: DriveEvents, record: DriveRecord) -> tuple[Whiteness, Whiteness]:
@@ -427,9 +412,9 @@ def refuse_other_formats(path: str | PathLike[str]) -> None:
         If the file is no slamlog 1.
     """
     is_file = Path(path).is_file()
-    first = "".join(read_lines(path)[0].text.split()) if is_file else ""
-    if first != "".join(FORMAT_LINE.split()):
-        raise LogError(
+    first = "".join(slamlog.read_lines(path)[0].text.split()) if is_file else ""
+    if first != "".join(slamlog.FORMAT_LINE.split()):
+        raise slamlog.LogError(
             f"{path}: only the header of a slamlog 1 holds a noise; slamgym replay "
             "writes one of any log, log.csv"
         )
@@ -454,15 +439,15 @@ def write_noise(path: str | PathLike[str], settings: FilterSettings) -> None:
     """
     refuse_other_formats(path)
     values = {
-        "motion_std": numbers(*settings.motion_std),
-        "measurement_std": numbers(*settings.measurement_std),
+        "motion_std": slamlog.numbers(*settings.motion_std),
+        "measurement_std": slamlog.numbers(*settings.measurement_std),
     }
     for key in ("range_std_per_metre", "bearing_std_metres"):
         if key in settings.options:
-            values[key] = numbers(settings.options[key])
+            values[key] = slamlog.numbers(settings.options[key])
     with Path(path).open(encoding="utf-8", newline="") as stream:
         lines = stream.read().split("\n")
-    write_whole(path, "\n".join(_with_header(lines, values)))
+    slamlog.write_whole(path, "\n".join(_with_header(lines, values)))
 
 
 def _with_header(lines: list[str], values: dict[str, str]) -> list[str]:

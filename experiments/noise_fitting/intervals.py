@@ -1,7 +1,5 @@
 """Confidence intervals of the fitted parameters."""
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -30,10 +28,10 @@ ENDS = np.geomspace(1e-6, 10.0, 71)  # [m, rad] where ends are looked for
 class Interval(NamedTuple):
     """The information of the readings about one parameter."""
 
+    #: Zero: the interval begins at zero; "unknown": nothing depends on it.
     verdict: Verdict
-    """Zero: the interval begins at zero; "unknown": nothing depends on it."""
+    #: Of the 95 % interval; 0 and infinity where unknown.
     low: float
-    """Of the 95 % interval; 0 and infinity where unknown."""
     high: float
 
 

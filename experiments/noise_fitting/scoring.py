@@ -11,8 +11,6 @@ g_s    its score ∂ℓ_s/∂θ, by central differences
 I      Σ g_s g_sᵀ, the outer product of scores, which estimates the information
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -32,8 +30,8 @@ from ..logs.slamlog import OdometryRow, Scan, SlamLog
 from ..runs.filter_settings import SMOOTHER, FilterSettings
 from ..runs.log_replay import Progress, replay
 
+#: Of parameters (B, p), the log likelihoods (B, S) of the steps.
 Likelihoods = Callable[[Array], Array]
-"""Of parameters (B, p), the log likelihoods (B, S) of the steps."""
 
 NARROW = 0.01  # step of the differences, in θ
 FARTHEST = 2.0  # the most that an iteration changes one θ
@@ -51,23 +49,23 @@ SIZES = 10.0 * 2.0 ** -np.arange(21)  # tried of a poorly determined parameter
 class Maximum(NamedTuple):
     """The most likely parameters."""
 
+    #: Shape (p,).
     parameters: Array
-    """Shape (p,)."""
     log_likelihood: float
     converged: bool
+    #: Number of values tried.
     passes: int
-    """Number of values tried."""
 
 
 class Scores(NamedTuple):
     """The log likelihood about one θ."""
 
+    #: ℓ.
     value: float
-    """ℓ."""
+    #: Σ g_s, shape (p,).
     gradient: Array
-    """Σ g_s, shape (p,)."""
+    #: I, shape (p, p).
     information: Array
-    """I, shape (p, p)."""
 
 
 class _Climb(NamedTuple):
@@ -295,16 +293,16 @@ def _times_after(log: SlamLog, counts: IntArray) -> Array:
 
 
 Motion = tuple[float, float, float]
+#: Steps of a drive, from the first to before the second.
 Stretch = tuple[int, int]
-"""Steps of a drive, from the first to before the second."""
 
 
 class TimedEvents(NamedTuple):
     """The events of a log, and the time of each step."""
 
     events: DriveEvents
+    #: Shape (S,).
     times: Array
-    """Shape (S,)."""
 
 
 def events_of(log: SlamLog) -> TimedEvents:

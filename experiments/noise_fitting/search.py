@@ -20,21 +20,8 @@ from ...estimator.filters.ekf import EkfSlam
 from ...estimator.kernels.drive_likelihood import DriveEvents, DriveRecord
 from ...estimator.kernels.kalman_gain import GATED
 from ..runs.filter_settings import FilterSettings
+from . import scoring
 from .intervals import NOT_ZERO, Verdict, intervals
-from .scoring import (
-    BETTER,
-    FAINT,
-    GREATEST,
-    Stretch,
-    maximise,
-    parts_of,
-    restricted,
-    sample_of,
-    scores,
-    stretches_of,
-    totals,
-    without_readings,
-)
 
 ROUNDS = 12  # of rejecting readings and fitting the others
 COARSE = 6  # iterations of a round after which readings are rejected anew
@@ -44,8 +31,8 @@ FACTORS = 4.0 ** np.arange(-3, 3)  # of motion and of sensor noise, tried at the
 BEARING, RANGE, PER_METRE, IN_METRES = 3, 4, 5, 6  # columns of the sensor's noise
 
 
+#: Entries of the sensor's noise, and those that can replace them.
 NEEDLESS = ((PER_METRE, RANGE), (IN_METRES, BEARING))
-"""Entries of the sensor's noise, and those that can replace them."""
 EXACT = 1e-6  # [rad, m] below which readings have no noise
 WORTH = 3.0  # by which a part of σβ in metres must raise the log likelihood (p = .014)
 PLAIN = 0.15  # standard deviation of log σ below which it is certainly not zero
@@ -58,22 +45,22 @@ class FittedNoise(NamedTuple):
     unit: str
     before: float
     value: float
+    #: Of its 95 % interval.
     low: float
-    """Of its 95 % interval."""
     high: float
+    #: Fitted; zero: the interval begins at zero; unknown: nothing depends on it.
     verdict: Verdict
-    """Fitted; zero: the interval begins at zero; unknown: nothing depends on it."""
 
 
 class _Fit(NamedTuple):
     """A noise during the search."""
 
+    #: Shape (7,).
     noise: Array
-    """Shape (7,)."""
+    #: Which entries are fitted, shape (7,); the others are zero.
     free: BoolArray
-    """Which entries are fitted, shape (7,); the others are zero."""
+    #: Its logarithm.
     likelihood: float
-    """Its logarithm."""
     converged: bool
     passes: int
 
@@ -81,8 +68,8 @@ class _Fit(NamedTuple):
 class Found(NamedTuple):
     """The most likely noise."""
 
+    #: Shape (7,).
     noise: Array
-    """Shape (7,)."""
     table: tuple[FittedNoise, ...]
     passes: int
 
@@ -121,7 +108,7 @@ def most_likely_noise(likelihood: LogLikelihood, before: Array) -> Found:
     _refuse_diverged(found)
     _refuse_exact(found.noise, _typical_range(smooth))
     noise, at = found.noise, np.flatnonzero(chosen)
-    along = restricted(smooth.of, noise, at)
+    along = scoring.restricted(smooth.of, noise, at)
     judged = dict(
         zip(at.tolist(), intervals(along, noise[at], found.likelihood), strict=True)
     )
@@ -171,7 +158,7 @@ def _coarse_start(likelihood: LogLikelihood, start: Array, chosen: BoolArray) ->
             for b in FACTORS
         ]
     )
-    values = totals(likelihood.of(tried))
+    values = scoring.totals(likelihood.of(tried))
     if not np.isfinite(values).any():
         raise np.linalg.LinAlgError("the fit diverges: no noise explains the readings")
     best = int(np.argmax(values))
@@ -185,8 +172,8 @@ def _typical_range(likelihood: LogLikelihood) -> float:
 def _fit(smooth: LogLikelihood, found: _Fit, *, most: int | None = None) -> _Fit:
     """Fit the free entries, starting from their present values."""
     free = np.flatnonzero(found.free)
-    along = restricted(smooth.of, found.noise, free)
-    fit = maximise(along, found.noise[None, free], most=most)
+    along = scoring.restricted(smooth.of, found.noise, free)
+    fit = scoring.maximise(along, found.noise[None, free], most=most)
     noise = found.noise.copy()
     noise[free] = fit.parameters
     passes = found.passes + fit.passes
@@ -221,10 +208,10 @@ def _without_needless(smooth: LogLikelihood, found: _Fit) -> _Fit:
 def _is_plain(smooth: LogLikelihood, found: _Fit, entry: int) -> bool:
     """Return whether an entry is significantly above zero."""
     free = np.flatnonzero(found.free)
-    along = restricted(smooth.of, found.noise, free)
-    information = scores(along, np.log(found.noise[free])).information
+    along = scoring.restricted(smooth.of, found.noise, free)
+    information = scoring.scores(along, np.log(found.noise[free])).information
     at = int(np.flatnonzero(free == entry)[0])
-    covariance = np.linalg.inv(information + FAINT * np.eye(len(free)))
+    covariance = np.linalg.inv(information + scoring.FAINT * np.eye(len(free)))
     return bool(covariance[at, at] < PLAIN**2)
 
 
@@ -233,9 +220,9 @@ def _without_zeros(smooth: LogLikelihood, found: _Fit) -> _Fit:
     for _ in range(int(np.count_nonzero(found.free)) - 1):
         free = np.flatnonzero(found.free)
         tried = [_fixed_at_zero(found, entry) for entry in free.tolist()]
-        values = totals(smooth.of(np.array([one.noise for one in tried])))
+        values = scoring.totals(smooth.of(np.array([one.noise for one in tried])))
         best = int(np.argmax(values))
-        if values[best] < found.likelihood - BETTER:
+        if values[best] < found.likelihood - scoring.BETTER:
             break
         found = _fit(smooth, tried[best])
     return found
@@ -251,7 +238,7 @@ def _refuse_most(rejected: BoolArray) -> None:
 
 
 def _refuse_diverged(found: _Fit) -> None:
-    if not found.converged or found.noise.max() > 0.5 * GREATEST:
+    if not found.converged or found.noise.max() > 0.5 * scoring.GREATEST:
         values = ", ".join(
             f"{name} {value:.3g}"
             for (name, _), value in zip(ENTRIES, found.noise, strict=True)
@@ -273,6 +260,7 @@ def _refuse_exact(noise: Array, typical_range: float) -> None:
             )
 
 
+#: Name and unit of each standard deviation; of a motion, per unit of the log's time.
 ENTRIES = (
     ("σx", "m"),
     ("σy", "m"),
@@ -282,7 +270,6 @@ ENTRIES = (
     ("σr per metre", "m/m"),
     ("σβ in metres", "m"),
 )
-"""Name and unit of each standard deviation; of a motion, per unit of the log's time."""
 
 SMALL = 0.1  # share of its neighbours at which the search for a zero begins
 
@@ -350,21 +337,23 @@ class LogLikelihood:
     many landmarks is therefore cut into parts, and each begins with an empty map.
     """
 
+    #: At its start.
     filter: EkfSlam
-    """At its start."""
     events: DriveEvents
     gate: float = GATE
     threads: int | None = None
+    #: Of one part.
     most_landmarks: int = MOST_LANDMARKS
-    """Of one part."""
-    stretches: Sequence[Stretch] = ()
-    """The parts, if they are given."""
+    #: The parts, if they are given.
+    stretches: Sequence[scoring.Stretch] = ()
 
     @cached_property
     def parts(self) -> tuple[DriveEvents, ...]:
         """The parts of the drive."""
-        stretches = self.stretches or stretches_of(self.events, self.most_landmarks)
-        return parts_of(self.events, stretches)
+        stretches = self.stretches or scoring.stretches_of(
+            self.events, self.most_landmarks
+        )
+        return scoring.parts_of(self.events, stretches)
 
     def sample(self, most_readings: int = MOST_READINGS) -> LogLikelihood:
         """Return the likelihood of evenly spread parts of a drive with many readings.
@@ -373,10 +362,10 @@ class LogLikelihood:
         """
         if len(self.events.readings) <= most_readings:
             return self
-        stretches = stretches_of(self.events, SAMPLED_LANDMARKS)
+        stretches = scoring.stretches_of(self.events, SAMPLED_LANDMARKS)
         if len(stretches) == 1:
             return self
-        events, chosen = sample_of(self.events, stretches, most_readings)
+        events, chosen = scoring.sample_of(self.events, stretches, most_readings)
         return replace(self, events=events, stretches=chosen)
 
     def of(self, noises: Array) -> Array:
@@ -420,5 +409,5 @@ class LogLikelihood:
 
         It is smooth: no reading is rejected here and accepted there.
         """
-        kept = without_readings(self.events, dropped)
+        kept = scoring.without_readings(self.events, dropped)
         return replace(self, events=kept, gate=np.inf)

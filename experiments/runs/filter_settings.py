@@ -33,13 +33,13 @@ if TYPE_CHECKING:
     from .simulated_runs import SimulatedRuns
 
 
+#: Import path of the smoother; its option ``follow`` names the filter that it follows,
+#: and whose options it takes too.
 SMOOTHER = "slamgym.estimator.smoother.recorded_slam:SmoothingSlam"
-"""Import path of the smoother; its option ``follow`` names the filter that it follows,
-and whose options it takes too."""
+#: Estimators of whole drives, which no step-by-step experiment knows by name.
 OFFLINE = {"smoother": SMOOTHER}
-"""Estimators of whole drives, which no step-by-step experiment knows by name."""
+#: The five noises: three of the motion in the robot's frame, two of the sensor.
 SIGMAS = ("σx", "σy", "σα", "σβ", "σr")
-"""The five noises: three of the motion in the robot's frame, two of the sensor."""
 
 _COURSE_SOURCE = "course data.txt"
 _COURSE_NOISE = {  # as the homework publishes it
@@ -48,6 +48,7 @@ _COURSE_NOISE = {  # as the homework publishes it
     "start_sigma": "0.02,0.02,0.1",
 }
 
+#: Keys of a log's header that :func:`settings_for` reads.
 NOISE_KEYS = (
     "motion_std",
     "measurement_std",
@@ -56,7 +57,6 @@ NOISE_KEYS = (
     "bearing_std_metres",
     "noise_at_rest",
 )
-"""Keys of a log's header that :func:`settings_for` reads."""
 
 _ASSUMED_NOISE = {"motion_std": (0.1, 0.1, 0.03), "measurement_std": (0.026, 0.3)}
 
@@ -72,16 +72,16 @@ class FilterSettings:
     (0.01, 0.8)
     """
 
+    #: Registered name or "module:Class".
     estimator: str
-    """Registered name or "module:Class"."""
+    #: (σx, σy, σα) per unit of the log's time [m, m, rad].
     motion_std: tuple[float, ...]
-    """(σx, σy, σα) per unit of the log's time [m, m, rad]."""
+    #: (σβ, σr) [rad, m].
     measurement_std: tuple[float, ...]
-    """(σβ, σr) [rad, m]."""
+    #: (σx, σy, σθ) of the first pose [m, m, rad].
     initial_pose_std: tuple[float, ...] = (0.0, 0.0, 0.0)
-    """(σx, σy, σθ) of the first pose [m, m, rad]."""
+    #: Further arguments of the estimator's constructor.
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Further arguments of the estimator's constructor."""
 
     def make(self, initial_pose: ArrayLike) -> interface.SlamEstimator:
         """Make the estimator at an initial pose (3,) [m, m, rad].
@@ -305,18 +305,18 @@ def _flag(name: str, key: str, text: str) -> bool:
 
 
 _PACKAGE = Path(registry.__file__).resolve().parents[1]
+#: Names that stay those of slamgym's own estimators.
 OWN_NAMES = frozenset(registry.list_estimators())
-"""Names that stay those of slamgym's own estimators."""
 
 
 class EstimatorChoice(NamedTuple):
     """An estimator and its label in the results."""
 
     label: str
+    #: Registered name or "module:Class".
     name: str
-    """Registered name or "module:Class"."""
+    #: Arguments of its constructor other than the noise.
     options: Mapping[str, Any] = {}
-    """Arguments of its constructor other than the noise."""
 
     def code(self) -> str:
         """Return a digest of the user's own source; empty for slamgym's estimators."""

@@ -39,36 +39,36 @@ _MOST_JOINED = 50  # the same where each must be joined from submaps
 class MapChanges(NamedTuple):
     """Changes of the map of a run other than added landmarks."""
 
+    #: Tentative landmarks that were confirmed.
     confirmed: int = 0
-    """Tentative landmarks that were confirmed."""
+    #: Landmarks marginalised.
     removed: int = 0
-    """Landmarks marginalised."""
+    #: Landmarks merged into another one.
     merged: int = 0
-    """Landmarks merged into another one."""
+    #: Largest size of the map.
     most: int = 0
-    """Largest size of the map."""
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
     """An estimator's run over a log."""
 
+    #: The log.
     log: slamlog.SlamLog
-    """The log."""
+    #: The estimator's belief after every step.
     trace: RunTrace
-    """The estimator's belief after every step."""
+    #: Its belief at the end.
     belief: Belief
-    """Its belief at the end."""
+    #: Number of scans in the log.
     scans: int
-    """Number of scans in the log."""
+    #: Their readings, counted by what became of them.
     readings: ReadingCounts
-    """Their readings, counted by what became of them."""
+    #: Changes of its map.
     changes: MapChanges = field(default_factory=MapChanges)
-    """Changes of its map."""
+    #: The step of the last reading of each landmark.
     last_seen: Mapping[int, int] = field(default_factory=dict)
-    """The step of the last reading of each landmark."""
+    #: Its decisions about readings without identity, if the log has true ids.
     decisions: RunDecisions | None = None
-    """Its decisions about readings without identity, if the log has true ids."""
 
 
 def replay(
@@ -227,20 +227,20 @@ def _ids(scan: slamlog.Scan) -> list[int] | None:
 class ReadingCounts(NamedTuple):
     """The readings of a log, counted by what became of them."""
 
+    #: Corrected the belief.
     associated: int = 0
-    """Corrected the belief."""
+    #: Added a landmark to the map.
     added: int = 0
-    """Added a landmark to the map."""
+    #: Rejected by the chi-square gate.
     rejected: int = 0
-    """Rejected by the chi-square gate."""
+    #: Too close to use.
     skipped: int = 0
-    """Too close to use."""
+    #: Associated ones within 10 σ of the robot, where linearisation is poor.
     near: int = 0
-    """Associated ones within 10 σ of the robot, where linearisation is poor."""
+    #: Supported landmarks that are not yet confirmed.
     tentative: int = 0
-    """Supported landmarks that are not yet confirmed."""
+    #: Fitted more than one landmark.
     ambiguous: int = 0
-    """Fitted more than one landmark."""
 
 
 class RunRecorder:
@@ -258,8 +258,8 @@ class RunRecorder:
         self._readings: Counter[str] = Counter()
         self._changes: Counter[str] = Counter()
         self._ids: tuple[int, ...] = ()
+        #: The step of the last reading of each landmark.
         self.last_seen: dict[int, int] = {}
-        """The step of the last reading of each landmark."""
 
     def add(self, predicted: Belief, report: UpdateReport | None) -> None:
         """Record one step, after the scan at its end."""

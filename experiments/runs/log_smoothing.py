@@ -35,17 +35,17 @@ from .trace import finite
 class SmoothedLog:
     """A log, filtered and smoothed."""
 
+    #: The filter's run, whose associations the smoother has.
     filtered: Replay
-    """The filter's run, whose associations the smoother has."""
+    #: All poses at scans and all landmarks, given the whole log.
     drive: SmoothedDrive
-    """All poses at scans and all landmarks, given the whole log."""
+    #: The pose after every step of the log, shape (K + 1, 3) [m, m, rad].
     poses: Array
-    """The pose after every step of the log, shape (K + 1, 3) [m, m, rad]."""
+    #: Step of each pose of the drive, shape (N,).
     scan_steps: IntArray
-    """Step of each pose of the drive, shape (N,)."""
 
+    #: The repaired association, if that was asked for.
     repair: Reassociation | None = None
-    """The repaired association, if that was asked for."""
 
     @property
     def log(self) -> SlamLog:

@@ -24,27 +24,27 @@ class SimulatedRuns(NamedTuple):
     world that hides identities are of no landmark.
     """
 
+    #: (d, α) before each scan, shape (B, T, 2) [m, rad]; zeros before the first.
     odometry: Array
-    """(d, α) before each scan, shape (B, T, 2) [m, rad]; zeros before the first."""
+    #: Rows (β, r), shape (B, T, M, 2) [rad, m].
     measurements: Array
-    """Rows (β, r), shape (B, T, M, 2) [rad, m]."""
+    #: Whether a row holds a reading, shape (B, T, M).
     visible: BoolArray
-    """Whether a row holds a reading, shape (B, T, M)."""
+    #: (x, y, θ), shape (B, T, 3) [m, m, rad].
     true_poses: Array
-    """(x, y, θ), shape (B, T, 3) [m, m, rad]."""
+    #: True positions, shape (B, L, 2) [m].
     landmarks: Array
-    """True positions, shape (B, L, 2) [m]."""
+    #: Initial poses of the filters, shape (B, 3).
     initial_poses: Array
-    """Initial poses of the filters, shape (B, 3)."""
+    #: The true landmark of each row of a world that hides identities, -1 for clutter
+    #: and empty rows, shape (B, T, M); the rows are then not those of the landmarks.
     true_ids: IntArray | None = None
-    """The true landmark of each row of a world that hides identities, -1 for clutter
-    and empty rows, shape (B, T, M); the rows are then not those of the landmarks."""
+    #: The landmark of each row, ascending, shape (M,); None if row i is landmark i.
     ids: IntArray | None = None
-    """The landmark of each row, ascending, shape (M,); None if row i is landmark i."""
+    #: Of (x, y, θ) by GPS and compass, nan where there is none, shape (B, T, 3).
     pose_readings: Array | None = None
-    """Of (x, y, θ) by GPS and compass, nan where there is none, shape (B, T, 3)."""
+    #: Their standard deviations, shape (3,) [m, m, rad].
     pose_std: Array | None = None
-    """Their standard deviations, shape (3,) [m, m, rad]."""
 
     @property
     def dt(self) -> Array:

@@ -289,17 +289,17 @@ def _finite_list(values: Array) -> list[float | None]:
     return [finite(value) for value in values]
 
 
+#: Share of rejected readings above which a filter may diverge.
 MOST_REJECTED = 0.05
-"""Share of rejected readings above which a filter may diverge."""
 
+#: NIS per degree of freedom that is no reason to worry.
 NIS_RANGE = (0.5, 2.0)
-"""NIS per degree of freedom that is no reason to worry."""
 
+#: A landmark within reach in this many scans should be in one of them.
 MANY_SCANS = 10
-"""A landmark within reach in this many scans should be in one of them."""
 
+#: Share of landmarks that scans no longer show above which a map may be split.
 MOST_ABANDONED = 0.25
-"""Share of landmarks that scans no longer show above which a map may be split."""
 
 
 def run_warnings(replay: Replay) -> list[str]:

@@ -25,12 +25,12 @@ Integers = NDArray[np.integer]
 class MapEstimate(NamedTuple):
     """The landmarks in the map at one step, in the order of the state."""
 
+    #: Shape (k,).
     ids: Integers
-    """Shape (k,)."""
+    #: Shape (k, 2) [m].
     means: Array
-    """Shape (k, 2) [m]."""
+    #: Shape (k, 2, 2) [m²].
     covariances: Array
-    """Shape (k, 2, 2) [m²]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,44 +46,44 @@ class RunTrace:
         If the shapes do not match.
     """
 
+    #: Name for titles.
     estimator: str
-    """Name for titles."""
+    #: Times, shape (K + 1,) [`time_unit`].
     t: Array
-    """Times, shape (K + 1,) [`time_unit`]."""
+    #: Poses (x, y, θ) before the scans, shape (K + 1, 3) [m, m, rad].
     predicted_poses: Array
-    """Poses (x, y, θ) before the scans, shape (K + 1, 3) [m, m, rad]."""
+    #: Shape (K + 1, 3, 3).
     predicted_pose_covariances: Array
-    """Shape (K + 1, 3, 3)."""
+    #: Updated poses, shape (K + 1, 3) [m, m, rad].
     poses: Array
-    """Updated poses, shape (K + 1, 3) [m, m, rad]."""
+    #: Shape (K + 1, 3, 3).
     pose_covariances: Array
-    """Shape (K + 1, 3, 3)."""
+    #: Shape (K + 1, 3), nan where unknown; None without ground truth.
     true_poses: Array | None
-    """Shape (K + 1, 3), nan where unknown; None without ground truth."""
+    #: Normalised innovation squared of each scan, shape (K + 1,).
     nis: Array
-    """Normalised innovation squared of each scan, shape (K + 1,)."""
+    #: Its degrees of freedom, 0 where nothing was corrected, shape (K + 1,).
     nis_dof: Integers
-    """Its degrees of freedom, 0 where nothing was corrected, shape (K + 1,)."""
+    #: Ids of the final map in the order of the state, shape (n,).
     landmark_ids: Integers
-    """Ids of the final map in the order of the state, shape (n,)."""
+    #: Final means, shape (n, 2) [m].
     landmarks: Array
-    """Final means, shape (n, 2) [m]."""
+    #: Means when each landmark entered the map, shape (n, 2) [m].
     first_landmarks: Array
-    """Means when each landmark entered the map, shape (n, 2) [m]."""
+    #: Covariances when each landmark entered the map, shape (n, 2, 2) [m²].
     first_landmark_covariances: Array
-    """Covariances when each landmark entered the map, shape (n, 2, 2) [m²]."""
+    #: The map after each step, K + 1 times (ids, means, covariances).
     landmark_history: Sequence[tuple[Integers, Array, Array]]
-    """The map after each step, K + 1 times (ids, means, covariances)."""
+    #: Shape (n, 2), nan where unknown; None without ground truth.
     true_landmarks: Array | None
-    """Shape (n, 2), nan where unknown; None without ground truth."""
+    #: Covariance of the state right after the first scan that added landmarks.
     first_covariance: Array
-    """Covariance of the state right after the first scan that added landmarks."""
+    #: Covariance of the state at the end, shape (3 + 2n, 3 + 2n).
     final_covariance: Array
-    """Covariance of the state at the end, shape (3 + 2n, 3 + 2n)."""
+    #: Unit of `t` for labels; simulated logs count "steps".
     time_unit: str = "s"
-    """Unit of `t` for labels; simulated logs count "steps"."""
+    #: Coordinates of the estimator's Gaussian error.
     frame: ErrorFrame = "additive"
-    """Coordinates of the estimator's Gaussian error."""
 
     def __post_init__(self) -> None:
         steps, n = len(self.t), len(self.landmark_ids)
@@ -138,21 +138,21 @@ NAMES = (*association_scores.AssociationScores._fields, "precision", "recall")
 class TrueLandmarks(NamedTuple):
     """The true landmarks of a world."""
 
+    #: Shape (n,).
     ids: IntArray
-    """Shape (n,)."""
+    #: Shape (n, 2) [m].
     positions: Array
-    """Shape (n, 2) [m]."""
 
 
 class RunDecisions(NamedTuple):
     """What a filter decided about the readings of a run, and what they are of."""
 
+    #: One per scan.
     decisions: Sequence[interface.ScanDecisions]
-    """One per scan."""
+    #: The true landmark of each reading, -1 for clutter, one array per scan.
     true_ids: Sequence[IntArray]
-    """The true landmark of each reading, -1 for clutter, one array per scan."""
+    #: (k, n): the filter believes a landmark seen in k of n scans.
     confirm: tuple[int, int]
-    """(k, n): the filter believes a landmark seen in k of n scans."""
 
     def identities(self) -> dict[int, int]:
         """Return the true landmark of each mapped one, -1 for clutter."""
@@ -162,14 +162,14 @@ class RunDecisions(NamedTuple):
 class RunAssociation(NamedTuple):
     """The association of a run, compared with the truth."""
 
+    #: None where the true landmark of some reading is unknown.
     scores: association_scores.AssociationScores | None
-    """None where the true landmark of some reading is unknown."""
+    #: Error of the final map.
     raw: association_scores.Gospa
-    """Error of the final map."""
+    #: The same after the rigid motion that brings its landmarks closest to theirs.
     aligned: association_scores.Gospa
-    """The same after the rigid motion that brings its landmarks closest to theirs."""
+    #: True landmarks nearer to each other count as one [m].
     resolution: float
-    """True landmarks nearer to each other count as one [m]."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return all as plain JSON types; None where undefined."""

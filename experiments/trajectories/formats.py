@@ -41,21 +41,21 @@ from .trajectory import (
 class TrajectoryFormat(NamedTuple):
     """What a module of this package defines."""
 
+    #: Writes a shard: (trajectories, path), and its options by name. The same
+    #: trajectories give the same bytes.
     write: Callable[..., None]
-    """Writes a shard: (trajectories, path), and its options by name. The same
-    trajectories give the same bytes."""
+    #: Yields the trajectories of a shard, one after the other.
     read: Callable[[Path], Iterator[Trajectory]]
-    """Yields the trajectories of a shard, one after the other."""
+    #: Raises a ValueError for a scenario that the format cannot hold.
     check: Callable[[Scenario], None] = lambda scenario: None
-    """Raises a ValueError for a scenario that the format cannot hold."""
+    #: The ending of the names of its shards.
     ENDING: str = ""
-    """The ending of the names of its shards."""
+    #: The packages besides numpy that write it; their versions determine the bytes.
     LIBRARIES: tuple[str, ...] = ()
-    """The packages besides numpy that write it; their versions determine the bytes."""
+    #: Names and defaults of the numbers > 0 that its `write` also takes.
     OPTIONS: Mapping[str, float] = {}
-    """Names and defaults of the numbers > 0 that its `write` also takes."""
+    #: Whether it writes and reads the beliefs of a filter too.
     HOLDS_BELIEFS: bool = False
-    """Whether it writes and reads the beliefs of a filter too."""
 
 
 def trajectory_format(name: str) -> TrajectoryFormat:
@@ -89,10 +89,8 @@ def trajectory_format(name: str) -> TrajectoryFormat:
             f"the format '{name}' needs the package {error.name}: "
             "pip install 'slamgym[trajectories]'"
         ) from None
-    defined = {
-        n: vars(module)[n] for n in TrajectoryFormat._fields if n in vars(module)
-    }
-    return TrajectoryFormat(**defined)
+    known = {n: vars(module)[n] for n in TrajectoryFormat._fields if n in vars(module)}
+    return TrajectoryFormat(**known)
 
 
 # --------------------------------------------------------------------------------------
@@ -224,8 +222,7 @@ def _write_tum(trajectories: Sequence[Trajectory], path: Path) -> None:
 def _check_tum(scenario: Scenario) -> None:
     """Refuse odometry that the increments of a path do not determine."""
     only_unicycle(
-        find_motion(scenario.models.get("motion", "unicycle")),
-        "the format 'tum'",
+        find_motion(scenario.models.get("motion", "unicycle")), "the format 'tum'"
     )
 
 
@@ -293,10 +290,8 @@ def dead_reckoning(start: Array, odometry: Array, motion: Motion = UNICYCLE) -> 
     x, y, heading = start.tolist()
     dx, dy, turns = motion.displacements(odometry).T
     headings = np.cumsum([heading, *turns])
-    along_x, along_y, *_ = composed(0.0, 0.0, headings[:-1], dx, dy, turns)
-    return np.column_stack(
-        [np.cumsum([x, *along_x]), np.cumsum([y, *along_y]), headings]
-    )
+    step_x, step_y, *_ = composed(0.0, 0.0, headings[:-1], dx, dy, turns)
+    return np.column_stack([np.cumsum([x, *step_x]), np.cumsum([y, *step_y]), headings])
 
 
 _ESTIMATOR = "invariant"
@@ -430,6 +425,7 @@ def _scans(log: slamlog.SlamLog) -> Iterator[slamlog.Scan]:
     return (event for event in log.events if isinstance(event, slamlog.Scan))
 
 
+#: The formats, or the modules that define them and load a library.
 FORMATS = {
     "slamlog": TrajectoryFormat(_write_slamlog, _read_slamlog),
     "npz": TrajectoryFormat(_write_npz, _read_npz, ENDING=".npz", HOLDS_BELIEFS=True),
@@ -438,4 +434,3 @@ FORMATS = {
     "tum": TrajectoryFormat(_write_tum, _read_tum, check=_check_tum),
     "g2o": "g2o",
 }
-"""The formats, or the modules that define them and load a library."""

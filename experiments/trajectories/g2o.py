@@ -31,9 +31,9 @@ from .formats import filtered_path, numbers, read_metadata, write_lines, write_m
 from .trajectory import Trajectory, array_of
 
 LIBRARIES = ("numba", "scipy")
+#: The smallest standard deviation in the files [m, rad]: noise of zero would have
+#: infinite information, and optimisers do not converge with 1e-6.
 OPTIONS = {"smallest_std": 1e-3}
-"""The smallest standard deviation in the files [m, rad]: noise of zero would have
-infinite information, and optimisers do not converge with 1e-6."""
 
 
 def check(scenario: Scenario) -> None:
@@ -78,12 +78,10 @@ def read(path: Path) -> Iterator[Trajectory]:
         yield _trajectory(path / name, about)
 
 
-def _vertices(
-    landmarks: dict[int, Array], poses: Array, first_pose: int
-) -> Iterator[str]:
+def _vertices(landmarks: dict[int, Array], poses: Array, first: int) -> Iterator[str]:
     for place, position in landmarks.items():
         yield f"VERTEX_XY {place} {numbers(position)}"
-    for place, pose in enumerate(poses, start=first_pose):
+    for place, pose in enumerate(poses, start=first):
         yield f"VERTEX_SE2 {place} {numbers(pose)}"
 
 

@@ -37,7 +37,7 @@ from .manifest import (
     Job,
     Manifest,
     ShardEntry,
-    checksum,
+    digest,
     is_whole,
     read_manifest,
     write_manifest,
@@ -234,9 +234,9 @@ class MadeShard(NamedTuple):
 
     entry: ShardEntry
     path: Path
+    #: Content of its files by their relative paths ("." for a shard that is one file);
+    #: None if the shard stands in the staging folder of the job.
     files: dict[str, bytes] | None = None
-    """Content of its files by their relative paths ("." for a shard that is one file);
-    None if the shard stands in the staging folder of the job."""
 
 
 @dataclass(frozen=True)
@@ -302,18 +302,16 @@ class ShardWork:
 
         job, layout = self.job, trajectory_format(self.job.format)
         seeds = [job.seed + episode for episode in episodes]
-        trajectories = drive_episodes(
-            job.scenario, job.controller, seeds, progress=progress
-        )
+        driven = drive_episodes(job.scenario, job.controller, seeds, progress=progress)
         if job.estimator is not None:
             name_of = job.estimator
-            trajectories = [with_beliefs(each, name_of) for each in trajectories]
+            driven = [with_beliefs(each, name_of) for each in driven]
         number = episodes.start // job.episodes_per_shard
         path = folder / f"shard_{number:05d}{layout.ENDING}"
         options = {name: getattr(job, name) for name in layout.OPTIONS}
-        layout.write(trajectories, path, **options)
+        layout.write(driven, path, **options)
         count = len(episodes)
-        entry = ShardEntry(path.name, episodes.start, count, checksum(path))
+        entry = ShardEntry(path.name, episodes.start, count, digest(path))
         return MadeShard(entry, path)
 
 

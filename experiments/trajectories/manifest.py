@@ -78,7 +78,7 @@ class ShardEntry:
     first_episode, episodes : int
         First episode, and number of episodes.
     sha256 : str
-        Its `checksum`.
+        Its `digest`.
     """
 
     name: str
@@ -156,29 +156,25 @@ def _manifest(table: dict[str, Any]) -> Manifest:
     if "estimator" in job and job["estimator"] is not None:
         texts.append("estimator")
     job = _checked(job, texts, seed=0, episodes=1, episodes_per_shard=1)
-    shards = [
-        _checked(each, ["sha256"], first_episode=0, episodes=0) for each in shards
-    ]
+    shards = [_checked(one, ["sha256"], first_episode=0, episodes=0) for one in shards]
     return Manifest(
         job=Job(**{**job, "scenario": scenario_from_text(job["scenario"])}),
         versions=dict(table["versions"]),
-        shards=tuple(ShardEntry(**each) for each in shards),
+        shards=tuple(ShardEntry(**one) for one in shards),
     )
 
 
-def _checked(
-    table: dict[str, Any], texts: Iterable[str], **least: int
-) -> dict[str, Any]:
-    """Return a table with some texts, and with some integers of a least value."""
+def _checked(row: dict[str, Any], texts: Iterable[str], **least: int) -> dict[str, Any]:
+    """Return a row with some texts, and with some integers of a least value."""
     for name in texts:
-        if not isinstance(table[name], str):
-            raise ValueError(f"{name} must be text, got {table[name]!r}")
+        if not isinstance(row[name], str):
+            raise ValueError(f"{name} must be text, got {row[name]!r}")
     for name, lowest in least.items():
-        integer(name, table[name], lowest)
-    return table
+        integer(name, row[name], lowest)
+    return row
 
 
-def checksum(path: Path) -> str:
+def digest(path: Path) -> str:
     """Compute the SHA-256 of a shard.
 
     For a folder it is the SHA-256 of the output of ``sha256sum`` for its files, named
@@ -326,6 +322,6 @@ def _unfinished(dataset: TrajectoryDataset) -> str:
 def is_whole(folder: Path, shard: ShardEntry) -> bool:
     """Whether a shard has the checksum in the manifest."""
     try:
-        return checksum(folder / shard.name) == shard.sha256
+        return digest(folder / shard.name) == shard.sha256
     except OSError:
         return False

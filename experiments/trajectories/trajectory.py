@@ -83,10 +83,10 @@ class Trajectory:
 
 
 _NAMES = tuple(field.name for field in fields(Trajectory))
+#: The names of the arrays of a drive.
 ARRAYS = _NAMES[_NAMES.index("start_estimate") : _NAMES.index("belief_poses")]
-"""The names of the arrays of a drive."""
+#: The names of the arrays of what a filter believes during it.
 BELIEFS = _NAMES[_NAMES.index("belief_poses") :]
-"""The names of the arrays of what a filter believes during it."""
 
 
 @lru_cache(maxsize=8)

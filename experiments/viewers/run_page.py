@@ -254,20 +254,15 @@ def _inline_json(value: Any) -> Markup:
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c"))
 
 
+#: What became of a reading; its code is the place in this list.
 OUTCOMES = (
-    "not used",
-    "used",
-    "new",
-    "rejected",
-    "too close",
-    "tentative",
-    "ambiguous",
+    *("not used", "used", "new", "rejected"),
+    *("too close", "tentative", "ambiguous"),
 )
-"""What became of a reading; its code is the place in this list."""
+#: In place of the landmark of a reading that was given to none.
 NO_ID = -1
-"""In place of the landmark of a reading that was given to none."""
+#: Landmarks of the largest map whose correlations are kept.
 MOST_CORRELATED = 300
-"""Landmarks of the largest map whose correlations are kept."""
 
 _UNUSED, _USED, _NEW, _REJECTED, _SKIPPED, _TENTATIVE, _AMBIGUOUS = range(7)
 _MOST_FRAMES = 2000
@@ -278,26 +273,26 @@ _MOST_PAIRS = 2_000_000  # summed over the frames with correlations
 class MapFrame(NamedTuple):
     """The map after one step, and what became of the scan's readings."""
 
+    #: Landmarks, shape (n,).
     ids: IntArray
-    """Landmarks, shape (n,)."""
+    #: Shape (n, 2) [m].
     means: Array
-    """Shape (n, 2) [m]."""
+    #: Shape (n, 2, 2) [m²].
     covariances: Array
-    """Shape (n, 2, 2) [m²]."""
+    #: Of each reading, its place in `OUTCOMES`, shape (m,).
     outcomes: NDArray[np.uint8]
-    """Of each reading, its place in `OUTCOMES`, shape (m,)."""
+    #: The mapped landmark of each reading, or `NO_ID`, shape (m,).
     row_ids: IntArray
-    """The mapped landmark of each reading, or `NO_ID`, shape (m,)."""
 
 
 class CorrelationFrame(NamedTuple):
     """The correlations after one step: of the robot's position and n landmarks."""
 
+    #: Landmarks, shape (n,).
     ids: IntArray
-    """Landmarks, shape (n,)."""
+    #: In [0, 1]: of row 1 with column 0, 2 with 0, 2 with 1, …, shape (n (n + 1) / 2,).
+    #: The robot is row 0.
     values: Array
-    """In [0, 1]: of row 1 with column 0, 2 with 0, 2 with 1, …, shape (n (n + 1) / 2,).
-    The robot is row 0."""
 
 
 class RunFrames:
@@ -328,10 +323,10 @@ class RunFrames:
         last = len(self._scans) - 1
         self._maps = ThinnedSteps[MapFrame](_MOST_FRAMES, _MOST_LANDMARKS, last)
         self._pairs = ThinnedSteps[CorrelationFrame](_MOST_FRAMES, _MOST_PAIRS, last)
+        #: Landmarks of the largest map.
         self.largest = 0
-        """Landmarks of the largest map."""
+        #: Whether the filter joins its map on demand; then the frames hold no map.
         self.joins = False
-        """Whether the filter joins its map on demand; then the frames hold no map."""
 
     @property
     def maps(self) -> dict[int, MapFrame]:
@@ -456,10 +451,10 @@ def _largest_singular_values(A: Array) -> Array:
 # The arrays become integers or single-precision numbers. Arrays of successive frames
 # hold differences to the frame before, which deflate shrinks; ``data.js`` unpacks them.
 
+#: Positions are integers of a tenth of a millimetre.
 TENTHS = 1e4
-"""Positions are integers of a tenth of a millimetre."""
+#: Standard deviations σ are integers of 2000 ln σ, a resolution of 0.05 %.
 LOG_STEPS = 2000.0
-"""Standard deviations σ are integers of 2000 ln σ, a resolution of 0.05 %."""
 
 _ALIGNMENT = 4  # [bytes] of the page's typed arrays
 _TYPES = ("float32", "int32", "int16", "uint8")
@@ -478,8 +473,8 @@ class PackedArrays:
     """
 
     def __init__(self) -> None:
+        #: Type, length and, of frames, the name of their numbers of entries.
         self.table: dict[str, dict[str, Any]] = {}
-        """Type, length and, of frames, the name of their numbers of entries."""
         self._parts: list[bytes] = []
 
     def put(self, name: str, values: AnyArray, kind: str) -> None:
@@ -530,10 +525,10 @@ def deviation_codes(std: Array) -> AnyArray:
 class ViewedRun(NamedTuple):
     """One filter's run over the log of the page."""
 
+    #: Its beliefs; its name labels the filter.
     trace: RunTrace
-    """Its beliefs; its name labels the filter."""
+    #: What it watched of the same replay.
     frames: RunFrames
-    """What it watched of the same replay."""
 
 
 def shown_steps(frames: Sequence[RunFrames]) -> list[int]:

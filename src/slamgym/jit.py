@@ -144,11 +144,11 @@ def _emitted_fma(_typing: Any, _a: Any, _b: Any, _c: Any) -> tuple[Any, Any]:
 
 # A compiler that is free to fuse (``fastmath``) does so depending on what is inlined
 # where.  One kernel would then give different bits alone and inside another kernel.
+#: a b + c, rounded once; twice in plain Python.
 fma = cast(
     "Callable[[float, float, float], float]",
     (lambda a, b, c: a * b + c) if _PLAIN else intrinsic(_emitted_fma),
 )
-"""a b + c, rounded once; twice in plain Python."""
 
 
 def _multiply_words(a: np.uint64, b: np.uint64) -> tuple[np.uint64, np.uint64]:
@@ -184,16 +184,16 @@ def _emitted_sum(_typing: Any, _a: Any, _b: Any) -> tuple[Any, Any]:
 
 
 _ALL_BITS = 2**64 - 1
+#: The high and the low half of the product of two words of 64 bits.
 multiply_words = cast(
     "Callable[[np.uint64, np.uint64], tuple[np.uint64, np.uint64]]",
     _multiply_words if _PLAIN else intrinsic(_emitted_product),
 )
-"""The high and the low half of the product of two words of 64 bits."""
+#: a + b modulo 2⁶⁴.
 add_words = cast(
     "Callable[[np.uint64, np.uint64], np.uint64]",
     _add_words if _PLAIN else intrinsic(_emitted_sum),
 )
-"""a + b modulo 2⁶⁴."""
 
 
 # --------------------------------------------------------------------------------------
@@ -207,8 +207,8 @@ _NUMBA: Any = numba
 _RESULT: Any = compiler.CompileResult
 _dumps: Any = serialize.dumps  # what numba's own cache uses, too
 
+#: Size of the folder above which the kernels go that nobody has used for longest.
 MAX_BYTES = 256 * 2**20
-"""Size of the folder above which the kernels go that nobody has used for longest."""
 _USER_CACHES = {"win32": "~/AppData/Local", "darwin": "~/Library/Caches"}
 _DAY = 86400.0
 _DIGEST = hashlib.sha256().digest_size
@@ -419,8 +419,8 @@ def _states(folder: Path) -> Iterator[tuple[float, int, Path]]:
 # The loaded code counts, not files: dates, folders and edits after the import play no
 # part.  Two checkouts with equal kernels have equal fingerprints.
 
+#: Named, with the versions of numba and numpy; not followed into their sources.
 LIBRARIES = {"builtins", "math", "numba", "numpy"}
-"""Named, with the versions of numba and numpy; not followed into their sources."""
 
 _VALUES = (bool, int, float, complex, str, bytes, type(None), type(...), np.generic)
 _UNRELATED = ("NUMBA_CACHE", "NUMBA_DEBUG", "NUMBA_NUM_THREADS")

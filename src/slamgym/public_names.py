@@ -58,6 +58,7 @@ def listed(file: Path) -> dict[str, str]:
     return names
 
 
+#: Modules that no longer exist, and where their names are now.
 MOVED = {
     "envs.sensors": "envs",
     "estimator.belief": "estimator.interface",
@@ -77,7 +78,6 @@ MOVED = {
     "sim_configs.scenario_errors": "sim_configs.field_types",
     "sim_configs.scenario_parts": "sim_configs.scenario",
 }
-"""Modules that no longer exist, and where their names are now."""
 
 
 class _MovedModules(MetaPathFinder, Loader):

@@ -4,26 +4,27 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+#: What `Restorable.state` returns; it stays as it is, whatever the object does.
 State = tuple[Any, ...]
-"""What `Restorable.state` returns; it stays as it is, whatever the object does."""
 
 
 class Restorable:
     """An object that can return to a state that it has had.
 
-    A subclass lists the attributes that change. Arrays and generators are copied, also
-    in tuples and dictionaries, and so are lists, whose elements never change.
+    A subclass names the attributes that change in `changing`. Arrays and generators are
+    copied, also in tuples and dictionaries, and so are lists, whose elements never
+    change.
     """
 
-    _changing: ClassVar[tuple[str, ...]]
+    changing: ClassVar[tuple[str, ...]]
 
     def state(self) -> State:
         """Return the present state, for `restore`."""
-        return tuple(copied(getattr(self, name)) for name in self._changing)
+        return tuple(copied(getattr(self, name)) for name in self.changing)
 
     def restore(self, state: State) -> None:
         """Return to a state of this object, which stays usable for further calls."""
-        for name, value in zip(self._changing, state, strict=True):
+        for name, value in zip(self.changing, state, strict=True):
             if not put_back(getattr(self, name), value):
                 setattr(self, name, copied(value))
 

@@ -253,10 +253,7 @@ class NeverGrowsCertain(EkfSlam):
         (CountsItsLandmarks, r"ids given to update\(\), here 9 and 4, got \(0, 1\)"),
         (IsSkewed, "must be symmetric, got elements that differ by 0.001"),
         (IsNegative, "must be positive semidefinite, got the eigenvalue -0.0"),
-        (
-            lambda: None,
-            r"<lambda>\(motion_std=.* raised TypeError: .* unexpected",
-        ),
+        (lambda: None, r"<lambda>\(motion_std=.* raised TypeError: .* unexpected"),
         (3, r"raised TypeError: 'int' object is not callable"),
     ],
 )
@@ -277,10 +274,7 @@ def test_a_breach_of_the_contract_is_named(estimator, complaint):
         (SavesLiveArrays, r"state_dict\(\) must return copies"),
         (SavesALiveReference, r"state_dict\(\) must return copies"),
         (LoadsTheMeanItself, r"load_state_dict\(\) must copy"),
-        (
-            SavesADictionary,
-            r"what numpy\.savez saves and loads, got ValueError: Ob",
-        ),
+        (SavesADictionary, r"what numpy\.savez saves and loads, got ValueError: Ob"),
         (ReportsNothing, r"new landmarks in added_ids, got UpdateReport: NIS 0"),
         (ReportsNothing, r"the 4 readings used: .*, got \(\) and 0"),
         (RemembersItsRuns, r"reset\(\) should forget the run"),

@@ -166,11 +166,7 @@ def test_readings_of_lost_landmarks_are_not_associated_with_them():
 
 def test_lost_landmarks_are_not_missing():
     view = {"max_range": 20.0}
-    changes = {
-        "view": view,
-        "remove_after": 2,
-        "constellations": EIGHT,
-    }
+    changes = {"view": view, "remove_after": 2, "constellations": EIGHT}
     slam, _, _ = lost_and_seen_again(scans=4, **changes)
     assert len(slam.landmark_ids) == 14
 

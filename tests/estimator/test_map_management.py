@@ -812,10 +812,7 @@ def test_a_replay_of_submaps_tells_what_they_could_say_at_once():
         replay(
             log,
             settings_for(
-                log,
-                estimator=name,
-                **noise,
-                options={**options, "management": NEAREST},
+                log, estimator=name, **noise, options={**options, "management": NEAREST}
             ).make((0, 0, 0)),
         )
         for name, options in (("invariant", {}), ("submaps", SMALL))

@@ -210,14 +210,8 @@ def test_more_landmarks_than_the_final_belief_may_hold_are_refused_before_the_ru
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        (
-            "run",
-            r"the \d+ landmarks that loop reads takes .* take fewer steps",
-        ),
-        (
-            "monte-carlo",
-            r"64 runs of \d+ scans .* take fewer runs at a time",
-        ),
+        ("run", r"the \d+ landmarks that loop reads takes .* take fewer steps"),
+        ("monte-carlo", r"64 runs of \d+ scans .* take fewer runs at a time"),
     ],
 )
 def test_a_command_says_in_one_line_that_memory_will_not_suffice(

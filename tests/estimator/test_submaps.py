@@ -390,9 +390,7 @@ def test_elimination_solves_what_a_dense_solver_solves(count):
     rows = rng.normal(size=(4, size)) * (rng.random((4, size)) < 0.2)
     np.testing.assert_allclose(done.solution(), np.linalg.solve(H, g), atol=1e-8)
     np.testing.assert_allclose(
-        done.covariance(csc_array(rows)),
-        rows @ np.linalg.solve(H, rows.T),
-        atol=1e-8,
+        done.covariance(csc_array(rows)), rows @ np.linalg.solve(H, rows.T), atol=1e-8
     )
     assert done.decrement() == pytest.approx(g @ np.linalg.solve(H, g))
     assert done.cost == count

@@ -11,6 +11,7 @@ import pytest
 from commands import slamgym
 from matplotlib.figure import Figure
 from PIL import Image
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from slamgym import jit as kernel_cache
@@ -890,6 +891,13 @@ def test_help_fits_into_80_columns_with_an_example(command, monkeypatch):
     assert "Usage:" in text
     assert max(map(len, text.splitlines())) <= 80
     assert f"slamgym {command} " in text.partition("Examples:")[2] + " "
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_of_a_command_has_a_help(command):
+    parameters = get_command(main).commands[command].params
+    assert parameters
+    assert not [each.name for each in parameters if not (each.help or "").strip()]
 
 
 def test_submaps_may_lie_in_a_folder(here, without_pictures):

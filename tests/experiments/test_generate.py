@@ -43,7 +43,7 @@ from slamgym.experiments.trajectories.generate import (
 )
 from slamgym.experiments.trajectories.manifest import (
     DamagedShardError,
-    checksum,
+    digest,
     load_trajectories,
     read_manifest,
 )
@@ -166,7 +166,7 @@ def test_the_checksum_of_a_folder_is_that_of_what_sha256sum_prints(tmp_path):
         capture_output=True,
         check=True,
     ).stdout
-    assert checksum(shard) == hashlib.sha256(listing).hexdigest()
+    assert digest(shard) == hashlib.sha256(listing).hexdigest()
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -197,7 +197,7 @@ def test_a_worker_that_does_not_see_the_folder_sends_its_files(tmp_path):
         assert made.files
         staging.mkdir()
         staged = fetched(pickle.loads(pickle.dumps(made)), staging)
-        assert checksum(staged) == made.entry.sha256
+        assert digest(staged) == made.entry.sha256
         assert made.entry == read_manifest(tmp_path / name).shards[1]
 
 
@@ -364,11 +364,11 @@ def test_a_damaged_shard_is_named_and_the_others_are_usable(name, tmp_path):
         assert [drive.seed for drive in skipping] == [5, 6, 7, 11]
     assert skipping.damaged_shards() == [shards[1].name]
     assert [drive.seed for drive in skipping.shard(2)] == [11]
-    damaged = checksum(out / shards[1].name)
+    damaged = digest(out / shards[1].name)
     with pytest.warns(UserWarning, match=rf"{shards[1].name} does not .*\.aside"):
         small(out, format=name)  # repairs
     aside = out / f"{shards[1].name}.aside"
-    assert checksum(aside) == damaged
+    assert digest(aside) == damaged
     aside.rename(tmp_path / "aside")
     assert tree(out) == before
 

@@ -11,13 +11,7 @@ import numpy as np
 import pytest
 from commands import slamgym
 
-from slamgym import (
-    judge,
-    load_scenario,
-    load_trajectories,
-    make_estimator,
-    monte_carlo,
-)
+from slamgym import judge, load_scenario, load_trajectories, make_estimator, monte_carlo
 from slamgym.estimator.models.rigid_motion import invariant_covariance, invariant_error
 from slamgym.evaluation.nees import normalised_squared_error
 from slamgym.experiments import (
@@ -424,10 +418,7 @@ def test_additive_covariances_are_those_of_a_numeric_jacobian(frame):
 
 
 BROKEN = {
-    "missing": (
-        lambda lines: None,
-        "there is no file of estimates",
-    ),
+    "missing": (lambda lines: None, "there is no file of estimates"),
     "short": (
         lambda lines: lines[:-1],
         "it has no pose for 1 of the steps 0 to 29, first for step 29",

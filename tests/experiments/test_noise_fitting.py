@@ -165,10 +165,7 @@ def test_a_factor_beyond_those_tried_is_open(ratios, factor):
         ((1.14, 0.609, 3.0), "by 1.14 (0.61 to 3) for a pose NEES of 1"),
         ((1.14, 0.0, None), "by 1.14 (not known better) for a pose NEES of 1"),
         ((None, 9.0, None), "no factor of σβ and σr up to 16 gives a pose NEES of 1"),
-        (
-            (0.0, 0.0, 0.5),
-            "σβ and σr times 0.25 give a pose NEES below 1",
-        ),
+        ((0.0, 0.0, 0.5), "σβ and σr times 0.25 give a pose NEES below 1"),
     ],
 )
 def test_the_advice_states_open_ends_and_what_remains(found, text):

@@ -314,17 +314,16 @@ def move(
     evaluated from x̄ to the predicted position x̂⁻, which then becomes the new x̄:
     G = I + (J (x̂⁻ − x̄), 0) e_θᵀ.
     """
-    motion = predict_pose(pose.mean, moved)
-    G, F = motion.jacobian_pose, motion.jacobian_noise
+    predicted = predict_pose(pose.mean, moved)
+    G, F = predicted.jacobian_pose, predicted.jacobian_noise
     if not from_mean:
-        way = motion.pose[:2] - pose.reference
+        way = predicted.pose[:2] - pose.reference
         G = G.copy()
         G[:2, 2] = -way[1], way[0]
     covariance = G @ pose.covariance @ G.T + (F * variance) @ F.T
     covariance = (covariance + covariance.T) / 2
-    return ConditionalPose(
-        motion.pose, G @ pose.gain, covariance, motion.pose[:2].copy()
-    )
+    reached = predicted.pose
+    return ConditionalPose(reached, G @ pose.gain, covariance, reached[:2].copy())
 
 
 def marginalise_pose(pose: ConditionalPose, scan: LinearScan) -> tuple[Array, Array]:
@@ -337,7 +336,7 @@ def marginalise_pose(pose: ConditionalPose, scan: LinearScan) -> tuple[Array, Ar
 
 
 def correct(
-    pose: ConditionalPose, scan: LinearScan
+    old: ConditionalPose, scan: LinearScan
 ) -> tuple[ConditionalPose, MapMeasurement]:
     """Condition on measurements.
 
@@ -346,17 +345,14 @@ def correct(
         H = H_l + H_p K,  N = Q + H_p Ω H_pᵀ = L Lᵀ,  Y = L⁻¹ H,  V = L⁻¹ H_p Ω
         Λ ← Λ + Yᵀ Y,  μ_p ← μ_p + Vᵀ L⁻¹ ν,  K ← K − Vᵀ Y,  Ω ← Ω − Vᵀ V
     """
-    H, N = marginalise_pose(pose, scan)
+    H, N = marginalise_pose(old, scan)
     L = np.linalg.cholesky(N)
     H_p = scan.jacobian_pose.reshape(-1, 3)
-    right = np.column_stack([H, scan.innovation.ravel(), H_p @ pose.covariance])
+    right = np.column_stack([H, scan.innovation.ravel(), H_p @ old.covariance])
     white = solve_triangular(L, right, lower=True, check_finite=False)
     Y, w, V = white[:, :-4], white[:, -4], white[:, -3:]
     corrected = ConditionalPose(
-        pose.mean + V.T @ w,
-        pose.gain - V.T @ Y,
-        pose.covariance - V.T @ V,
-        pose.reference,
+        old.mean + V.T @ w, old.gain - V.T @ Y, old.covariance - V.T @ V, old.reference
     )
     return corrected, MapMeasurement(Y, w)
 
@@ -391,9 +387,7 @@ def relocate(
     return moved, MapMeasurement(Q[:, 3:].T @ Y, Q[:, 3:].T @ w)
 
 
-def cut_links(
-    pose: ConditionalPose, information: Array, weak: BoolArray
-) -> ConditionalPose:
+def cut_links(pose: ConditionalPose, matrix: Array, weak: BoolArray) -> ConditionalPose:
     """Remove the links between the pose and weak landmarks, as the SEIF does.
 
     The weak landmarks w are marginalised out of p | m with all passive landmarks fixed
@@ -407,9 +401,9 @@ def cut_links(
     dropped = np.repeat(weak, 2)
     stays = pose.is_linked.repeat(2) & ~dropped
     K_w = pose.gain[:, dropped]
-    moved = np.linalg.solve(information[np.ix_(dropped, dropped)], K_w.T)
+    moved = np.linalg.solve(matrix[np.ix_(dropped, dropped)], K_w.T)
     gain = np.zeros_like(pose.gain)
-    gain[:, stays] = pose.gain[:, stays] - moved.T @ information[np.ix_(dropped, stays)]
+    gain[:, stays] = pose.gain[:, stays] - moved.T @ matrix[np.ix_(dropped, stays)]
     added = K_w @ moved
     return pose._replace(gain=gain, covariance=pose.covariance + (added + added.T) / 2)
 

@@ -15,12 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import lapack, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
-from ...filters.ekf import (
-    EkfSlam,
-    FirstEstimatesEkfSlam,
-    ObservabilityConstrainedEkfSlam,
-    reading_variances,
-)
+from ...filters import ekf
 from ...filters.gaussian_map import not_positive_definite
 from ...interface import UpdateReport
 from ...models.bearing_range import locate_landmark, predict_measurement, wrap_angle
@@ -96,7 +91,7 @@ def process_scan(
     local, pose = state
     seen, added = screened.scan.landmarks, free_slots[: len(new)]
     if len(new):
-        variance = reading_variances(rules.rules, readings[new, 1])
+        variance = ekf.reading_variances(rules.rules, readings[new, 1])
         local, pose = add_landmarks(rules.base, state, added, readings[new], variance)
         count = len(local.slots)
         seen = np.append(seen, np.arange(count - len(new), count))
@@ -188,8 +183,8 @@ class ScanRules:
         if unknown:
             raise TypeError(f"SparseInformationSlam has no option {min(unknown)!r}")
         noise = np.array(motion_std), np.array(measurement_std)
+        #: Makes the filter of the same belief in dense form.
         self.dense = partial(BASES[base], *noise, **settings)
-        """Makes the filter of the same belief in dense form."""
         self.rules = self.dense().rules
         at_rest = settings.get("noise_at_rest", True)
         motion = settings.get("motion", UNICYCLE)
@@ -218,7 +213,7 @@ class ScanRules:
         kept = ~skipped
         places, readings = places[kept], readings[kept]
         at = readings[:, 1] if self.rules.noise_as_read else expected[kept]
-        variance = reading_variances(self.rules, at)
+        variance = ekf.reading_variances(self.rules, at)
         scan = linearise_scan(self.base, local, pose, places, readings, variance)
         S = _innovation_covariance(pose, local, scan)
         blocks = np.array(
@@ -283,10 +278,10 @@ def _factor(S: Array, ids: list[int]) -> Array:
 # either.
 
 ESTIMATE, FIRST, CONSTRAINED = "ekf", "first_estimates", "observability_constrained"
-BASES: dict[str, type[EkfSlam]] = {
-    ESTIMATE: EkfSlam,
-    FIRST: FirstEstimatesEkfSlam,
-    CONSTRAINED: ObservabilityConstrainedEkfSlam,
+BASES: dict[str, type[ekf.EkfSlam]] = {
+    ESTIMATE: ekf.EkfSlam,
+    FIRST: ekf.FirstEstimatesEkfSlam,
+    CONSTRAINED: ekf.ObservabilityConstrainedEkfSlam,
 }
 
 

@@ -4,8 +4,6 @@
 its belief to a saved state and back.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from math import inf
 from typing import Any
@@ -492,7 +490,7 @@ def checked_state(state: Mapping[str, Any], name: str, base: str) -> SparseBelie
                 f"state[{key!r}] must lie in [0, {end}), got {places.min()} to "
                 f"{places.max()}"
             )
-    _load_dissection(saved, map_, local["slots"])
+    _load_order(saved, map_, local["slots"])
     belief = SparseBelief(
         slots,
         free,
@@ -545,9 +543,7 @@ def _eliminated(
     return SchurComplement(**around, factor=factor)
 
 
-def _load_dissection(
-    saved: Mapping[str, Any], map_: SparseMap, local: IntArray
-) -> None:
+def _load_order(saved: Mapping[str, Any], map_: SparseMap, local: IntArray) -> None:
     """Load the elimination order; insert landmarks that it does not contain."""
     matrix, nodes = map_.information, saved["nodes"]
     if (nodes >= 2**50).any():

@@ -63,8 +63,8 @@ class ClosedSubmaps:
         self.store, self._frame = store, frame
         self.renamed = dict(renamed or {})
         self.summaries = list(summaries)
+        #: Slots of the landmarks in the submaps, including links.
         self.slots: set[int] = set().union(*(s.slots.tolist() for s in summaries))
-        """Slots of the landmarks in the submaps, including links."""
         self._initialisation = initialisation or FrameInitialisation()
         self._joined: JoinedMap | None = None
         self._whole: tuple[IntArray, Gaussian] | None = None
@@ -347,11 +347,7 @@ class Neighbourhood:
         if self._copy is None or ids is None:
             return
         refused = {*report.rejected_ids, *report.skipped_ids}
-        used = {
-            row: i
-            for row, i in enumerate(np.asarray(ids).ravel().tolist())
-            if i not in refused
-        }
+        used = {k: i for k, i in enumerate(np.ravel(ids).tolist()) if i not in refused}
         if used:
             readings = np.asarray(measurements)[list(used)]
             self._correct(self._copy, readings, list(used.values()), report.added_ids)

@@ -116,12 +116,10 @@ def retract(mean: Array, error: Array, frame: ErrorFrame) -> Array:
     return state_of(points, float(mean[2]) + turn)
 
 
-def regularised(covariance: Array) -> Array:
+def regularised(P: Array) -> Array:
     """Return a covariance with an increased diagonal, so that it can be solved with."""
-    largest = float(np.max(np.diagonal(covariance)))
-    return covariance + np.eye(len(covariance)) * max(
-        SMALLEST_RATIO**2 * largest, 1e-18
-    )
+    largest = float(np.max(np.diagonal(P)))
+    return P + np.eye(len(P)) * max(SMALLEST_RATIO**2 * largest, 1e-18)
 
 
 def whitened(covariance: Array, columns: Array) -> Array:

@@ -58,8 +58,8 @@ class SubmapGraph:
     ) -> None:
         self.index, self.chain = index, chain
         self.closed, self.active = closed, active
+        #: Whether the active submap is full, but could not be written.
         self.is_overdue = False
-        """Whether the active submap is full, but could not be written."""
 
     @property
     def pose(self) -> Array:
@@ -196,10 +196,7 @@ class SubmapGraph:
 
 
 def fuse(
-    world: Gaussian,
-    local: Gaussian,
-    frame: ErrorFrame,
-    common: tuple[IntArray, IntArray],
+    world: Gaussian, local: Gaussian, frame: ErrorFrame, both: tuple[IntArray, IntArray]
 ) -> Gaussian:
     """Fuse the active submap with the map.
 
@@ -212,7 +209,7 @@ def fuse(
         error in ``frame``, that of ``world`` to the additive error.
     frame : {"additive", "invariant"}
         Coordinates of the local error.
-    common : tuple of two ndarrays
+    both : tuple of two ndarrays
         Positions of the common landmarks in both.
 
     Returns
@@ -224,11 +221,11 @@ def fuse(
     mean, own, cut = world.mean, local.mean, len(world.mean)
     V = np.empty((0, cut + len(own)))
     start = _in_invariant(world, np.arange(3))
-    if len(common[0]):
-        A, innovation = _difference(mean, own, frame, common)
-        seen = np.concatenate([start, _in_invariant(world, 3 + pairs(common[0]))])
+    if len(both[0]):
+        A, innovation = _difference(mean, own, frame, both)
+        seen = np.concatenate([start, _in_invariant(world, 3 + pairs(both[0]))])
         AP = np.hstack([A[:, : len(seen)] @ seen, A[:, len(seen) :] @ local.covariance])
-        used = np.r_[0:3, 3 + pairs(common[0]), cut : cut + len(own)]
+        used = np.r_[0:3, 3 + pairs(both[0]), cut : cut + len(own)]
         S = AP[:, used] @ A.T
         lower = _root((S + S.T) / 2)
         V = solve_triangular(
@@ -238,7 +235,7 @@ def fuse(
         mean = retract(mean, step[:cut], "invariant")
         own = retract(own, step[cut:], frame)
     moved = Gaussian(own, block_diag(start, local.covariance))
-    return _composed(world, mean, moved, V, (frame, common[1]))
+    return _composed(world, mean, moved, V, (frame, both[1]))
 
 
 def _in_invariant(world: Gaussian, rows: IntArray) -> Array:
@@ -399,8 +396,8 @@ class ActiveSubmap:
 
     def __init__(self, slam: EkfSlam) -> None:
         self.filter = slam
+        #: Coordinates of the error.
         self.frame = FRAMES[slam.rules.frame]
-        """Coordinates of the error."""
 
     def begin(self) -> None:
         """Begin a new submap, with the robot at the origin of the frame."""
@@ -509,8 +506,8 @@ class Chain:
     def __init__(self, pose: Array, covariance: Array) -> None:
         self.start = (pose.copy(), covariance.copy())
         self.pose, self.covariance = self.start
+        #: Frames of the last join, shape (J + 1, 3).
         self.joined = pose[None].copy()
-        """Frames of the last join, shape (J + 1, 3)."""
 
     def extend(self, pose: Array, covariance: Array) -> None:
         """Append a submap by its last pose, shape (3,), and that pose's covariance."""

@@ -154,14 +154,12 @@ class JoinedMap:
         J, w = W[:, :-1], W[:, -1]
         return J.T @ J, -J.T @ w, float(w @ w)
 
-    def _error(self, index: int, mean: Array) -> FactorError:
+    def _error(self, k: int, mean: Array) -> FactorError:
         """Return the error of the shared part of a submap, and its Jacobian."""
-        points = self._points[self._shared[index]].ravel()
-        world = np.concatenate([self.frames[index + 1], points])
-        error, jacobian = factor_error(
-            self.frames[index], world, mean, self._error_frame
-        )
-        return FactorError(error, jacobian if index else jacobian[:, 3:])
+        points = self._points[self._shared[k]].ravel()
+        world = np.concatenate([self.frames[k + 1], points])
+        error, jacobian = factor_error(self.frames[k], world, mean, self._error_frame)
+        return FactorError(error, jacobian if k else jacobian[:, 3:])
 
     def _unknowns(self, index: int) -> IntArray:
         """Return the unknowns of a submap: two frames, one if it is the first."""

@@ -3,8 +3,6 @@
 `SubmapSlam` is the public filter. `SubmapQueries` is the part of it that only reads.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -433,9 +431,7 @@ STATE: saved_states.Table = {
 }
 
 
-def as_arrays(
-    name: str, graph: SubmapGraph, vicinity: Mapping[str, Any]
-) -> dict[str, Any]:
+def as_arrays(name: str, graph: SubmapGraph, near: Mapping[str, Any]) -> dict[str, Any]:
     """Return copies of the whole state; submaps in a folder by their checksums."""
     index, closed, store = graph.index, graph.closed, graph.closed.store
     local = graph.active.filter.state_dict()
@@ -450,7 +446,7 @@ def as_arrays(
         "submap_count": np.array(len(store)),
         "run": np.array(""),
     }
-    state |= with_prefix("local", local, "_") | with_prefix("vicinity", vicinity, "_")
+    state |= with_prefix("local", local, "_") | with_prefix("vicinity", near, "_")
     state |= with_prefix("chain", graph.chain.state_dict(), "_")
     if isinstance(store, FolderStore):
         digests = np.array(store.digests, dtype=np.int64)

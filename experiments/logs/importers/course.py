@@ -28,8 +28,8 @@ from ..slamlog import (
     wrap_bearing,
 )
 
+#: Ground truth that the homework prints for the six landmarks of its log [m].
 PUBLISHED_LANDMARKS = np.array([[3, 6], [3, 12], [7, 8], [7, 14], [11, 6], [11, 12.0]])
-"""Ground truth that the homework prints for the six landmarks of its log [m]."""
 MATCH_DISTANCE = 1.0  # [m]
 
 

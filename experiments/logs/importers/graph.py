@@ -160,8 +160,8 @@ def reals_at(line: LogLine, first: int, end: int | None = None) -> list[float]:
 # * A file with ``VERTEX2`` lines is TORO's, whose ``EDGE2`` lines hold Ω in the order
 #   xx, xy, yy, θθ, xθ, yθ.
 
+#: Relative difference of standard deviations up to which they count as equal.
 ALIKE = 1e-3
-"""Relative difference of standard deviations up to which they count as equal."""
 
 G2O, ISAM, TORO = "g2o", "iSAM", "TORO"
 _ROWS = {2: (0, 1, 1, 2), 3: (0, 1, 2, 1, 3, 4, 2, 4, 5)}
