@@ -182,7 +182,7 @@ class MapFilter:
         checked = saved_states.read(state, MAP_STATE, of=name)
         if self.waiting is not None:
             checked |= read_waiting(state, checked["landmark_ids"])
-        self.restore(checked)
+        MapFilter.restore(self, checked)  # a subclass may need entries of its own
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state that this process has saved, without checks."""
