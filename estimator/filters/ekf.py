@@ -350,7 +350,11 @@ class EkfSlam(MapFilter):
             dt, and dt = 0 adds none.
         """
         noise, weight = self._motion_noise, 1.0
-        moved = noise.motion.moved(odometry)
+        if noise.motion is UNICYCLE:  # a tenth of a prediction faster
+            distance, turn = argument_checks.pair("odometry", odometry)
+            moved = distance, 0.0, turn
+        else:
+            moved = noise.motion.moved(odometry)
         if not (type(dt) is float and dt == 1.0 and noise.at_rest):
             weight = noise.weight(moved, dt)
         move_pose(self.map.block, *moved, weight)
