@@ -351,13 +351,13 @@ class EkfSlam(MapFilter):
         """
         noise, weight = self._motion_noise, 1.0
         if noise.motion is UNICYCLE:  # a tenth of a prediction faster
-            distance, turn = argument_checks.pair("odometry", odometry)
-            moved = distance, 0.0, turn
+            forward, turn = argument_checks.pair("odometry", odometry)
+            sideways = 0.0
         else:
-            moved = noise.motion.moved(odometry)
+            forward, sideways, turn = noise.motion.moved(odometry)
         if not (type(dt) is float and dt == 1.0 and noise.at_rest):
-            weight = noise.weight(moved, dt)
-        move_pose(self.map.block, *moved, weight)
+            weight = noise.weight((forward, sideways, turn), dt)
+        move_pose(self.map.block, forward, sideways, turn, weight)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
