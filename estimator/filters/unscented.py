@@ -98,7 +98,8 @@ class UnscentedSlam(EkfSlam):
 
     def _read_distance(self, reading: Array) -> float:
         """Return the distance of a landmark by its reading [m]; infinite if unknown."""
-        return for_sensor(read_distance_jit, self.sensor)(reading[0], reading[1])
+        read = for_sensor(read_distance_jit, self.sensor)
+        return float(read(reading[0], reading[1]))
 
     def _expected_range(self, landmark_id: int) -> float:
         """Return the expected range of a landmark [m]; infinite for a new one."""
