@@ -77,7 +77,7 @@ def kernel_step(slam: EkfSlam, readings: NDArray[np.float64]) -> Callable[[], ob
     block, ids = slam.map.block, np.arange(len(readings))
 
     def step() -> None:
-        move_pose(block, 0.0, 0.0, 1.0)
+        move_pose(block, 0.0, 0.0, 0.0, 1.0)
         update_map(block, readings, ids)
 
     return step
