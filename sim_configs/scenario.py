@@ -395,7 +395,8 @@ class Scenario(Part):
         >>> load_scenario("differential").models
         {'motion': 'differential[track_width=0.5]'}
         """
-        models, robot = {}, self.robot
+        models: dict[str, str] = {}
+        robot = self.robot
         if self.sensor.kind != "bearing_range":
             models["sensor"] = self.sensor.kind
         if robot.drive == "differential":

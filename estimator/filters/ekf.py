@@ -334,10 +334,14 @@ class EkfSlam(MapFilter):
             dt, and dt = 0 adds none.
         """
         noise, weight = self._motion_noise, 1.0
-        moved = noise.motion.moved(odometry)
+        if noise.motion is UNICYCLE:  # a tenth of a prediction faster
+            forward, turn = argument_checks.pair("odometry", odometry)
+            sideways = 0.0
+        else:
+            forward, sideways, turn = noise.motion.moved(odometry)
         if not (type(dt) is float and dt == 1.0 and noise.at_rest):
-            weight = noise.weight(moved, dt)
-        move_pose(self.map.block, *moved, weight)
+            weight = noise.weight((forward, sideways, turn), dt)
+        move_pose(self.map.block, forward, sideways, turn, weight)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None

@@ -51,8 +51,9 @@ class UnscentedSlam(EkfSlam):
         deviations = np.sqrt(n + 3) * np.concatenate([root, -root], axis=1)
         x, y, heading = mean[:3, None] + deviations[:3]
         along, across, turned = deviations[n:]
-        moves = forward + along, sideways + across, turn + turned
-        poses = np.stack(composed(x, y, heading, *moves)[:3])
+        moves = forward + along, sideways + across, turn
+        x, y, heading, _, _ = composed(x, y, heading, *moves)
+        poses = np.stack([x, y, heading + turned])
         mean[:3] = poses.mean(axis=1)
         spread = poses - mean[:3, None]
         share = deviations.shape[1]

@@ -112,8 +112,8 @@ def differential(track_width: float) -> Motion:
 
     Notes
     -----
-    S. Thrun, W. Burgard, D. Fox, Probabilistic Robotics, MIT Press, 2005, eq. 5.9, for
-    the arc.
+    S. Thrun, W. Burgard, D. Fox, Probabilistic Robotics, MIT Press, 2005, section
+    5.3, for the arc.
 
     Examples
     --------
@@ -144,8 +144,8 @@ def bicycle(wheelbase: float, reference: tuple[float, float] = (0.0, 0.0)) -> Mo
     Notes
     -----
     J. Guivant, E. Nebot, Optimization of the simultaneous localization and map-building
-    algorithm for real-time implementation, IEEE T-RA 17(3), 2001, eqs. 3 and 4, with
-    the arc for their step along the tangent.
+    algorithm for real-time implementation, IEEE T-RA 17(3), 2001, with the arc in
+    place of their step along the tangent.
 
     Examples
     --------
@@ -159,14 +159,16 @@ def bicycle(wheelbase: float, reference: tuple[float, float] = (0.0, 0.0)) -> Mo
     return Motion(name, ("d", "steering"), ("m", "rad"), _Bicycle(length, a, b))
 
 
-class _Differential(NamedTuple):  # not a closure, so that a motion can be pickled
+@dataclass(frozen=True)
+class _Differential:  # not a closure, so that a motion can be pickled
     width: float
 
     def __call__(self, left: Real, right: Real) -> tuple[Real, Real, Real]:
         return _arc((left + right) / 2, (right - left) / self.width)
 
 
-class _Bicycle(NamedTuple):
+@dataclass(frozen=True)
+class _Bicycle:
     wheelbase: float
     ahead: float
     left: float

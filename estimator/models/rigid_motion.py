@@ -16,13 +16,15 @@ References
    arXiv:1510.06263, 2015.
 """
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from ...arrays import Array, ComplexArray
 from ...jit import njit_inlined
 from .bearing_range import wrap_angle
+
+Real = Any  # a number, or an array of any shape
 
 
 def rotation(angle: float) -> Array:
@@ -60,8 +62,8 @@ def compose(start: Array, pose: Array) -> tuple[Array, Array, Array]:
 
 
 def composed(
-    x: float, y: float, heading: float, dx: float, dy: float, turn: float
-) -> tuple[float, float, float, float, float]:
+    x: Real, y: Real, heading: Real, dx: Real, dy: Real, turn: Real
+) -> tuple[Real, Real, Real, Real, Real]:
     """Return (x, y, θ) ⊕ (dx, dy, turn) entry by entry, and (cos, sin) of θ."""
     cos, sin = np.cos(heading), np.sin(heading)
     return x + cos * dx - sin * dy, y + sin * dx + cos * dy, heading + turn, cos, sin

@@ -120,8 +120,9 @@ def _pack_world(
     packed.put("landmark.id", log.landmark_ids, "int32")
     packed.put("landmark.x", log.landmarks[:, 0], "float32")
     packed.put("landmark.y", log.landmarks[:, 1], "float32")
-    rows, ids = zip(*(_readings(scans[step]) for step in steps), strict=True)
-    rows = [drawn_readings(log.header.get("sensor", "bearing_range"), r) for r in rows]
+    found, ids = zip(*(_readings(scans[step]) for step in steps), strict=True)
+    kind = log.header.get("sensor", "bearing_range")
+    rows = [drawn_readings(kind, readings) for readings in found]
     packed.put_frames("reading.true", ids, "int32")
     bearings = [np.round(readings[:, 0] * 1e4) for readings in rows]
     packed.put_frames("reading.bearing", bearings, "int32")
