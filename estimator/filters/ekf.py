@@ -45,7 +45,6 @@ from ..support.argument_checks import LandmarkIds, landmark_pairs
 from ..support.memory_limit import covariance_bytes
 from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
-from .conditioning import ObservesPoses
 from .delayed_landmarks import (
     WAITING_STATE,
     Waiting,
@@ -56,6 +55,7 @@ from .delayed_landmarks import (
 from .gaussian_map import (
     MAP_STATE,
     GaussianMap,
+    ObservesPoses,
     UpdateKernel,
     not_positive_definite,
 )

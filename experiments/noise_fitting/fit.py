@@ -28,14 +28,8 @@ from ...evaluation.hypothesis_tests import (
 )
 from ...evaluation.nees import pose_nees
 from ..logs.ground_truth import hides_identities, true_poses_of
-from ..logs.slamlog import (
-    FORMAT_LINE,
-    LogError,
-    SlamLog,
-    numbers,
-    read_lines,
-    write_whole,
-)
+from ..logs.log_lines import read_lines, write_whole
+from ..logs.slamlog import FORMAT_LINE, LogError, SlamLog, numbers
 from ..runs.filter_settings import FilterSettings, one_blas_thread
 from ..runs.log_replay import Progress
 from .scoring import associated_log, events_of
