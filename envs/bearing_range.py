@@ -28,8 +28,6 @@ _PI = np.array(np.pi)  # 0-d arrays compare twice as fast as Python floats
 _UNSEEN = np.array(0.0)
 _LAST = np.array(np.inf)  # sorts after every other row
 
-_ONE_NUMBER = ("bearing", "range")
-
 Limit = float | Array | None
 
 
@@ -61,7 +59,9 @@ class BearingRangeSensor:
         self._half_view: Limit = _limit(sensor.field_of_view / 2, above=math.pi)
         self._grows = sensor.range_std_per_metre > 0
         self._settings = SensorSettings.of(sensor)
-        self._kind = sensor.kind
+        self._reads_positions = sensor.kind == "position"
+        self._reads_ranges = sensor.kind == "range"
+        self._reads_one = sensor.kind in ("bearing", "range")
         faults = scenario.present_faults
         biases = np.array([faults.bearing_bias, faults.range_bias])
         self._bias = biases if biases.any() else None
@@ -121,7 +121,7 @@ class BearingRangeSensor:
         mask = _in_view(readings, nearest, max_range, half_view)
         if self._sight is not None:
             mask &= ~self._sight.blocked(landmarks, position)
-        if self._kind == "position":
+        if self._reads_positions:
             readings[0], readings[1] = x, y
             readings += error
         else:
@@ -142,9 +142,9 @@ class BearingRangeSensor:
             readings[1] += self._bias[1]
         if self._may_wrap and np.count_nonzero(np.abs(bearings) >= _PI):
             wrap_bearings(bearings)
-        if self._kind == "range":
-            bearings[...] = readings[1]
-        if self._kind in _ONE_NUMBER:
+        if self._reads_one:
+            if self._reads_ranges:
+                bearings[...] = readings[1]
             readings[1] = 0.0
 
 

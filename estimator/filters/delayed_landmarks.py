@@ -17,10 +17,11 @@ poses c, k readings satisfy::
 
 This is the limit of a Kalman update of a landmark without prior knowledge.
 
-A landmark is placed when two conditions hold.  Its standard deviation, relative to the
-robot, is below a tenth of its distance from every pose that read it, so that
-linearisation holds [2]_.  And every other place, as the mirror image of ranges from a
-straight path [3]_, is less likely by a factor of 10⁵.
+A landmark is placed when linearisation holds [2]_ and its place is not ambiguous.  Its
+standard deviation, relative to the robot, is below a tenth of its distance from every
+pose that read it, and changes their readings by less than a tenth of their noise in
+second order.  Every other place, as the mirror image of ranges from a straight path
+[3]_, is less likely by a factor of 10⁵.
 
 References
 ----------
@@ -33,12 +34,12 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import NamedTuple
+from collections.abc import Collection, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...arrays import Array, BoolArray, IntArray
+from ...arrays import LARGEST, Array, BoolArray, IntArray
 from ..kernels.kalman_gain import (
     AFTER_STDS,
     AT_ESTIMATE,
@@ -48,14 +49,22 @@ from ..kernels.kalman_gain import (
     Rules,
 )
 from ..models.sensors import Sensor
+from ..support import saved_states
 from ..support.argument_checks import LOWEST_ID, RESERVED_IDS
-from ..support.saved_states import NUMBERS, WHOLE, Table
+from ..support.saved_states import (
+    NUMBERS,
+    WHOLE,
+    Table,
+    with_prefix,
+    without_prefix,
+)
 from .conditioning import composed
 from .gaussian_map import GaussianMap
 
 MOST_POSES = 40
 """Past poses kept; beyond it, the one nearest to the pose before it goes."""
 CERTAIN = 10.0  # distance of a placed landmark, in its standard deviations
+BENT = 0.1  # second-order change of its readings, in theirs
 UNLIKELY = 23.0  # 2 log 10⁵: excess of the cost of other places
 DIRECTIONS, DISTANCES = 24, np.geomspace(0.5, 100.0, 12)  # first guesses, [m]
 SAME = 0.02  # places this near, relative to their distance, are one
@@ -83,13 +92,24 @@ def is_landmark(landmark_id: int) -> bool:
     return landmark_id >= LOWEST_ID + RESERVED_IDS
 
 
-def refuse_unknown_poses(ids: IntArray, mapped: Collection[int]) -> None:
-    """Refuse saved readings (landmark, pose) from poses that are not in the map."""
-    for pose in ids[:, 1].tolist():
+def read_waiting(state: Mapping[str, Any], mapped: Collection[int]) -> dict[str, Any]:
+    """Return saved readings that wait, checked; none where the state has none.
+
+    Raises
+    ------
+    ValueError
+        If one names a past pose that is not in the map.
+    """
+    if "waiting_ids" not in state:
+        return with_prefix("waiting", Waiting()._asdict(), "_")
+    own = without_prefix(state, "waiting", "_")
+    checked = saved_states.read(own, WAITING_STATE, "waiting_")
+    for pose in checked["ids"][:, 1].tolist():
         if not set(_names(pose)) <= set(mapped):
             raise ValueError(
                 f"state['waiting_ids'] must name poses in the map, got {pose}"
             )
+    return with_prefix("waiting", checked, "_")
 
 
 def collect(
@@ -156,9 +176,10 @@ def _add_pose(gaussian: GaussianMap, rules: Rules) -> int:
     extend[[n, n + 1, n + 2, n + 3], [0, 1, 0, 1]] = 1.0
     extend[[n + 2, n + 3], 2] = -np.sin(at[2]), np.cos(at[2])
     rows = extend[n:] @ P
-    P = np.block([[P, rows.T], [rows, rows @ extend[n:].T]])
+    own = rows @ extend[n:].T
+    P = np.block([[P, rows.T], [rows, (own + own.T) / 2]])
     grown = [
-        np.concatenate([x, x[:2], x[:2] + [np.cos(x[2]), np.sin(x[2])]])
+        np.concatenate([x, x[:2], x[:2] + np.array((np.cos(x[2]), np.sin(x[2])))])
         for x in (mean, reference)
     ]
     pose = (last + 1) % (RESERVED_IDS // 2)
@@ -229,9 +250,24 @@ class _Seen(NamedTuple):
         shape = len(points), -1
         return (nu / std).reshape(shape), (H / std[..., None]).reshape(*shape, 2)
 
+    def bend(self, state: Array, point: Array, axes: Array) -> float:
+        """Return the largest second-order change of a reading at one σ, by its noise.
+
+        ::
+
+            ½ |h(l + e) + h(l − e) − 2 h(l)| / σ
+        """
+        h = [
+            self.sensor.read(*self._seen_from(state, points)[1:3])
+            for points in (point + axes, point - axes, point[None])
+        ]
+        bends = self.sensor.difference(h[0], h[2]) + self.sensor.difference(h[1], h[2])
+        distances = np.linalg.norm(state[self.columns[:, :2]] - point, axis=1)
+        return float(np.abs(bends / (2 * self.stds(distances))).max())
+
     def stds(self, distances: Array) -> Array:
         """Return the standard deviations of the readings, shape (..., 2)."""
-        std = self.sensor.std(self.noise, distances)  # type: ignore[arg-type]
+        std = self.sensor.std(self.noise, distances)
         return np.stack(np.broadcast_arrays(distances, *std)[1:], axis=-1)
 
     def fit(self, state: Array, P: Array, reference: Array, point: Array) -> _Fit:
@@ -249,9 +285,9 @@ class _Seen(NamedTuple):
             Hc = Hc.reshape(2 * k, -1)[rows]
             apart = state[self.columns[:, :2]] - point
             std = self.stds(np.linalg.norm(apart, axis=1)).ravel()[rows]
-            W = np.linalg.inv(Hc @ own @ Hc.T + np.diag(std**2))
+            W = np.asarray(np.linalg.inv(Hc @ own @ Hc.T + np.diag(std**2)))
             Hl = Hl.reshape(2 * k, 2)[rows]
-            M = np.linalg.inv(Hl.T @ W @ Hl)
+            M = np.asarray(np.linalg.inv(Hl.T @ W @ Hl))
             G = M @ Hl.T @ W
             best = _Fit(point, nu, Hc, W, M, G, Hl)
             point = point + G @ nu
@@ -268,6 +304,12 @@ class _Fit(NamedTuple):
     M: Array
     G: Array
     Hl: Array
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the place is one, not infinity where readings are parallel."""
+        is_finite = np.isfinite(self.cost) and np.abs(self.point).max() <= LARGEST
+        return bool(is_finite and np.linalg.eigvalsh(self.M)[0] > 0)
 
     @property
     def cost(self) -> float:
@@ -293,7 +335,7 @@ def _place(
         fits = [seen.fit(mean, P, at, point) for point in _guesses(seen, mean)]
     except np.linalg.LinAlgError:
         return False
-    fits = sorted((fit for fit in fits if np.isfinite(fit.cost)), key=lambda f: f.cost)
+    fits = sorted((fit for fit in fits if fit.is_sound), key=lambda fit: fit.cost)
     if not fits:
         return False
     best, poses = fits[0], mean[columns[:, :2]]
@@ -303,7 +345,10 @@ def _place(
         if not is_same and other.cost < best.cost + UNLIKELY:
             return False
     grown = _conditioned(mean, P, best, columns.ravel(), rules)
-    if CERTAIN * _spread(grown.mean, grown.covariance) > nearest:
+    axes = _spread(grown.mean, grown.covariance)
+    if not CERTAIN * np.linalg.norm(axes, axis=1).max() <= nearest:
+        return False
+    if seen.bend(mean, best.point, axes) > BENT:
         return False
     first = np.concatenate([reference, grown.mean[-2:]])
     _hold(gaussian, BeliefArrays(grown.mean, grown.covariance, first), (landmark,))
@@ -371,12 +416,13 @@ def _conditioned(
     return BeliefArrays(mean, P, mean)
 
 
-def _spread(mean: Array, P: Array) -> float:
-    """Return the largest standard deviation of the last landmark, as the robot sees it.
+def _spread(mean: Array, P: Array) -> Array:
+    """Return the last landmark's axes of one σ, rows (2, 2) [m], as the robot sees it.
 
     The error in the robot's frame is e_l − e_p − J δ e_θ.
     """
     dx, dy = mean[-2:] - mean[:2]
     own = np.array([0, 1, 2, -2, -1])
     H = np.array([[-1, 0, dy, 1, 0], [0, -1, -dx, 0, 1]])
-    return float(np.linalg.eigvalsh(H @ P[np.ix_(own, own)] @ H.T)[-1] ** 0.5)
+    variances, axes = np.linalg.eigh(H @ P[np.ix_(own, own)] @ H.T)
+    return np.asarray((axes * np.sqrt(np.maximum(variances, 0.0))).T)

@@ -43,15 +43,9 @@ from ..models.sensors import (
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds, landmark_pairs
 from ..support.memory_limit import covariance_bytes
-from ..support.saved_states import with_prefix, without_prefix
+from ..support.saved_states import with_prefix
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
-from .delayed_landmarks import (
-    WAITING_STATE,
-    Waiting,
-    collect,
-    is_landmark,
-    refuse_unknown_poses,
-)
+from .delayed_landmarks import Waiting, collect, is_landmark, read_waiting
 from .gaussian_map import (
     MAP_STATE,
     GaussianMap,
@@ -345,10 +339,14 @@ class EkfSlam(MapFilter):
             dt, and dt = 0 adds none.
         """
         noise, weight = self._motion_noise, 1.0
-        moved = noise.motion.moved(odometry)
+        if noise.motion is UNICYCLE:  # a tenth of a prediction faster
+            forward, turn = argument_checks.pair("odometry", odometry)
+            sideways = 0.0
+        else:
+            forward, sideways, turn = noise.motion.moved(odometry)
         if not (type(dt) is float and dt == 1.0 and noise.at_rest):
-            weight = noise.weight(moved, dt)
-        move_pose(self.map.block, *moved, weight)
+            weight = noise.weight((forward, sideways, turn), dt)
+        move_pose(self.map.block, forward, sideways, turn, weight)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -587,23 +585,6 @@ class IteratedEkfSlam(EkfSlam):
         self._adopt(self.rules._replace(iterations=count))
 
 
-def read_waiting(state: Mapping[str, Any], mapped: Sequence[int]) -> dict[str, Any]:
-    """Return saved readings that wait, checked; none where the state has none.
-
-    Raises
-    ------
-    ValueError
-        If one names a past pose that is not in the map.
-    """
-    if "waiting_ids" not in state:
-        return with_prefix("waiting", Waiting()._asdict(), "_")
-    own = saved_states.read(
-        without_prefix(state, "waiting", "_"), WAITING_STATE, "waiting_"
-    )
-    refuse_unknown_poses(own["ids"], mapped)
-    return with_prefix("waiting", own, "_")
-
-
 # --------------------------------------------------------------------------------------
 # The settings of a filter, checked and converted to rules for kernels.
 
@@ -657,7 +638,7 @@ def checked_rules(
 def reading_variances(
     rules: Rules, ranges: Array, sensor: Sensor = BEARING_RANGE
 ) -> Array:
-    """Return (σβ², σr²) of readings at these ranges [m], or another sensor's, (m, 2)."""
+    """Return the variances of readings at these ranges [m], shape (m, 2)."""
     noise = rules[FIRST_STD:AFTER_STDS]
     std = sensor.std(noise, np.maximum(ranges, rules.min_range))
     return np.stack(np.broadcast_arrays(*std), axis=1) ** 2

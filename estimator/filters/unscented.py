@@ -51,8 +51,9 @@ class UnscentedSlam(EkfSlam):
         deviations = np.sqrt(n + 3) * np.concatenate([root, -root], axis=1)
         x, y, heading = mean[:3, None] + deviations[:3]
         along, across, turned = deviations[n:]
-        moves = forward + along, sideways + across, turn + turned
-        poses = np.stack(composed(x, y, heading, *moves)[:3])
+        moves = forward + along, sideways + across, turn
+        x, y, heading, _, _ = composed(x, y, heading, *moves)
+        poses = np.stack([x, y, heading + turned])
         mean[:3] = poses.mean(axis=1)
         spread = poses - mean[:3, None]
         share = deviations.shape[1]
@@ -97,7 +98,8 @@ class UnscentedSlam(EkfSlam):
 
     def _read_distance(self, reading: Array) -> float:
         """Return the distance of a landmark by its reading [m]; infinite if unknown."""
-        return for_sensor(read_distance_jit, self.sensor)(reading[0], reading[1])
+        read = for_sensor(read_distance_jit, self.sensor)
+        return float(read(reading[0], reading[1]))
 
     def _expected_range(self, landmark_id: int) -> float:
         """Return the expected range of a landmark [m]; infinite for a new one."""

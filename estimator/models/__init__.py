@@ -17,5 +17,9 @@ if TYPE_CHECKING:
     from .motions import differential as differential
     from .motions import find_motion as find_motion
     from .motions import predict_pose as predict_pose
+    from .sensors import Sensor as Sensor
+    from .sensors import check_sensor as check_sensor
+    from .sensors import find_sensor as find_sensor
+    from .sensors import register_sensor as register_sensor
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -36,10 +36,11 @@ from .bearing_range import LandmarkLocation, MeasurementPrediction, wrap_angle_j
 
 Real = Any  # a number, or an array of any shape
 Numbers = tuple[Real, Real]
+Noise = tuple[float, ...]  # the four numbers of a filter, see `Sensor`
 Slopes = tuple[Real, Real, Real, Real]
 
 
-def constant_std(noise: tuple[float, float, float, float], distance: Real) -> Numbers:
+def constant_std(noise: Noise, distance: Real) -> Numbers:
     """Return the two standard deviations as given, at any distance."""
     return noise[0] + 0.0 * distance, noise[1] + 0.0 * distance
 
@@ -85,7 +86,7 @@ class Sensor:
     h: Callable[[Real, Real], tuple[Numbers, Slopes]]
     inverse: Callable[[Real, Real], Numbers] | None = None
     angles: tuple[bool, ...] = ()
-    std: Callable[[tuple[float, float, float, float], Real], Numbers] = constant_std
+    std: Callable[[Noise, Real], Numbers] = constant_std
 
     @property
     def size(self) -> int:
@@ -179,9 +180,7 @@ def from_bearing_range(bearing: Real, distance: Real) -> Numbers:
     return distance * np.cos(bearing), distance * np.sin(bearing)
 
 
-def bearing_range_std(
-    noise: tuple[float, float, float, float], distance: Real
-) -> Numbers:
+def bearing_range_std(noise: Noise, distance: Real) -> Numbers:
     """Return σβ + b / r and σr + k r."""
     return noise[0] + noise[3] / distance, noise[1] + noise[2] * distance
 
@@ -208,7 +207,7 @@ def read_range(x: Real, y: Real) -> tuple[Numbers, Slopes]:
     return (r, 0.0), (x / r, y / r, 0.0, 0.0)
 
 
-def range_std(noise: tuple[float, float, float, float], distance: Real) -> Numbers:
+def range_std(noise: Noise, distance: Real) -> Numbers:
     """Return σr + k r."""
     return noise[0] + noise[2] * distance, 1.0
 
@@ -444,7 +443,7 @@ def _name(sensor: Sensor, column: int) -> str:
 
 def _check_slopes(sensor: Sensor, x: Array, y: Array) -> None:
     given, step = sensor.slopes(x, y), 1e-6 * np.hypot(x, y)
-    for axis, (mx, my) in enumerate(((step, 0.0), (0.0, step))):
+    for axis, (mx, my) in enumerate(((step, 0 * step), (0 * step, step))):
         ahead, behind = sensor.read(x + mx, y + my), sensor.read(x - mx, y - my)
         numeric = sensor.difference(ahead, behind) / (2 * step[:, None])
         scale = 1e-6 * (1 + np.abs(numeric)) + 1e-9 / step[:, None] * 1e-6

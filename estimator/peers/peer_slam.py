@@ -47,7 +47,7 @@ class PeerSlam(ABC):
     motion_std, measurement_std, initial_pose, initial_pose_std
         As in :func:`~slamgym.estimator.make_estimator`; a first pose that is certain
         has the deviation `START_FLOOR`.
-    range_std_per_metre, noise_at_rest, min_range
+    range_std_per_metre, noise_at_rest, min_range, motion
         As in :class:`~slamgym.estimator.EkfSlam`; the range that counts is the one
         that the estimate expects.
 

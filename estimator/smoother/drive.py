@@ -60,6 +60,8 @@ class Drive:
         Mean and standard deviation of the first pose [m, m, rad].
     range_std_per_metre, bearing_std_metres, range_noise_at, noise_at_rest, min_range
         As in :class:`~slamgym.estimator.EkfSlam`.
+    motion : str or DriveMotion
+        The drive.
 
     Raises
     ------

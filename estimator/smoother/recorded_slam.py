@@ -21,6 +21,8 @@ from ..interface import (
     taking_poses,
 )
 from ..map_management.map_editor import MapEditor, mapped_ids, marginal, view_map
+from ..models.motions import UNICYCLE, Motion
+from ..models.sensors import BEARING_RANGE, Sensor, only_bearing_range
 from ..registry import accepted_options, find_estimator, make_estimator, read_label
 from ..support import argument_checks, saved_states
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
@@ -252,6 +254,10 @@ class SmoothingSlam(RecordedSlam):
         As in `batch_smoother.smooth`.
     range_std_per_metre, bearing_std_metres, range_noise_at, noise_at_rest, min_range
         As in :class:`~slamgym.estimator.EkfSlam`; the filter gets those that it takes.
+    motion : str or Motion
+        The drive; the filter gets it too.
+    sensor : str or Sensor
+        Bearing-range; others are refused.
     **options
         Further options of the filter.
 
@@ -278,8 +284,11 @@ class SmoothingSlam(RecordedSlam):
         range_noise_at: str = "expected",
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
+        motion: str | Motion = UNICYCLE,
+        sensor: str | Sensor = BEARING_RANGE,
         **options: Any,
     ) -> None:
+        only_bearing_range(sensor, "the smoother")
         noise: dict[str, Any] = {
             "motion_std": motion_std,
             "measurement_std": measurement_std,
@@ -287,19 +296,20 @@ class SmoothingSlam(RecordedSlam):
             "initial_pose_std": initial_pose_std,
         }
         name, own = read_label(follow)
-        sensor = {
+        settings: dict[str, Any] = {
             "range_std_per_metre": range_std_per_metre,
             "bearing_std_metres": bearing_std_metres,
             "range_noise_at": range_noise_at,
             "noise_at_rest": noise_at_rest,
             "min_range": min_range,
+            "motion": motion,
         }
-        sensor |= {key: own.pop(key) for key in sensor if key in own}
+        settings |= {key: own.pop(key) for key in settings if key in own}
         options |= own
         robust_kernel(robust, robust_scale)
-        taken = accepted_options(find_estimator(name), sensor)
+        taken = accepted_options(find_estimator(name), settings)
         slam = make_estimator(name, **noise, **taken, **options)
-        super().__init__(slam, **noise, **sensor)
+        super().__init__(slam, **noise, **settings)
         self._kernel: dict[str, Any] = {"robust": robust, "robust_scale": robust_scale}
 
     def smoothed(self) -> SmoothedDrive:

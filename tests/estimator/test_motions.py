@@ -198,6 +198,9 @@ def test_every_filter_takes_the_odometry_of_a_car(name):
         move_as_unicycle(unicycle, odometry, 0.7)
         for slam in (car, unicycle):
             slam.update(readings, None if name == "managed" else ids)
+    if name == "smoother":
+        car, unicycle = car.smoothed(), unicycle.smoothed()
+        np.testing.assert_allclose(car.poses, unicycle.poses, atol=1e-9)
     found, expected = car.belief(), unicycle.belief()
     np.testing.assert_allclose(found.mean, expected.mean, atol=1e-9)
     np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-9)
@@ -229,3 +232,8 @@ def test_plans_of_another_drive_are_refused():
     slam = make_estimator("ekf", **NOISE, motion=CAR)
     with pytest.raises(ValueError, match="imagine takes the odometry of a unicycle"):
         imagine(slam, [np.zeros((2, 2))], load_scenario("loop").sensor)
+
+
+def test_the_smoother_refuses_another_sensor():
+    with pytest.raises(ValueError, match="the smoother takes bearing_range"):
+        SmoothingSlam(**NOISE, sensor="position")

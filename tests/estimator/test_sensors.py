@@ -10,6 +10,7 @@ from dense_ekf import DenseEkf
 from numeric_jacobian import numeric_jacobian
 
 from slamgym.estimator import make_batch, make_estimator
+from slamgym.estimator.filters.delayed_landmarks import MOST_POSES
 from slamgym.estimator.filters.imagine import imagine
 from slamgym.estimator.models import bearing_range
 from slamgym.estimator.models.sensors import (
@@ -49,6 +50,8 @@ COPY = replace(BEARING_RANGE, name="copy")
 
 def reading(sensor, pose, landmarks, rng, noise=1.0):
     z = sensor.predict(pose, landmarks).measurement
+    if not noise:
+        return z
     std = np.resize((*STD.get(sensor.name, (0.03, 0.1)), 0.0), 2)
     return z + noise * rng.normal(size=z.shape) * std
 
@@ -144,7 +147,7 @@ def test_every_filter_equals_the_dense_oracle(label, sensor):
     pose, seen = np.zeros(3), 4
     for step in range(8):
         u = np.array([0.4, 0.5])
-        pose = pose + [u[0] * np.cos(pose[2]), u[0] * np.sin(pose[2]), u[1]]
+        pose = pose + np.array([u[0] * np.cos(pose[2]), u[0] * np.sin(pose[2]), u[1]])
         for each in (slam, slow):
             each.predict(u + 0.01)
         if sensor.places and step == 4:
@@ -187,7 +190,7 @@ def test_filters_of_large_maps_take_positions(label):
         for name in (label, "ekf")
     )
     for _ in range(10):
-        pose = pose + [0.2 * np.cos(pose[2]), 0.2 * np.sin(pose[2]), 0.1]
+        pose = pose + np.array([0.2 * np.cos(pose[2]), 0.2 * np.sin(pose[2]), 0.1])
         z = reading(POSITION, pose, LANDMARKS, rng)
         for each in (slam, ekf):
             each.predict((0.2, 0.1))
@@ -389,3 +392,149 @@ def test_check_sensor_refuses_slopes_of_the_void_number():
         check_sensor(single)
     with pytest.raises(SensorContractError, match="inverse must be None"):
         check_sensor(replace(BEARING, inverse=mirrored))
+
+
+# --------------------------------------------------------------------------------------
+# Landmarks that one reading does not place.
+
+
+def waiting_filter(label, sensor, **settings):
+    noise = {"motion_std": (0.01, 0.01, 0.003), "measurement_std": STD[sensor.name]}
+    return make_estimator(label, **noise, sensor=sensor, **settings)
+
+
+def drive_past(slam, sensor, steps, *, landmarks=LANDMARKS, noise=1.0, turn=0.15):
+    """Drive on a circle, or straight on, past landmarks; return the true pose."""
+    rng, pose = np.random.default_rng(0), np.zeros(3)
+    for _ in range(steps):
+        pose = pose + np.array([0.3 * np.cos(pose[2]), 0.3 * np.sin(pose[2]), turn])
+        slam.predict((0.3, turn))
+        report = slam.update(
+            reading(sensor, pose, landmarks, rng, noise), range(len(landmarks))
+        )
+    return pose, report
+
+
+@pytest.mark.parametrize("sensor", [BEARING, RANGE], ids=lambda s: s.name)
+@pytest.mark.parametrize("label", ["ekf", "invariant", "first_estimates"])
+def test_landmarks_are_placed_from_several_poses(label, sensor):
+    slam = waiting_filter(label, sensor)
+    assert slam.update(reading(sensor, np.zeros(3), LANDMARKS, None, 0), range(5)) == (
+        type(slam.report())()
+    )
+    assert slam.belief().landmark_ids == ()
+    assert slam.landmark_ids == ()
+    assert slam.map_view().landmarks.shape == (0, 2)
+    pose, _ = drive_past(slam, sensor, 40)
+    belief = slam.belief()
+    assert sorted(belief.landmark_ids) == [0, 1, 2, 3, 4]
+    assert len(slam.map.slots) == 5  # no past pose is left
+    error = belief.error(pose, LANDMARKS[list(belief.landmark_ids)])
+    squared = error @ np.linalg.solve(belief.error_covariance(), error)
+    assert squared < 13 * 2.5
+
+
+def test_mirror_images_of_ranges_are_kept_until_they_separate():
+    """A straight path cannot tell a landmark on the left from one on the right."""
+    slam = waiting_filter("invariant", RANGE)
+    one = LANDMARKS[1:2] * (-1, 1)
+    pose, _ = drive_past(slam, RANGE, 25, landmarks=one, turn=0.0, noise=0.1)
+    assert slam.landmark_ids == ()
+    assert len(slam.waiting.ids) == 25
+    rng = np.random.default_rng(1)
+    for _ in range(12):
+        pose = pose + np.array([0.3 * np.cos(pose[2]), 0.3 * np.sin(pose[2]), 0.2])
+        slam.predict((0.3, 0.2))
+        slam.update(reading(RANGE, pose, one, rng, 0.1), [0])
+    assert slam.landmark_ids == (0,)
+    np.testing.assert_allclose(slam.belief().landmarks, one, atol=0.5)
+
+
+def test_readings_that_waited_are_used_once_as_by_least_squares():
+    """Against a batch of all poses and readings, where both are nearly linear."""
+    motion, std, steps = np.array([1e-3, 1e-3, 1e-3]), 1e-3, 12
+    slam = make_estimator(
+        "ekf", motion_std=motion, measurement_std=(std,), sensor="bearing"
+    )
+    landmark, rng, turn = np.array([2.0, 3.0]), np.random.default_rng(3), 0.1
+    pose, readings = np.zeros(3), []
+    for _ in range(steps):
+        pose = pose + np.array([0.3 * np.cos(pose[2]), 0.3 * np.sin(pose[2]), turn])
+        slam.predict((0.3, turn))
+        z = reading(BEARING, pose, landmark[None], rng, 0)
+        z = z + np.array([std * rng.normal(), 0])
+        readings.append(z[0, 0])
+        slam.update(z, [0])
+    assert slam.landmark_ids == (0,)
+
+    def residuals(x):
+        """Weighted residuals of the motions ε (steps, 3) and the landmark."""
+        noise, point, at, found = x[:-2].reshape(-1, 3), x[-2:], np.zeros(3), [x[:-2]]
+        for k in range(steps):
+            along, across, turned = noise[k] * motion
+            cos, sin = np.cos(at[2]), np.sin(at[2])
+            dx, dy = 0.3 + along, across
+            at = at + np.array(
+                [cos * dx - sin * dy, sin * dx + cos * dy, turn + turned]
+            )
+            expected = BEARING.predict(at, point[None]).measurement[0, 0]
+            found.append([(readings[k] - expected) / std])
+        return np.concatenate(found), at
+
+    x = np.concatenate([np.zeros(3 * steps), landmark])
+    for _ in range(5):
+        J = numeric_jacobian(lambda y: residuals(y)[0], x)
+        x = x - np.linalg.lstsq(J, residuals(x)[0], rcond=None)[0]
+    by_pose = numeric_jacobian(lambda y: residuals(y)[1], x)
+    out = np.vstack([by_pose, np.eye(len(x))[-2:]])
+    covariance = out @ np.linalg.inv(J.T @ J) @ out.T
+    belief = slam.belief()
+    std_of = np.sqrt(np.diag(covariance))
+    expected = np.concatenate([residuals(x)[1], x[-2:]])
+    assert (np.abs(belief.mean - expected) < 0.05 * std_of).all()
+    scale = np.outer(std_of, std_of)
+    np.testing.assert_allclose(belief.covariance / scale, covariance / scale, atol=0.02)
+
+
+def test_waiting_filters_continue_from_a_saved_state_bit_for_bit():
+    slam = waiting_filter("invariant", RANGE)
+    pose, _ = drive_past(slam, RANGE, 8)
+    assert len(slam.waiting.ids)
+    other = waiting_filter("invariant", RANGE)
+    other.load_state_dict(slam.state_dict())
+    rng = np.random.default_rng(4)
+    for _ in range(15):
+        pose = pose + np.array([0.3 * np.cos(pose[2]), 0.3 * np.sin(pose[2]), 0.15])
+        z = reading(RANGE, pose, LANDMARKS, rng)
+        for each in (slam, other):
+            each.predict((0.3, 0.15))
+        assert slam.update(z, range(5)) == other.update(z, range(5))
+    np.testing.assert_array_equal(slam.belief().covariance, other.belief().covariance)
+    state = slam.state_dict()
+    state["waiting_ids"] = np.array([[0, 77]])
+    state["waiting_readings"] = np.ones((1, 2))
+    with pytest.raises(ValueError, match="must name poses in the map, got 77"):
+        other.load_state_dict(state)
+
+
+def test_an_update_that_fails_leaves_the_readings_waiting():
+    slam = waiting_filter("ekf", RANGE)
+    drive_past(slam, RANGE, 5)
+    before = slam.state_dict()
+    with pytest.raises(ValueError, match="must be finite"):
+        slam.update([(1.0,), (np.nan,)], [8, 9])
+    with pytest.raises(ValueError, match="landmark_ids must be >="):
+        slam.update([(1.0,)], [-(2**63)])
+    after = slam.state_dict()
+    assert all(np.array_equal(before[key], after[key]) for key in before)
+    slam.reset((0, 0, 0), (0, 0, 0))
+    assert len(slam.waiting.ids) == 0
+
+
+def test_past_poses_do_not_exceed_their_limit():
+    slam = waiting_filter("ekf", BEARING)
+    far = np.array([[1e5, 1e5]])  # no drive can place it
+    drive_past(slam, BEARING, 60, landmarks=far)
+    assert slam.landmark_ids == ()
+    assert len(slam.map.slots) == 2 * MOST_POSES
+    assert len(slam.waiting.ids) == MOST_POSES

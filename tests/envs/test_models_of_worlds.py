@@ -1,0 +1,219 @@
+"""Worlds with other sensors and drives than bearing-range and the unicycle."""
+
+import numpy as np
+import pytest
+from gymnasium.utils import seeding
+from gymnasium.utils.env_checker import check_env
+
+from slamgym.envs import LandmarkWorldEnv
+from slamgym.envs.controllers import make_controller, planned_path
+from slamgym.envs.drives import drive_of
+from slamgym.envs.rendering.render_state import drawn_readings
+from slamgym.envs.vector import WorldBatch
+from slamgym.estimator.models.motions import find_motion
+from slamgym.estimator.models.sensors import find_sensor
+from slamgym.sim_configs import ScenarioError, load_scenario
+
+LOOP = load_scenario("loop").with_changes(
+    motion={"noise_in": "motion", "std": (0.02, 0.01, 0.02)}
+)
+ROBOTS = {
+    "unicycle": {},
+    "differential": {"drive": "differential", "track_width": 0.4},
+    "bicycle": {
+        "drive": "bicycle",
+        "wheelbase": 0.4,
+        "max_steering": 0.6,
+        "reference": (0.3, 0.1),
+    },
+}
+STDS = {
+    "bearing_range": (0.03, 0.1),
+    "position": (0.1, 0.2),
+    "bearing": (0.03, 0.0),
+    "range": (0.1, 0.0),
+}
+WALLS = [(2, 1, 2, 5), (-3, -1, -3, 6)]
+
+
+def world(drive, kind, **sensor):
+    return LOOP.with_changes(
+        robot=ROBOTS[drive],
+        sensor={"kind": kind, "std": STDS[kind], "dropout": 0.1, **sensor},
+        walls=[] if drive == "bicycle" else WALLS,
+    )
+
+
+def actions(steps, seed=1):
+    rng = np.random.default_rng(seed)
+    drawn = rng.uniform((0.0, -1.0), 1.0, (steps, 3, 2))
+    drawn[::9] = 0.0
+    return drawn
+
+
+@pytest.mark.parametrize("kind", STDS)
+@pytest.mark.parametrize("drive", ROBOTS)
+def test_a_world_alone_equals_one_among_many_and_its_space_holds_it(drive, kind):
+    scenario = world(drive, kind, max_range=12.0, field_of_view=5.0, occlusion=True)
+    worlds = WorldBatch(scenario, 3)
+    worlds.reset([seeding.np_random(seed)[0] for seed in range(3)])
+    envs = [LandmarkWorldEnv(scenario) for _ in range(3)]
+    for seed, env in enumerate(envs):
+        env.reset(seed=seed)
+    for each in actions(60):
+        worlds.step(each)
+        for k, env in enumerate(envs):
+            observation, _, _, _, info = env.step(each[k])
+            assert env.observation_space.contains(observation)
+            np.testing.assert_array_equal(
+                observation["landmarks"], worlds.measurements[k]
+            )
+            np.testing.assert_array_equal(observation["mask"], worlds.mask[k])
+            np.testing.assert_array_equal(observation["odometry"], worlds.odometry[k])
+            np.testing.assert_array_equal(info["pose"], worlds.poses[k])
+
+
+@pytest.mark.parametrize("drive", ["differential", "bicycle"])
+def test_without_noise_the_filters_drive_follows_the_odometry(drive):
+    scenario = world(drive, "position").with_changes(motion={"std": (0, 0, 0)})
+    motion, env = find_motion(scenario.models["motion"]), LandmarkWorldEnv(scenario)
+    _, info = env.reset(seed=0)
+    pose = info["pose"]
+    for action in actions(80)[:, 0]:
+        observation, _, _, _, info = env.step(action)
+        dx, dy, turn = motion.displacement(*observation["odometry"])
+        cos, sin = np.cos(pose[2]), np.sin(pose[2])
+        pose = pose + np.array([cos * dx - sin * dy, sin * dx + cos * dy, turn])
+        np.testing.assert_allclose(pose, info["pose"], atol=1e-5)  # walls: 1 µm
+
+
+@pytest.mark.parametrize("kind", STDS)
+def test_without_noise_readings_are_those_of_the_filters_sensor(kind):
+    scenario = world("unicycle", kind, std=(0.0, 0.0), max_range=9.0)
+    env, sensor = LandmarkWorldEnv(scenario), find_sensor(kind)
+    observation, info = env.reset(seed=0)
+    seen = observation["mask"]
+    expected = sensor.predict(info["pose"], env.landmarks[seen]).measurement
+    assert 1 < seen.sum() < len(seen)
+    np.testing.assert_allclose(observation["landmarks"][seen], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", STDS)
+def test_readings_have_the_stated_noise(kind):
+    scenario = world("unicycle", kind, max_range=30.0, dropout=0.0).with_changes(
+        motion={"std": (0, 0, 0)}
+    )
+    worlds, sensor = WorldBatch(scenario, 400), find_sensor(kind)
+    worlds.reset([np.random.default_rng(seed) for seed in range(400)])
+    pose, places = worlds.poses[0], worlds.landmarks[0]
+    exact = sensor.predict(pose, places).measurement
+    errors = sensor.difference(worlds.measurements, exact)
+    found = errors[worlds.mask].std(axis=0)
+    np.testing.assert_allclose(found, STDS[kind], rtol=0.03)
+
+
+@pytest.mark.parametrize("name", ["position", "bearing", "range", "bicycle"])
+def test_the_presets_pass_gymnasiums_check(name):
+    check_env(LandmarkWorldEnv(name), skip_render_check=True)
+
+
+def test_a_car_turns_only_while_it_drives_and_within_its_steering():
+    env = LandmarkWorldEnv(
+        world("bicycle", "position").with_changes(motion={"std": (0, 0, 0)})
+    )
+    start = env.reset(seed=0)[1]["pose"]
+    observation, *_, info = env.step([0.0, 1.0])
+    np.testing.assert_array_equal(info["pose"], start)
+    np.testing.assert_array_equal(observation["odometry"], 0.0)
+    observation, *_, info = env.step([0.1, 1.0])
+    assert observation["odometry"][1] == pytest.approx(0.6)
+    assert info["pose"][2] == pytest.approx(0.1 * np.tan(0.6) / 0.4)
+
+
+def test_the_planned_path_is_that_of_the_drive():
+    scenario = load_scenario("bicycle").with_changes(
+        motion={"std": (0, 0, 0)}, start={"std": (0, 0, 0)}, steps=40
+    )
+    env = LandmarkWorldEnv(scenario)
+    poses = [env.reset(seed=0)[1]["pose"]]
+    driver = make_controller("open_loop", scenario, np.random.default_rng(0))
+    poses += [env.step(driver.act(poses[-1], step))[-1]["pose"] for step in range(40)]
+    np.testing.assert_allclose(planned_path(scenario), poses, atol=1e-9)
+
+
+def test_faults_of_the_odometry_pass_through_the_drive():
+    scenario = world("differential", "position").with_changes(
+        faults={"odometry_scale": 0.1, "odometry_turn": 0.02}, walls=[]
+    )
+    env = LandmarkWorldEnv(scenario)
+    env.reset(seed=0)
+    left, right = env.step([0.5, 0.2])[0]["odometry"]
+    assert (left + right) / 2 == pytest.approx(1.1 * 0.5)
+    assert (right - left) / 0.4 == pytest.approx(0.22)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"robot": {"drive": "differential"}}, "robot.track_width must be given"),
+        ({"robot": {"wheelbase": 0.4}}, "robot.wheelbase must not be given"),
+        ({"robot": ROBOTS["bicycle"], "walls": WALLS}, "walls must be empty"),
+        (
+            {
+                "robot": ROBOTS["differential"],
+                "motion": {"noise_in": "odometry", "std": (0.1, 0, 0.1)},
+            },
+            "motion.noise_in must be 'motion'",
+        ),
+        (
+            {
+                "robot": ROBOTS["bicycle"],
+                "controls": {
+                    "sequence": "square",
+                    "side": 4.0,
+                    "speed": 1.0,
+                    "turn_steps": 3,
+                },
+            },
+            "controls must turn by at most",
+        ),
+        ({"sensor": {"kind": "sonar"}}, "'position', 'bearing' or 'range'"),
+        ({"sensor": {"kind": "bearing"}}, r"sensor.std must be \(σ, 0\)"),
+        ({"sensor": {"kind": "position", "identities": False}}, "identities must be"),
+        (
+            {"sensor": {"kind": "position", "range_std_per_metre": 0.1}},
+            "range_std_per_metre must be 0",
+        ),
+        (
+            {"sensor": {"kind": "position"}, "faults": {"range_bias": 0.1}},
+            "faults.range_bias must be 0",
+        ),
+    ],
+)
+def test_what_a_model_does_not_have_is_refused(changes, message):
+    with pytest.raises(ScenarioError, match=message):
+        LOOP.with_changes(**changes)
+
+
+def test_a_car_has_no_controller_that_turns_at_rest():
+    with pytest.raises(ValueError, match="'waypoints' turns at rest"):
+        make_controller("waypoints", load_scenario("bicycle"), np.random.default_rng(0))
+
+
+def test_the_unicycle_has_no_drive_of_its_own():
+    assert drive_of(LOOP.robot) is None
+    assert LOOP.models == {}
+
+
+def test_scenario_and_drive_have_the_same_label():
+    for name in ("differential", "bicycle"):
+        label = load_scenario(name).models["motion"]
+        assert find_motion(label).name == label
+
+
+def test_pictures_show_a_ray_of_each_reading():
+    rows = np.array([[0.5, 0.0]])
+    assert drawn_readings("bearing", rows)[0, 0] == 0.5
+    np.testing.assert_array_equal(drawn_readings("range", rows), 0.0)
+    np.testing.assert_array_equal(drawn_readings("position", rows), [[0.0, 0.5]])
+    assert drawn_readings("bearing_range", rows) is rows
