@@ -15,7 +15,8 @@ import numpy as np
 
 from ..arrays import AnyArray, Array, IntArray
 from .logs.importers import read_log
-from .logs.slamlog import LogError, LogLine, read_lines
+from .logs.log_lines import LogLine, read_lines
+from .logs.slamlog import LogError
 from .trajectories.manifest import MANIFEST, load_trajectories
 from .trajectories.trajectory import BELIEFS, Trajectory, array_of
 

@@ -320,18 +320,16 @@ class BatchSlam(BatchOfBeliefs):
         Parameters
         ----------
         readings : array_like, shape (B, k)
-            z of every run; those of runs that do not take part are not read.
-        matrix, covariance : array_like, shape (k, 3) and (k, k)
+            z of every run; not read of those that do not take part.
+        matrix, covariance : array_like
             H and R, as of :meth:`EkfSlam.observe_pose`.
         runs : array_like of bool, shape (B,), optional
             The runs that take part; all by default, without those that have stopped.
 
         Returns
         -------
-        nis : ndarray, shape (B,)
-            νᵀ S⁻¹ ν, 0 for a run that has not used its reading.
-        degrees_of_freedom : ndarray, shape (B,)
-            k, or 0 for such a run.
+        nis, degrees_of_freedom : ndarray, shape (B,)
+            νᵀ S⁻¹ ν and k; 0 and 0 for a run that has not used its reading.
         """
         chosen = chosen_runs(runs, self.runs) & (self.failed_at == NEVER)
         z = np.array(readings, dtype=np.float64)
@@ -354,13 +352,6 @@ class BatchSlam(BatchOfBeliefs):
         nis, freedom = np.zeros(self.runs), np.zeros(self.runs, dtype=np.int64)
         nis[rows], freedom[rows] = found.nis, size
         return nis, freedom
-
-    def write_poses(self, trace: BatchTrace, step: int) -> None:
-        """Replace the poses of a step of a trace by the present ones."""
-        going = self.failed_at == NEVER
-        trace.poses[going, step] = self._means[going, :3]
-        trace.poses[going, step, 2] = wrap_angle(trace.poses[going, step, 2])
-        trace.pose_covariances[going, step] = self._covariances[going, :3, :3]
 
     def __repr__(self) -> str:
         few, most = self._mapped.min(), self._mapped.max()

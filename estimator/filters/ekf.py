@@ -45,9 +45,14 @@ from ..support.argument_checks import LandmarkIds, landmark_pairs
 from ..support.memory_limit import covariance_bytes
 from ..support.saved_states import with_prefix
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
-from .conditioning import ObservesPoses
 from .delayed_landmarks import Waiting, collect, is_landmark, read_waiting
-from .gaussian_map import MAP_STATE, GaussianMap, UpdateKernel, not_positive_definite
+from .gaussian_map import (
+    MAP_STATE,
+    GaussianMap,
+    ObservesPoses,
+    UpdateKernel,
+    not_positive_definite,
+)
 
 
 class MapFilter(ObservesPoses):

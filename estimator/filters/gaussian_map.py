@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from weakref import ref
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ..interface import Belief, MapView, UpdateReport
@@ -49,7 +50,7 @@ from ..models.rigid_motion import ErrorFrame
 from ..support.memory_limit import aligned_zeros, landmarks_that_fit
 from ..support.saved_states import COVARIANCE, IDS, NUMBERS, Table
 from ..support.undo import Undo
-from .conditioning import coincide
+from .conditioning import FRAMES, ObservedMap, PoseReading, coincide, gate_of
 
 set_attribute = object.__setattr__  # of frozen dataclasses
 FIRST_LANDMARKS = FIRST_READINGS = 8  # that a new map has room for
@@ -350,6 +351,78 @@ class GaussianMap:
         """Restore what :meth:`state_dict` returned, without checks."""
         saved = state["mean"], state["covariance"], state["reference"]
         self.hold(BeliefArrays(*saved), np.asarray(state["landmark_ids"]).tolist())
+
+
+class ObservesPoses:
+    """A filter on a Gaussian map that takes readings of its pose."""
+
+    #: The belief, in the arrays that steps change.
+    map: GaussianMap
+    #: What distinguishes this filter's updates from another's.
+    rules: Rules
+
+    @property
+    def frame(self) -> ErrorFrame:
+        """Coordinates in which the filter takes its error to be Gaussian."""
+        return FRAMES[self.rules.frame]
+
+    def observe_pose(
+        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
+    ) -> UpdateReport:
+        """Correct the belief with a reading of the pose, such as compass or GPS.
+
+        The reading is z = H (x, y, θ) + w.  A compass has H = [0 0 1], a GPS
+        H = [1 0 0; 0 1 0].
+
+        Parameters
+        ----------
+        reading : array_like, shape (k,)
+            z [m or rad]; a component that depends on the heading alone is an angle.
+        matrix : array_like, shape (k, 3)
+            H.
+        covariance : array_like, shape (k, k)
+            R, of the noise w; positive definite.
+
+        Returns
+        -------
+        UpdateReport
+            NIS, innovation (k,) and its covariance.  It has no degrees of freedom where
+            the gate of the filter, if any, rejects the reading.
+
+        Raises
+        ------
+        ValueError
+            If an argument is malformed; the belief is then as before.
+
+        Examples
+        --------
+        >>> from slamgym.estimator import InvariantEkfSlam
+        >>> slam = InvariantEkfSlam((0, 0, 0), (0.1, 0.1), initial_pose_std=(1, 1, 1))
+        >>> slam.observe_pose(0.5, [0, 0, 1], 1.0).degrees_of_freedom
+        1
+        >>> slam.belief().pose
+        array([0.  , 0.  , 0.25])
+        """
+        given = PoseReading.checked(reading, matrix, covariance)
+        (mean, P, reference), map_ = self.map.used, self.map
+        found = self._observe(given, mean, P)
+        size = found.innovation.size
+        if not found.nis <= gate_of(self.rules, size):
+            return UpdateReport()
+        after = BeliefArrays(found.mean, found.covariance, reference)
+        map_.hold(after, map_.slots, block=map_.blank(map_.room), steps=1)
+        return UpdateReport(
+            nis=float(found.nis),
+            degrees_of_freedom=size,
+            innovation=found.innovation,
+            factor=found.factor,
+        )
+
+    def _observe(
+        self, given: PoseReading, mean: Array, covariance: Array
+    ) -> ObservedMap:
+        once = self.rules.iterations == 1
+        return given.correct(mean, covariance, frame=self.frame, once=once)
 
 
 #: What a saved map must be.

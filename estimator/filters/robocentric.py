@@ -92,7 +92,7 @@ class RobocentricEkfSlam(EkfSlam):
     def _observe(
         self, given: PoseReading, mean: Array, covariance: Array
     ) -> ObservedMap:
-        """Correct the state, a function of which is the pose in the world."""
+        """Correct the state; the pose in the world is a function of it."""
 
         def innovation(state: Array) -> Array:
             return given.innovation(_in_world(state)[0][:3])

@@ -22,6 +22,7 @@ from ...estimator.interface import (
     taking_poses,
     with_fix,
 )
+from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.motions import find_motion
 from ...estimator.smoother.batch_smoother import smoother_in
 from ...evaluation.error_bound import PosteriorBound, posterior_bound
@@ -134,9 +135,12 @@ def _run(batch: BatchSlam, runs: SimulatedRuns) -> BatchTrace:
         )
         if (given := runs.pose_reading(end - 1)) is not None:
             nis, freedom = batch.observe_pose(*given)
+            going, now = np.isfinite(trace.nis[:, -1]), batch.storage()
             trace.nis[:, -1] += nis
             trace.degrees_of_freedom[:, -1] += freedom
-            batch.write_poses(trace, -1)
+            trace.poses[going, -1] = now.means[going, :3]
+            trace.poses[:, -1, 2] = wrap_angle(trace.poses[:, -1, 2])
+            trace.pose_covariances[going, -1] = now.covariances[going, :3, :3]
         traces.append(trace)
         begin = end
     if len(traces) == 1:

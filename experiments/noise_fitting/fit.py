@@ -29,6 +29,7 @@ from ...evaluation.hypothesis_tests import (
 from ...evaluation.nees import pose_nees
 from ..logs import slamlog
 from ..logs.ground_truth import hides_identities, true_poses_of
+from ..logs.log_lines import read_lines, write_whole
 from ..runs.filter_settings import FilterSettings, one_blas_thread
 from ..runs.log_replay import Progress
 from . import search
@@ -412,7 +413,7 @@ def refuse_other_formats(path: str | PathLike[str]) -> None:
         If the file is no slamlog 1.
     """
     is_file = Path(path).is_file()
-    first = "".join(slamlog.read_lines(path)[0].text.split()) if is_file else ""
+    first = "".join(read_lines(path)[0].text.split()) if is_file else ""
     if first != "".join(slamlog.FORMAT_LINE.split()):
         raise slamlog.LogError(
             f"{path}: only the header of a slamlog 1 holds a noise; slamgym replay "
@@ -447,7 +448,7 @@ def write_noise(path: str | PathLike[str], settings: FilterSettings) -> None:
             values[key] = slamlog.numbers(settings.options[key])
     with Path(path).open(encoding="utf-8", newline="") as stream:
         lines = stream.read().split("\n")
-    slamlog.write_whole(path, "\n".join(_with_header(lines, values)))
+    write_whole(path, "\n".join(_with_header(lines, values)))
 
 
 def _with_header(lines: list[str], values: dict[str, str]) -> list[str]:

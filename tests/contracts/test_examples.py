@@ -197,3 +197,7 @@ def test_11_gives_every_reading_to_its_landmark_by_default(run):
     assert default[0] < nearest[0]
     assert default[2:4] == [0, 0]
     assert default[4] < nearest[4]
+
+
+def test_15_maps_a_rock_with_a_sensor_of_its_own_and_a_compass(run):
+    assert "the rock is at [8. 3.]" in run("16_your_own_sensor")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .. import slamlog
+from .. import log_lines, slamlog
 from . import course, graph, utias, victoria_park
 
 EXPECTED = (
@@ -73,8 +73,8 @@ def read_log(
     if source.is_dir():
         kind = _folder_of(source)
     else:
-        path = slamlog.ReadFile(path)
-        kind = _format_of(slamlog.read_lines(path)[0])
+        path = log_lines.ReadFile(path)
+        kind = _format_of(log_lines.read_lines(path)[0])
     if robot is not None and kind != "utias":
         raise ValueError(f"robot must be None for a log in one file, got {robot}")
     if truth is not None and kind != "isam":
@@ -103,7 +103,7 @@ def _folder_of(folder: Path) -> str:
     return "victoria" if is_park else "utias"
 
 
-def _format_of(line: slamlog.LogLine) -> str:
+def _format_of(line: log_lines.LogLine) -> str:
     """Detect the format from the first line of a file."""
     tag, *fields = line.text.split()
     if line.text.startswith("#") or "," in line.text:
@@ -115,5 +115,5 @@ def _format_of(line: slamlog.LogLine) -> str:
     try:
         np.array([tag, *fields], dtype=np.float64)
     except ValueError:
-        raise line.error(EXPECTED, slamlog.shown(line.text)) from None
+        raise line.error(EXPECTED, log_lines.shown(line.text)) from None
     return "course"

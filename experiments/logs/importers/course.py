@@ -15,16 +15,14 @@ from typing import cast
 import numpy as np
 
 from ....arrays import Array, IntArray
+from ..log_lines import LogLine, read_lines, shown
 from ..slamlog import (
     EventRecorder,
     LogError,
-    LogLine,
     OdometryRow,
     Reading,
     Scan,
     SlamLog,
-    read_lines,
-    shown,
     wrap_bearing,
 )
 

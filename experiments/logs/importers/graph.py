@@ -18,16 +18,14 @@ from pathlib import Path
 import numpy as np
 
 from ....arrays import Array
+from ..log_lines import LogLine, read_lines, shown
 from ..slamlog import (
     Event,
     EventRecorder,
     LogError,
-    LogLine,
     Reading,
     SlamLog,
     numbers,
-    read_lines,
-    shown,
     wrap_bearing,
 )
 

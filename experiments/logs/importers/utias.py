@@ -19,7 +19,7 @@ import numpy as np
 
 from ....arrays import Array, IntArray
 from ....evaluation.trajectory_error import poses_at
-from .. import slamlog
+from .. import log_lines, slamlog
 
 ODOMETRY_STEP = 0.1  # [s]
 LONGEST = 1e6  # [s]: 10 million rows
@@ -27,9 +27,9 @@ TRUTH_STEP = 0.2  # [s]
 LAST_ROBOT = 5
 TIME_DIGITS = 6  # float64 resolves stamps near 1.25e9 s to 2.4e-7 s
 ODOMETRY_NAME = re.compile(r"Robot(\d+)_Odometry\.dat")
-MERGED = slamlog.LogLine("merged odometry", 0, "")
+MERGED = log_lines.LogLine("merged odometry", 0, "")
 
-TimedReadings = list[tuple[slamlog.LogLine, slamlog.Reading]]
+TimedReadings = list[tuple[log_lines.LogLine, slamlog.Reading]]
 
 
 def read_utias(folder: Path, *, robot: int | None = None) -> slamlog.SlamLog:
@@ -221,7 +221,7 @@ def _timed_table(path: Path, form: str) -> Array:
     return np.array([[line.to_real(x) for x in line.text.split()] for line in lines])
 
 
-def _timed_lines(path: Path, form: str) -> list[slamlog.LogLine]:
+def _timed_lines(path: Path, form: str) -> list[log_lines.LogLine]:
     """Read lines whose first field is a time that does not decrease."""
     lines, before = _lines(path, form), -np.inf
     for line in lines:
@@ -232,11 +232,13 @@ def _timed_lines(path: Path, form: str) -> list[slamlog.LogLine]:
     return lines
 
 
-def _lines(path: Path, form: str) -> list[slamlog.LogLine]:
+def _lines(path: Path, form: str) -> list[log_lines.LogLine]:
     """Read the lines without comments; each has as many fields as the form."""
     if not path.is_file():
         raise slamlog.LogError(f"{path.parent}: expected {path.name}, got no such file")
-    lines = [line for line in slamlog.read_lines(path) if not line.text.startswith("#")]
+    lines = [
+        line for line in log_lines.read_lines(path) if not line.text.startswith("#")
+    ]
     for line in lines:
         line.check_count(line.text.split(), (len(form.split()),), form)
     if not lines:

@@ -1,0 +1,177 @@
+"""Lines of a text log with their places in the file, which errors name."""
+
+from __future__ import annotations
+
+import math
+import os
+import stat
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+
+from ...sim_configs.atomic_file import replace_when_written
+
+MAX_ID_DIGITS = 18  # every such number fits int64
+MAX_SHOWN = 60  # characters of a wrong text that an error repeats
+
+
+class LogError(ValueError):
+    """A log cannot be read or written; the message names file and reason in a line."""
+
+
+class LogLine(NamedTuple):
+    """One line of a log and its place in the file.
+
+    Attributes
+    ----------
+    file : str
+        Path of the file, as the caller gave it.
+    number : int
+        Line number, counted from 1.
+    text : str
+        The line without surrounding white space.
+
+    Examples
+    --------
+    >>> line = LogLine("drive.csv", 7, "odometry,1,east")
+    >>> line.to_real("2.5")
+    2.5
+    >>> line.to_real("east")
+    Traceback (most recent call last):
+    slamgym.experiments.logs.slamlog.LogError: drive.csv, line 7: expected a finite \
+number, got 'east'
+    """
+
+    file: str
+    number: int
+    text: str
+
+    def error(self, expected: str, got: str) -> LogError:
+        """Return an error with this line, what was expected, and what was found."""
+        return LogError(
+            f"{self.file}, line {self.number}: expected {expected}, got {got}"
+        )
+
+    def to_real(self, field: str) -> float:
+        """Read a finite number; raise LogError for anything else."""
+        try:
+            value = float(field)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value) or "_" in field:
+            raise self.error("a finite number", shown(field))
+        return value
+
+    def to_id(self, field: str) -> int:
+        """Read a whole number >= 0; raise LogError for anything else."""
+        if not (field.isascii() and field.isdigit() and len(field) <= MAX_ID_DIGITS):
+            raise self.error("an id (a whole number >= 0)", shown(field))
+        return int(field)
+
+    def check_count(
+        self, fields: list[str], counts: tuple[int, ...], form: str
+    ) -> None:
+        """Raise LogError unless the number of fields is one of ``counts``."""
+        if len(fields) not in counts:
+            raise self.error(form, f"{len(fields)} fields in {shown(self.text)}")
+
+
+def shown(text: str) -> str:
+    """Quote a text for an error message, cut to a readable length.
+
+    Examples
+    --------
+    >>> shown("east")
+    "'east'"
+    """
+    quoted = repr(text[: MAX_SHOWN + 1])
+    return quoted if len(quoted) <= MAX_SHOWN else quoted[:MAX_SHOWN] + "…"
+
+
+def to_lines(text: str, file: str) -> list[LogLine]:
+    r"""Split a text into lines, without blank ones.
+
+    Raises
+    ------
+    LogError
+        If no line is left.
+
+    Examples
+    --------
+    >>> [line.number for line in to_lines("a\n\n  b\n", "notes.txt")]
+    [1, 3]
+    """
+    stripped = (line.strip() for line in text.split("\n"))
+    lines = [LogLine(file, k, line) for k, line in enumerate(stripped, 1) if line]
+    if not lines:
+        raise LogLine(file, 1, "").error("a log", "an empty file")
+    return lines
+
+
+class ReadFile(PathLike[str]):
+    """The path of a file with its content, which a pipe gives only once.
+
+    Raises
+    ------
+    LogError
+        If it is a device, such as /dev/zero, whose content may have no end.
+    OSError
+        If it cannot be opened.
+    """
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        self._path = os.fspath(path)
+        mode = os.stat(self._path).st_mode
+        if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
+            raise LogError(f"{path} must be a file or a pipe, got a device")
+        self.content = Path(path).read_bytes()
+
+    def __fspath__(self) -> str:
+        return self._path
+
+    def __str__(self) -> str:
+        return self._path
+
+
+def read_lines(path: str | PathLike[str]) -> list[LogLine]:
+    """Read the lines of a UTF-8 text file that are not blank.
+
+    Raises
+    ------
+    LogError
+        If the file is no UTF-8 text, empty, or a device.
+    OSError
+        If the file cannot be opened.
+    """
+    data = (path if isinstance(path, ReadFile) else ReadFile(path)).content
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = LogLine(str(path), data.count(b"\n", 0, error.start) + 1, "")
+        wrong = f"byte 0x{data[error.start]:02x}"
+        raise line.error("UTF-8 text", wrong) from None
+    return to_lines(text, str(path))
+
+
+def write_whole(path: str | PathLike[str], text: str) -> None:
+    """Write a UTF-8 text file, which appears complete or not at all.
+
+    Raises
+    ------
+    LogError
+        If the file cannot be written.
+    """
+    target = Path(path).resolve()
+    if target.exists() and not target.is_file():
+        raise LogError(f"{path}: cannot be written: not a regular file")
+    try:
+        with (
+            replace_when_written(target) as partial,
+            partial.open("x", encoding="utf-8", newline="\n") as stream,
+        ):
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+    except OSError as error:
+        reason = error.strerror or error
+        raise LogError(f"{path}: cannot be written: {reason}") from error
