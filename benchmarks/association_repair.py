@@ -20,6 +20,7 @@ import numpy as np
 from association import LOST, Scan, drive, follow, make, worlds
 
 from slamgym.estimator.smoother import Drive, reassociate, smooth
+from slamgym.estimator.smoother.batch_smoother import smooth_repaired
 from slamgym.evaluation import oracle_errors
 from slamgym.sim_configs import Scenario, load_scenario
 
@@ -63,7 +64,7 @@ def row_of(world: Scenario, seed: int, hypotheses: int) -> list[float]:
     begin = time.process_time()
     found = reassociate(made)
     seconds = time.process_time() - begin
-    repaired = error_of(smooth(found.drive, start=found.poses).poses, scans)
+    repaired = error_of(smooth_repaired(found).poses, scans)
     real = [scan.ids >= 0 for scan in scans]
     clean = [
         s._replace(readings=s.readings[r]) for s, r in zip(scans, real, strict=True)

@@ -17,9 +17,8 @@ from ...estimator.smoother import (
     SmoothedDrive,
     SmoothingSlam,
     reassociate,
-    smooth,
 )
-from ...estimator.smoother.batch_smoother import smoother_in
+from ...estimator.smoother.batch_smoother import smooth_repaired, smoother_in
 from ...estimator.smoother.drive import Sightings
 from ...evaluation import nees
 from ..logs.ground_truth import path_accuracy, true_landmarks_of, true_poses_of
@@ -103,7 +102,7 @@ def smooth_log(
                 start=filtered.trace.poses[_scan_steps(log)],
                 progress=repairing or _unwatched,
             )
-            drive = smooth(repair.drive, start=repair.poses, **recorder.kernel)
+            drive = smooth_repaired(repair, **recorder.kernel)
         elif smoother is not None:
             drive = smoother.smoothed()
     if not isinstance(drive, SmoothedDrive):
