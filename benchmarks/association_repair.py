@@ -72,12 +72,13 @@ def row_of(world: Scenario, seed: int, hypotheses: int) -> list[float]:
     truth = recorded(world, clean, [s.ids[r] for s, r in zip(scans, real, strict=True)])
     least = error_of(smooth(truth).poses, scans)
     landmarks = {int(i) for scan in scans for i in scan.ids if i >= 0}
+    points = np.array(getattr(world.landmarks, "points", [])).reshape(-1, 2)
     oracle = oracle_errors(
         np.array([scan.pose for scan in scans]),
         [scan.readings for scan in scans],
         [scan.ids for scan in scans],
-        np.arange(len(world.landmarks.points or ())),
-        np.array(world.landmarks.points or np.empty((0, 2))),
+        np.arange(len(points)),
+        points,
         world.sensor.std,
         range_std_per_metre=world.sensor.range_std_per_metre,
     )

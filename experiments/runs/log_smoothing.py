@@ -10,7 +10,7 @@ import numpy as np
 
 from ... import __version__
 from ...arrays import Array, IntArray
-from ...estimator.interface import SlamEstimator
+from ...estimator.interface import SlamEstimator, SmoothedPath
 from ...estimator.smoother import (
     Drive,
     Reassociation,
@@ -93,7 +93,8 @@ def smooth_log(
             "to smooth"
         )
     smoother = smoother_in(slam)  # of the hypothesis that is the best one now
-    repair, drive = None, None
+    repair: Reassociation | None = None
+    drive: SmoothedPath | None = None
     with one_blas_thread():
         recorder = getattr(slam, "filter", slam)
         if associate and isinstance(recorder, SmoothingSlam):
