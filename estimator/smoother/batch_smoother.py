@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +22,7 @@ from ..support.argument_checks import LandmarkIds
 from .drive import Drive, path_between
 from .elimination import conditionals
 from .optimiser import KINDS, Estimate, Noise, Optimiser, Solution, factorised, start_of
-from .reassociation import reassociate
+from .reassociation import Reassociation, reassociate
 
 ITERATIONS = 5  # of an update of the filter that gives the second start
 SCALES = {"huber": 1.345, "cauchy": 2.3849}  # 95 % efficient without outliers
@@ -95,14 +95,30 @@ def smooth(
     argument_checks.above("tolerance", tolerance, 0.0)
     if associate:
         poses = None if start is None or isinstance(start, Belief) else start
-        found = reassociate(drive, start=poses)
-        drive, start, landmarks = found.drive, found.poses, None
+        return smooth_repaired(
+            reassociate(drive, start=poses),
+            robust=robust,
+            robust_scale=robust_scale,
+            tolerance=tolerance,
+            iterations=iterations,
+        )
     noise = Noise(drive.rules, *robust_kernel(robust, robust_scale))
     arrays, order = drive.arrays()
     optimiser = Optimiser(arrays, noise)
     starts = _starts(drive, start, _places(landmarks or {}, order), order)
-    solution = _best(optimiser, starts, tolerance, iterations)
-    return SmoothedDrive(optimiser, solution, order.tolist(), drive)
+    found = _best(optimiser, starts, tolerance, iterations)
+    return SmoothedDrive(optimiser, found, order.tolist(), drive)
+
+
+def smooth_repaired(found: Reassociation, **options: Any) -> SmoothedDrive:
+    """Smooth a drive with repaired associations, by further keywords of `smooth`.
+
+    It starts from the poses of the repair, and from those of a filter if that fails.
+    """
+    try:
+        return smooth(found.drive, start=found.poses, **options)
+    except np.linalg.LinAlgError:
+        return smooth(found.drive, **options)
 
 
 def robust_kernel(robust: str | None, scale: float | None) -> tuple[float, float]:

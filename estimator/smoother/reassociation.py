@@ -215,8 +215,7 @@ class _Search:
         labels = np.full_like(labels, NONE)
         labels[used] = slots
         score = found.cost + PRICE * float((~used).sum())
-        at = found.estimate.poses
-        score += MISS * self.missed(at, places, labels)
+        score += MISS * self.missed(found.estimate.poses, places, labels)
         score += len(rows) * (self.log_area - math.log(2 * math.pi))
         score += float(np.linalg.slogdet(information)[1]) / 2
         covariance = inverse[np.ix_(entries, entries)]

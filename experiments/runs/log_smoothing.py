@@ -10,16 +10,15 @@ import numpy as np
 
 from ... import __version__
 from ...arrays import Array, IntArray
-from ...estimator.interface import SlamEstimator
+from ...estimator.interface import SlamEstimator, SmoothedPath
 from ...estimator.smoother import (
     Drive,
     Reassociation,
     SmoothedDrive,
     SmoothingSlam,
     reassociate,
-    smooth,
 )
-from ...estimator.smoother.batch_smoother import smoother_in
+from ...estimator.smoother.batch_smoother import smooth_repaired, smoother_in
 from ...estimator.smoother.drive import Sightings
 from ...evaluation import nees
 from ..logs.ground_truth import path_accuracy, true_landmarks_of, true_poses_of
@@ -94,7 +93,8 @@ def smooth_log(
             "to smooth"
         )
     smoother = smoother_in(slam)  # of the hypothesis that is the best one now
-    repair, drive = None, None
+    repair: Reassociation | None = None
+    drive: SmoothedPath | None = None
     with one_blas_thread():
         recorder = getattr(slam, "filter", slam)
         if associate and isinstance(recorder, SmoothingSlam):
@@ -103,7 +103,7 @@ def smooth_log(
                 start=filtered.trace.poses[_scan_steps(log)],
                 progress=repairing or _unwatched,
             )
-            drive = smooth(repair.drive, start=repair.poses, **recorder.kernel)
+            drive = smooth_repaired(repair, **recorder.kernel)
         elif smoother is not None:
             drive = smoother.smoothed()
     if not isinstance(drive, SmoothedDrive):
