@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from slamgym import make_estimator
+from slamgym import InvariantEkfSlam
 from slamgym.estimator import Sensor, check_sensor
 
 Pair = tuple[Any, Any]
@@ -50,11 +50,8 @@ SONAR = Sensor(
 def main() -> None:
     """Check the sensor, and map a rock with it and a compass."""
     check_sensor(SONAR, measurement_std=(0.02, 1e-4))
-    slam = make_estimator(
-        "invariant",
-        motion_std=(0.02, 0.02, 0.02),
-        measurement_std=(0.02, 1e-4),
-        sensor=SONAR,
+    slam = InvariantEkfSlam(
+        motion_std=(0.02, 0.02, 0.02), measurement_std=(0.02, 1e-4), sensor=SONAR
     )
     rng, rock = np.random.default_rng(0), (8.0, 3.0)
     for step in range(20):
