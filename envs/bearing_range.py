@@ -15,7 +15,8 @@ Every function accepts leading axes for worlds that are simulated together.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from importlib import import_module
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -59,7 +60,7 @@ class BearingRangeSensor:
         self._half_view: Limit = _limit(sensor.field_of_view / 2, above=math.pi)
         self._grows = sensor.range_std_per_metre > 0
         self._settings = SensorSettings.of(sensor)
-        self._reads_positions = sensor.kind == "position"
+        self._reads_places, self._wraps = _reading_of_places(sensor.kind)
         self._reads_ranges = sensor.kind == "range"
         self._reads_one = sensor.kind in ("bearing", "range")
         faults = scenario.present_faults
@@ -121,9 +122,11 @@ class BearingRangeSensor:
         mask = _in_view(readings, nearest, max_range, half_view)
         if self._sight is not None:
             mask &= ~self._sight.blocked(landmarks, position)
-        if self._reads_positions:
-            readings[0], readings[1] = x, y
+        if self._reads_places is not None:
+            readings[0], readings[1] = self._reads_places(x, y)
             readings += error
+            if self._wraps is not None:
+                wrap_bearings(readings[self._wraps])
         else:
             self._disturb(readings, error, settings or self._settings)
         if np.count_nonzero(mask) < mask.size:
@@ -146,6 +149,24 @@ class BearingRangeSensor:
             if self._reads_ranges:
                 bearings[...] = readings[1]
             readings[1] = 0.0
+
+
+def _reading_of_places(kind: str) -> tuple[Any, int | None]:
+    """Return what maps (x, y) to a reading, and which number of it is an angle.
+
+    Both are None for the sensors of bearings and ranges.  A kind "module:SENSOR" is a
+    sensor that the user has written.
+    """
+    module, colon, name = kind.partition(":")
+    if not colon:
+        return (lambda x, y: (x, y)) if kind == "position" else None, None
+    try:
+        own = getattr(import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"cannot import sensor.kind = '{kind}': {error}") from error
+    return (lambda x, y: own.h(x, y)[0]), next(
+        (row for row, is_angle in enumerate(own.wraps) if is_angle), None
+    )
 
 
 def _in_view(

@@ -57,6 +57,8 @@ def _ends(scenario: Scenario, longest: float) -> tuple[Array, Array]:
             return np.array([-np.pi, 0.0]), np.array([np.pi, 1.0])
         case "range":
             return np.zeros(2), np.array([longest, 1.0])
+        case kind if ":" in kind:  # a sensor of the user's own
+            return np.full(2, -np.inf), np.full(2, np.inf)
     return np.array([-np.pi, 0.0]), np.array([np.pi, longest])
 
 

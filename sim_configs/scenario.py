@@ -131,15 +131,17 @@ class Sensor(Part):
     """The sensor: what it reads, its noise, its field of view and its failures.
 
     A sensor of one number has (σ, 0) as its `std`, and 0 as the second number of its
-    readings.
+    readings.  A sensor of your own is simulated by its function h.
     """
 
     kind: Annotated[
-        Literal["bearing_range", "position", "bearing", "range"],
-        expect("'bearing_range', 'position', 'bearing' or 'range'"),
+        str,
+        Field(pattern=r"^(bearing_range|position|bearing|range|[\w.]+:\w+)$"),
+        expect("'bearing_range', 'position', 'bearing', 'range' or 'module:SENSOR'"),
     ] = setting(
         "bearing_range",
-        "what one reading holds: (β, r), (x, y) in the robot's frame, β, or r",
+        "what one reading holds: (β, r), (x, y) in the robot's frame, β, r, or the "
+        "numbers of a sensor of your own, 'module:SENSOR'",
     )
     std: MeasurementStd = Field(
         description="of one reading: (σβ, σr) [rad, m], (σx, σy) [m], (σβ, 0), (σr, 0)"
@@ -187,7 +189,7 @@ class Sensor(Part):
             yield f"identities must be true with kind = '{kind}', got false"
         if kind in ("bearing", "range") and self.std[1] != 0:
             yield f"std must be (σ, 0) with kind = '{kind}', got {self.std}"
-        if kind in ("position", "bearing") and self.range_std_per_metre:
+        if kind not in ("bearing_range", "range") and self.range_std_per_metre:
             yield (
                 f"range_std_per_metre must be 0 with kind = '{kind}', "
                 f"got {self.range_std_per_metre}"
@@ -458,7 +460,7 @@ class Scenario(Part):
         if drive == "bicycle" and self.walls:
             yield "walls must be empty with robot.drive = 'bicycle'"
         for name, kinds in (("bearing_bias", "bearing"), ("range_bias", "range")):
-            if getattr(faults, name) and kinds not in kind:
+            if getattr(faults, name) and (kinds not in kind or ":" in kind):
                 yield f"faults.{name} must be 0 with sensor.kind = '{kind}'"
         if drive == "bicycle":
             distances, turns = np.abs(command_cycle(self.controls, self.dt)).T

@@ -5,6 +5,7 @@ import pytest
 from gymnasium.utils import seeding
 from gymnasium.utils.env_checker import check_env
 
+from slamgym import make_estimator
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.envs.controllers import make_controller, planned_path
 from slamgym.envs.drives import drive_of
@@ -177,7 +178,7 @@ def test_faults_of_the_odometry_pass_through_the_drive():
             },
             "controls must turn by at most",
         ),
-        ({"sensor": {"kind": "sonar"}}, "'position', 'bearing' or 'range'"),
+        ({"sensor": {"kind": "sonar"}}, "'bearing', 'range' or 'module:SENSOR', got 'sonar'"),
         ({"sensor": {"kind": "bearing"}}, r"sensor.std must be \(σ, 0\)"),
         ({"sensor": {"kind": "position", "identities": False}}, "identities must be"),
         (
@@ -217,3 +218,54 @@ def test_pictures_show_a_ray_of_each_reading():
     np.testing.assert_array_equal(drawn_readings("range", rows), 0.0)
     np.testing.assert_array_equal(drawn_readings("position", rows), [[0.0, 0.5]])
     assert drawn_readings("bearing_range", rows) is rows
+
+
+SONAR = """
+import numpy as np
+from slamgym.estimator import Sensor
+
+def h(x, y):
+    squared = x * x + y * y
+    r = np.sqrt(squared)
+    slopes = -y / squared, x / squared, 2 * x / r / 1500, 2 * y / r / 1500
+    return (np.arctan2(y, x), 2 * r / 1500), slopes
+
+def inverse(bearing, delay):
+    return 750 * delay * np.cos(bearing), 750 * delay * np.sin(bearing)
+
+NAMES = ("bearing", "delay"), ("rad", "s")
+ECHO = Sensor("sonar:ECHO", *NAMES, h, inverse, (True, False))
+"""
+
+
+def test_a_world_simulates_a_sensor_of_the_user(tmp_path, monkeypatch):
+    (tmp_path / "sonar.py").write_text(SONAR)
+    monkeypatch.syspath_prepend(tmp_path)
+    own = {"kind": "sonar:ECHO", "std": (0.02, 2e-4)}
+    plain, echoes = (
+        LandmarkWorldEnv("six_landmarks", sensor=sensor)
+        for sensor in ({"kind": "bearing_range", "std": (0.02, 0.15)}, own)
+    )
+    world = load_scenario("six_landmarks").with_changes(sensor=own)
+    slam = make_estimator(
+        "invariant",
+        motion_std=world.motion.std,
+        measurement_std=world.sensor.std,
+        **world.models,
+    )
+    first, second = plain.reset(seed=3)[0], echoes.reset(seed=3)[0]
+    for _ in range(20):
+        assert echoes.observation_space.contains(second)
+        scaled = second["landmarks"] * [1.0, 750.0]  # 1500 m/s, there and back
+        np.testing.assert_allclose(scaled, first["landmarks"], atol=1e-9)
+        seen = np.flatnonzero(second["mask"])
+        slam.update(second["landmarks"][seen], seen)
+        first, second = plain.step([0.5, 0.2])[0], echoes.step([0.5, 0.2])[0]
+        slam.predict(second["odometry"])
+    assert len(slam.belief().landmark_ids) == 6
+
+
+def test_a_sensor_that_cannot_be_imported_is_named():
+    own = {"kind": "no_such_module:ECHO", "std": (0.02, 2e-4)}
+    with pytest.raises(ValueError, match="no_such_module"):
+        LandmarkWorldEnv("six_landmarks", sensor=own)
