@@ -46,9 +46,6 @@ SPREAD = 40.0
 #: Associations tried in a scan, for each hypothesis kept.
 TRIED = 4
 
-#: A hypothesis is reported until another one is e^5 times more probable.
-DECISIVE = 10.0
-
 #: Most hypotheses whose poses overlap.
 PER_BASIN = 3
 
@@ -138,9 +135,7 @@ class HypothesisSlam:
     of the scans are added.  Hypotheses beyond the number that the policy allows, and
     those e^20 times less probable than the best one, are discarded (Reid 1979), and so
     are variants of the better ones whose poses overlap with theirs.  The belief and the
-    reports are those of one hypothesis and its most probable continuation, until
-    another one is e^5 times more probable: a wrong loop closure often looks better for
-    a few scans.
+    reports are those of the most probable hypothesis.
 
     Parameters
     ----------
@@ -182,7 +177,7 @@ class HypothesisSlam:
         noise = motion_std, measurement_std
         make = partial(ManagedSlam, estimator, *noise, management=self._policy)
         self._pool = FilterPool(partial(make, **options))
-        #: The reported hypothesis, then the others, the most probable first.
+        #: The hypotheses, the most probable first.
         self.hypotheses = [Hypothesis(0.0, self._pool.fresh())]
         #: Number of steps taken.
         self.steps = 0
@@ -190,7 +185,7 @@ class HypothesisSlam:
 
     @property
     def best(self) -> ManagedSlam:
-        """The filter of the reported hypothesis."""
+        """The filter of the most probable hypothesis."""
         return self.hypotheses[0].slam
 
     @property
@@ -200,7 +195,7 @@ class HypothesisSlam:
 
     @property
     def filter(self) -> SlamEstimator:
-        """The filter inside the reported hypothesis."""
+        """The filter inside the most probable hypothesis."""
         return self.best.filter
 
     @property
@@ -215,7 +210,7 @@ class HypothesisSlam:
 
     @property
     def decisions(self) -> Sequence[ScanDecisions]:
-        """The decisions of the reported hypothesis about the scans so far."""
+        """The decisions of the most probable hypothesis about the scans so far."""
         return self.best.decisions
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
@@ -278,7 +273,7 @@ class HypothesisSlam:
         Returns
         -------
         UpdateReport
-            That of the reported hypothesis.
+            That of the most probable hypothesis.
         """
         readings = argument_checks.scan(measurements)
         views = (h.slam.bookmark_views() for h in self.hypotheses)
@@ -297,35 +292,30 @@ class HypothesisSlam:
                     (h.cost, k, partial(h.slam.as_given, readings, landmark_ids))
                     for k, h in enumerate(self.hypotheses)
                 ]
-                options.sort(key=lambda option: option[:2])
             plans = [complete() for _, _, complete in options]
-            return self._take(readings, options, plans)
+            slams = self._branches([k for _, k, _ in options])
+            return self._take(readings, [cost for cost, *_ in options], plans, slams)
 
     def _take(
         self,
         readings: Array,
-        options: Sequence[Option],
+        costs: Sequence[float],
         plans: Sequence[ScanAssociation],
+        slams: Sequence[ManagedSlam],
     ) -> UpdateReport:
         """Update filters by their associations, and continue with the best of them."""
-        slams = self._branches([k for _, k, _ in options])
         begun, steps = [slam.steps for slam in slams], self.steps + 1
-        heirs = {
-            id(slam) for slam, (_, k, _) in zip(slams, options, strict=True) if not k
-        }
-        taken: list[Hypothesis] = []
+        taken: tuple[UpdateReport, list[Hypothesis]] | None = None
 
         def finish() -> UpdateReport:
-            if not taken:
-                costs = [cost for cost, *_ in options]
+            nonlocal taken
+            if taken is None:
                 branches = zip(costs, plans, slams, begun, strict=True)
-                taken.extend(self._advance(readings, branches))
-            least = taken[0].cost  # the first is the most probable
-            kept = [Hypothesis(h.cost - least, h.slam) for h in taken]
-            same = [h for h in kept if id(h.slam) in heirs and h.cost <= DECISIVE]
-            kept.sort(key=lambda h: h not in same[:1])
+                taken = self._advance(readings, branches)
+            self._report, hypotheses = taken
+            least = hypotheses[0].cost
+            kept = [Hypothesis(h.cost - least, h.slam) for h in hypotheses]
             self._keep(kept, slams)
-            self._report = self.best.report() or UpdateReport()
             self.steps = steps
             return self._report
 
@@ -356,11 +346,11 @@ class HypothesisSlam:
             self._keep(self.hypotheses[:1])
 
     def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
-        """Return the belief of the reported hypothesis."""
+        """Return the belief of the most probable hypothesis."""
         return self.best.belief(landmark_ids)
 
     def map_view(self) -> MapView:
-        """Return the pose and map of the reported hypothesis without a copy."""
+        """Return the pose and map of the most probable hypothesis without a copy."""
         return self.best.map_view()
 
     def state_dict(self) -> dict[str, Any]:
@@ -429,19 +419,20 @@ class HypothesisSlam:
         self,
         readings: Array,
         branches: Iterable[tuple[float, ScanAssociation, ManagedSlam, int]],
-    ) -> list[Hypothesis]:
+    ) -> tuple[UpdateReport, list[Hypothesis]]:
         """Update the filters that have not taken a step since; drop those that fail."""
-        kept, errors = [], []
+        reports, kept, errors = [], [], []
         for cost, plan, slam, steps in branches:
             try:
                 if slam.steps == steps:
                     slam.take(readings, partial(_the_plan, plan))
+                reports.append(slam.report() or UpdateReport())
                 kept.append(Hypothesis(cost, slam))
             except (np.linalg.LinAlgError, MemoryError) as error:
                 errors.append(error)
         if not kept:
             raise errors[0]
-        return distinct(kept, self._policy.hypotheses)
+        return reports[0], distinct(kept, self._policy.hypotheses)
 
     def _keep(
         self, hypotheses: list[Hypothesis], others: Sequence[ManagedSlam] = ()

@@ -413,6 +413,6 @@ class SmoothedDrive:
 
 
 def smoother_in(slam: SlamEstimator) -> SupportsSmoothing | None:
-    """Return the smoother, that of the reported hypothesis; None without one."""
+    """Return the smoother, that of the most probable hypothesis; None without one."""
     inner = slam.best if isinstance(slam, HypothesisSlam) else slam
     return inner if isinstance(inner, SupportsSmoothing) else None

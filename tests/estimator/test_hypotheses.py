@@ -8,9 +8,7 @@ from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import EkfSlam, UpdateReport, make_estimator
 from slamgym.estimator.association import scan_assignments
 from slamgym.estimator.interface import MapView
-from slamgym.estimator.map_management import hypotheses
 from slamgym.estimator.map_management.hypotheses import (
-    DECISIVE,
     OVERLAP,
     PER_BASIN,
     FilterPool,
@@ -317,30 +315,7 @@ def test_a_hypothesis_whose_filter_fails_is_discarded(slippery_drive):
     slam.predict(odometry)
     slam.update(readings)
     assert failing not in [h.slam for h in slam.hypotheses]
-    assert min(h.cost for h in slam.hypotheses) == 0.0
-
-
-@pytest.mark.parametrize(
-    ("lead", "is_same"), [(DECISIVE - 0.1, True), (DECISIVE + 0.1, False)]
-)
-def test_a_hypothesis_is_reported_until_another_one_is_decisively_better(
-    lead, is_same, slippery_drive, monkeypatch
-):
-    world, scans = slippery_drive
-    slam, _ = several_hypotheses(scans, world)
-    monkeypatch.setattr(hypotheses, "distinct", lambda found, _: list(found))
-    first, second = (h.slam for h in slam.hypotheses[:2])
-    for hypothesis in slam.hypotheses[1:]:
-        hypothesis.cost = 0.0
-    slam.hypotheses[0].cost = lead
-    nothing = np.empty((0, 2))
-    for _ in range(2):  # the leader stays ahead by as much
-        report = slam.update(nothing, [])
-        assert (slam.best is first) == is_same
-        assert report is slam.best.report()
-        costs = {id(h.slam): h.cost for h in slam.hypotheses}
-        assert costs[id(second)] == 0.0
-        assert costs[id(first)] == pytest.approx(lead)
+    assert slam.hypotheses[0].cost == 0.0
 
 
 def test_where_every_filter_fails_nothing_has_changed(slippery_drive, monkeypatch):

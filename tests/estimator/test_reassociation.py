@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from slamgym.estimator.models.unicycle_motion import predict_pose
 
 from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.motions import predict_pose
 from slamgym.estimator.smoother import Drive, reassociate, smooth
 from slamgym.estimator.smoother.drive import Sightings
 from slamgym.estimator.smoother.reassociation import NONE, PRICE, _Search
