@@ -4,6 +4,8 @@
 together and with batched filters.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path

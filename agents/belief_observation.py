@@ -3,6 +3,8 @@
 `BeliefObservation` wraps one world, and `BeliefObservationVector` many.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import Any, SupportsFloat, cast
 

@@ -1,5 +1,7 @@
 """Estimators in the loop of an agent: construction, and checks of their beliefs."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace

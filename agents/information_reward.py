@@ -14,6 +14,8 @@ other states. So P has a fixed size, and the decreases of a criterion over an ep
 add up to its first value minus its last.
 """
 
+from __future__ import annotations
+
 import math
 from typing import Any, SupportsFloat
 

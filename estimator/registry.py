@@ -55,6 +55,7 @@ def register_estimator(name: str, factory: EstimatorFactory) -> None:
 
     Examples
     --------
+    >>> from slamgym.estimator import EkfSlam
     >>> register_estimator("mine", EkfSlam)
     >>> "mine" in list_estimators()
     True
@@ -271,6 +272,7 @@ def accepted_options(
 
     Examples
     --------
+    >>> from slamgym.estimator import EkfSlam
     >>> accepted_options(EkfSlam, {"min_range": 0.1, "colour": "red"})
     {'min_range': 0.1}
     """

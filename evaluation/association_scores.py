@@ -16,6 +16,8 @@ stands at the end of the run::
 Readings before the confirming one count where the filter applied them in the end.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple

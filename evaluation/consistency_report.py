@@ -5,6 +5,8 @@ sum is not chi-square, and such a test rejects a consistent filter far more ofte
 stated.  Every sum here is over independent numbers: one per run, or innovations.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cache
 

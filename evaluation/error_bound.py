@@ -16,6 +16,8 @@ References
    discrete-time nonlinear filtering, IEEE Trans. Signal Processing 46(5), 1998.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

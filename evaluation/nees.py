@@ -8,6 +8,8 @@ frame of its error, additive or invariant
 rejects even a consistent filter if the heading is uncertain.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from ..arrays import Array

@@ -8,6 +8,8 @@ well as over runs. Every test of `noise_findings` therefore has a known distribu
 any number of runs or steps.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 

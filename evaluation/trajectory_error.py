@@ -5,6 +5,8 @@ positions are compared twice: as they are (raw), and after the rotation and tran
 that bring them closest to the truth (aligned). Scale is never adapted.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

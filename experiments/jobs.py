@@ -7,6 +7,8 @@ writer. A manifest lists its other files with their digests; what slamgym did no
 there, or what was changed since, is refused or set aside, and never lost.
 """
 
+from __future__ import annotations
+
 import contextlib
 import hashlib
 import json

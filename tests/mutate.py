@@ -54,6 +54,7 @@ TESTS = {
     "estimator/models/bearing_range": "motions bearing_range ekf_slam",
     "estimator/models/rigid_motion": "error_frames submaps joining ekf_slam",
     "estimator/models/motions": "motions ekf_slam",
+    "estimator/models/sensors": "sensors",
     "estimator/kernels/assignment_search": "joint_assignment constellations",
     "estimator/kernels/batch": "batch",
     "estimator/kernels/drive_likelihood": "drive_likelihood",

@@ -4,6 +4,8 @@ The functions below it compute what is drawn: the limits of the axes, the area t
 sensor sees, and the ellipses of a belief.
 """
 
+from __future__ import annotations
+
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np

@@ -1,5 +1,7 @@
 """filterpy's Kalman filters; a new filter object wherever the map has grown."""
 
+from __future__ import annotations
+
 import numpy as np
 from filterpy.kalman import (
     ExtendedKalmanFilter,

@@ -11,6 +11,8 @@ odometry factor x_k⁻¹ x_{k+1} = (d, 0, α) has its noise in the frame of the 
 heading: its covariance is R(α)ᵀ diag(σx², σy²) R(α) and σα².
 """
 
+from __future__ import annotations
+
 from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any

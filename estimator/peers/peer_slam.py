@@ -3,6 +3,8 @@
 `PeerSlam` is the base of all adapters, and `KalmanPeer` that of Kalman filters.
 """
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, NamedTuple

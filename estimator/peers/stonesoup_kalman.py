@@ -4,6 +4,8 @@ Stone Soup has no model of SLAM: it gets one of the motion and one of the readin
 the whole state, with their Jacobians, and bearings of its own type, which wrap.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar

@@ -1,4 +1,4 @@
-"""Repair the association of a drive: which readings are of which landmark.
+"""Repair the association of a drive: find the landmark of each reading.
 
 `reassociate` alternates smoothing and association.  It accepts a change if that lowers
 the score of the whole drive ::
@@ -31,7 +31,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import linear_sum_assignment
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit
@@ -256,6 +255,8 @@ class _Search:
 
     def assigned(self, costs: Array) -> IntArray:
         """Return the landmark of each reading by costs (M, m), one to one in a scan."""
+        from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 (slow)
+
         m = costs.shape[1]
         labels = np.where(costs.min(axis=1) < PRICE, costs.argmin(axis=1), m)
         keys, counts = np.unique(self.owners * (m + 1) + labels, return_counts=True)

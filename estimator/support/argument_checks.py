@@ -3,6 +3,8 @@
 Those of every step take well-formed arguments through without a copy.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping, Sequence
 from math import inf, isfinite
 from typing import Any

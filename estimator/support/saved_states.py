@@ -1,5 +1,7 @@
 """Declared saved states: what each entry must be, checked by name before it is used."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any, NamedTuple

@@ -38,7 +38,7 @@ class LogLine(NamedTuple):
     2.5
     >>> line.to_real("east")
     Traceback (most recent call last):
-    slamgym.experiments.logs.slamlog.LogError: drive.csv, line 7: expected a finite \
+    slamgym.experiments.logs.log_lines.LogError: drive.csv, line 7: expected a finite \
 number, got 'east'
     """
 

@@ -1,5 +1,7 @@
 """Confidence intervals of the fitted parameters."""
 
+from __future__ import annotations
+
 from typing import Literal, NamedTuple
 
 import numpy as np

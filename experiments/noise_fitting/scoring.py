@@ -11,6 +11,8 @@ g_s    its score ∂ℓ_s/∂θ, by central differences
 I      Σ g_s g_sᵀ, the outer product of scores, which estimates the information
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise

@@ -1,5 +1,7 @@
 """Evaluate a fitted noise: replay the log before and after, summarise, and draw."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from typing import Any
 

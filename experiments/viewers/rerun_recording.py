@@ -1,5 +1,7 @@
 """Write a run of one or more filters as a recording for the viewer rerun."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any

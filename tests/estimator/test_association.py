@@ -153,7 +153,7 @@ def test_a_tentative_landmark_starts_where_it_was_read():
 
 def test_odometry_moves_a_tentative_landmark_and_its_doubt():
     one, motion_std = tracked([(0.7, 6.0)]), np.array([0.3, 0.2, 0.1])
-    moved = one.moved(1.5, 0.4, motion_std**2)
+    moved = one.moved((1.5, 0.0, 0.4), motion_std**2)
 
     def in_robot_frame(values):
         q, slip = values[:2], values[2:]
@@ -171,7 +171,8 @@ def test_odometry_moves_a_tentative_landmark_and_its_doubt():
 
 
 def test_a_sighting_corrects_a_tentative_landmark_like_any_filter():
-    one, reading = tracked([(0.7, 6.0)]).moved(1.0, 0.2, np.ones(3) * 0.01), (0.6, 5.2)
+    motion, reading = (1.0, 0.0, 0.2), (0.6, 5.2)
+    one = tracked([(0.7, 6.0)]).moved(motion, np.ones(3) * 0.01)
     P = np.zeros((5, 5))
     P[3:, 3:] = one.covariances[0]
     expected = predict_measurement(np.zeros(3), one.places)

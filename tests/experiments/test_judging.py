@@ -719,7 +719,7 @@ def test_a_program_in_c_is_judged(text_drives, tmp_path):
     compiler = next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
     if compiler is None:
         pytest.skip("there is no C compiler")
-    source = ROOT / "examples" / "15_judge_a_program_in_c.c"
+    source = ROOT / "examples" / "16_judge_a_program_in_c.c"
     program = tmp_path / "ekf_slam"
     strict = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror"]
     subprocess.run([compiler, *strict, source, "-o", program, "-lm"], check=True)

@@ -213,7 +213,7 @@ def test_every_float_survives_the_round_trip(tmp_path_factory, numbers, dt):
         ("odometer,1,3,0,1", "expected a row of landmark, odometry, measurement"),
         ("# a note", "expected # key: value, got '# a note'"),
         ("# unit: m", "expected each key of the header once, got unit again"),
-        ("# motion: arc", "expected turn-last or midpoint, got 'arc'"),
+        ("# motion: arc", "expected turn-last, midpoint or a drive, got 'arc'"),
         ("# start: 0,0", "expected # start: x,y,theta, got 2 fields"),
         ("# start: 0,0,north", "expected a finite number, got 'north'"),
     ],
@@ -271,7 +271,7 @@ def test_what_is_no_log_is_refused(tmp_path, content, message):
         ({"header": {"note": "two\nlines"}}, "expected a row of landmark"),
         ({"header": {"note": " margin"}}, "single lines without margins"),
         ({"header": {"a:b": "c"}}, "single lines without margins"),
-        ({"motion": "arc"}, "expected turn-last or midpoint"),
+        ({"motion": "arc"}, "expected turn-last, midpoint or a drive"),
     ],
 )
 def test_a_log_that_would_not_read_back_is_not_written(tmp_path, change, message):

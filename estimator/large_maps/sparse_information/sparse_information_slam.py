@@ -4,6 +4,8 @@
 its belief to a saved state and back.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from math import inf
 from typing import Any

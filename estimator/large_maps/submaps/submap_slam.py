@@ -3,6 +3,8 @@
 `SubmapSlam` is the public filter. `SubmapQueries` is the part of it that only reads.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

@@ -6,7 +6,7 @@ the EKF family takes the sensor.
 
 Run it::
 
-    python examples/16_your_own_sensor.py
+    python examples/15_your_own_sensor.py
 """
 
 from typing import Any
@@ -38,7 +38,7 @@ def inverse(bearing: Any, delay: Any) -> Pair:
 
 
 SONAR = Sensor(
-    "16_your_own_sensor:SONAR",
+    "15_your_own_sensor:SONAR",
     columns=("bearing", "delay"),
     units=("rad", "s"),
     h=h,

@@ -1,7 +1,7 @@
 /* An EKF-SLAM in C whose estimates slamgym judges.
  *
  *     slamgym generate six_landmarks --episodes 50 --controller open_loop --format slamlog --out drives
- *     cc -O2 examples/15_judge_a_program_in_c.c -o ekf_slam -lm
+ *     cc -O2 examples/16_judge_a_program_in_c.c -o ekf_slam -lm
  *     mkdir estimates
  *     ./ekf_slam estimates drives/shard_*\/seed_*.csv
  *     slamgym judge estimates --drives drives
