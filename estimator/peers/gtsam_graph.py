@@ -113,7 +113,7 @@ class GtsamSlam(PeerSlam):
 
     def _add_readings(self, readings: Readings) -> None:
         for (bearing, distance), slot, variance in zip(*readings, strict=True):
-            self._events.append((READING, bearing, distance, *variance, slot))
+            self._events.append((READING, bearing, distance, *variance, slot, 0.0))
             noise = gtsam.noiseModel.Diagonal.Variances(variance)
             self._graph.add(
                 gtsam.BearingRangeFactor2D(
@@ -123,7 +123,7 @@ class GtsamSlam(PeerSlam):
 
     def _solve(self) -> None:
         """Give the library what is new, and read its estimate."""
-        self._events.append((SOLVE, 0.0, 0.0, 0.0, 0.0, 0.0))
+        self._events.append((SOLVE, *[0.0] * 6))
         n = len(self._estimate[3:]) // 2
         self._optimise(self._graph, self._guess, n)
         self._graph, self._guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -167,7 +167,7 @@ class GtsamSlam(PeerSlam):
         return {
             "estimator": type(self).__name__,
             "first_pose": self._first.copy(),
-            "events": np.array(self._events, dtype=np.float64).reshape(-1, 6),
+            "events": np.array(self._events, dtype=np.float64).reshape(-1, 7),
             "landmark_ids": np.array(self.landmark_ids, dtype=np.int64),
         }
 
@@ -177,17 +177,17 @@ class GtsamSlam(PeerSlam):
         saved_states.refuse_other_state(state, entries, estimator=type(self).__name__)
         ids = saved_states.landmark_ids("landmark_ids", state["landmark_ids"])
         pose, std = saved_states.array("first_pose", state["first_pose"], (2, 3))
-        events = saved_states.array("events", state["events"], (-1, 6))
+        events = saved_states.array("events", state["events"], (-1, 7))
         self._slots = {i: slot for slot, i in enumerate(ids)}
         self._start(pose, std)
         rows: list[Array] = []
         for event in events:
             if event[0] == MOVE:
-                self._move(event[1:3], event[3:])
+                self._move(event[1:4], event[4:])
             elif event[0] == READING:
                 rows.append(event)
             else:
-                self._repeat(np.array(rows).reshape(-1, 6))
+                self._repeat(np.array(rows).reshape(-1, 7))
                 rows = []
 
     def _repeat(self, rows: Array) -> None:
