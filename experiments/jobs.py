@@ -1,6 +1,6 @@
 """Long jobs: blocks of runs that workers compute, kept in a folder of one writer.
 
-A job is a function of a block, which is a `range` of runs. `complete` computes the
+A job is a function of a block, which is a `range` of runs. `resume` computes the
 blocks that a folder lacks and keeps each as it comes, so that a job may be killed at
 any time and continues after its last complete block. The folder is `claimed` for one
 writer. A manifest lists its other files with their digests; what slamgym did not write
@@ -58,7 +58,7 @@ def blocks_of(runs: range, size: int) -> list[range]:
     return [runs[first : first + size] for first in range(0, len(runs), size)]
 
 
-def complete(
+def resume(
     work: Work[Result],
     missing: Sequence[range],
     keep: Callable[[range, Result], object],

@@ -25,7 +25,7 @@ from ...estimator.interface import SupportsTruth
 from ...estimator.support.memory_limit import usable_cores
 from ...evaluation.diagnosis import SMALLEST_NOISE
 from ...sim_configs import Scenario, load_scenario
-from ..jobs import Progress, blocks_of, complete, engage_workers
+from ..jobs import Progress, blocks_of, engage_workers, resume
 from ..runs.filter_settings import (
     EstimatorChoice,
     FilterSettings,
@@ -166,9 +166,7 @@ def monte_carlo(
         threads=None if workers is None else 1,
     )
     blocks = blocks_of(asked, size)
-    compute = partial(
-        complete, work, workers=workers, runs=len(asked), progress=progress
-    )
+    compute = partial(resume, work, workers=workers, runs=len(asked), progress=progress)
     with one_blas_thread():
         begun = perf_counter()
         factors = LESS_NOISE if small_noise else ()

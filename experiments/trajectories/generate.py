@@ -21,12 +21,12 @@ from ...sim_configs.field_types import unknown_choice
 from ..jobs import (
     Progress,
     claimed,
-    complete,
     difference,
     engage_workers,
     naming,
     remove,
     remove_leftovers,
+    resume,
     set_aside,
     staging_folder,
 )
@@ -137,7 +137,7 @@ def generate_trajectories(
         manifest = _begun(job, folder, versions, anything)
         with staging_folder(folder) as staging:
             shards = _Shards(folder, staging, manifest)
-            complete(
+            resume(
                 ShardWork(job, versions, staging),
                 shards.missing(),
                 shards.keep,
