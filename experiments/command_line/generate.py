@@ -38,7 +38,7 @@ class GenerateOptions(Options):
 
     episodes: int = declared(REQUIRED, "N", min=1)
     format_: str = declared("npz", "--format NAME")
-    shard: int | None = declared(None, "N", "100, fewer if they are large", min=1)
+    shard: int | None = declared(None, "N", "100, or fewer large ones", min=1)
     smallest_std: float | None = declared(None, "--smallest-std S", "0.001")
     believer: str | None = declared(None, "--estimator -e NAME", "none")
     out: Path | None = declared(None, "DIR", "results/<name>-<controller>-<format>")

@@ -33,8 +33,10 @@ class JudgeOptions(Options):
         The folder to write: new, empty, or with earlier output of slamgym.
     """
 
-    drives: Path | None = declared(None, "DIR", "the estimates, if generate wrote them")
-    truths: list[Path] | None = declared(None, "--truth FILE", "that of the drives")
+    drives: Path | None = declared(None, "DIR", "FILES, if generate wrote them")
+    truths: list[Path] | None = declared(
+        None, "--truth FILE", "the truth in the drives"
+    )
     covariances: str = declared("additive", "additive|invariant|right|left")
     frame: str = declared("invariant", "invariant|additive")
     align: str | None = declared(None, "fit|X,Y,THETA", "none")
