@@ -351,7 +351,7 @@ def test_the_errors_of_a_filter_are_no_stray_poses():
     ratios[1, 20:24] = 300.0  # it lasts
     assert not stray_poses(ratios, "abc")
     ratios[1, 21:24] = 1.0
-    assert "the first is step 20 of drive b: without" in stray_poses(ratios, "abc")
+    assert "the first is step 20 of drive b, and without" in stray_poses(ratios, "abc")
     ratios[2, ::4] = 300.0  # too many
     assert not stray_poses(ratios, "abc")
 
@@ -448,7 +448,7 @@ BROKEN = {
     ),
     "not in order": (
         lambda lines: [*lines[:3], lines[4], lines[3], *lines[5:]],
-        "pose 3 is of step 4, but each step needs one",
+        "pose 3 is that of step 4; each step needs one",
     ),
     "not symmetric": (
         lambda lines: [
