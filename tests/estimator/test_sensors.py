@@ -338,7 +338,7 @@ def test_filters_that_do_not_wait_refuse_a_sensor_that_makes_them(name):
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ({"range_noise_at": "reading"}, "must be 'expected': sensor 'range' reads no"),
+        ({"range_noise_at": "reading"}, "must be 'expected': one reading of sensor"),
         ({"measurement_std": (0.1, 0.1, 0.1)}, "measurement_std must be 2 finite"),
     ],
 )
