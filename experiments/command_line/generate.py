@@ -22,15 +22,15 @@ class GenerateOptions(Options):
     episodes
         Number of episodes; episode i has seed SEED + i.
     format_
-        npz, parquet and minari hold everything; slamlog, g2o and tum hold what their
-        formats express.
+        npz, parquet and minari hold all data; slamlog, g2o and tum hold the parts that
+        their formats can express.
     shard
         Episodes in each file or folder of the data set.
     smallest_std
         Smallest standard deviation in files of g2o [m, rad].
     believer
-        A filter whose beliefs after every scan are written beside the truth (npz,
-        parquet and minari).
+        A filter; its beliefs after every scan are written with the truth (npz, parquet
+        and minari).
     out
         The folder to write: new, empty, or begun by the same command, which then
         continues, perhaps with more episodes.
