@@ -70,8 +70,8 @@ def make_controller(
         case "waypoints":
             if scenario.robot.drive == "bicycle":
                 raise ValueError(
-                    "controller 'waypoints' turns at rest, which robot.drive = "
-                    "'bicycle' cannot: use 'open_loop' or 'random'"
+                    "controller 'waypoints' turns the robot at rest, but a robot with "
+                    "drive = 'bicycle' cannot do this: use 'open_loop' or 'random'"
                 )
             return Waypoints.for_scenario(scenario)
         case "random":

@@ -102,7 +102,7 @@ def taking_poses(estimator: object) -> SupportsPoses:
     """Return an estimator that takes readings of the pose; refuse any other."""
     if not isinstance(estimator, SupportsPoses):
         name = type(estimator).__name__
-        raise ValueError(f"{name} does not take readings of the pose")
+        raise ValueError(f"{name} does not accept readings of the pose")
     return estimator
 
 

@@ -326,7 +326,7 @@ def accepted_models(
     """
     accepted = accepted_options(factory, models)
     for name in models.keys() - accepted.keys():
-        raise ValueError(f"the estimator does not take {name} = '{models[name]}'")
+        raise ValueError(f"the estimator does not accept {name} = '{models[name]}'")
     return accepted
 
 

@@ -190,7 +190,7 @@ def diagnose(
     repeat = runs_to_repeat(pose, heading) if cause == CANNOT_TELL else 0
     if cause == WRONG_COVARIANCE and p_value >= FILTER_RATE:
         # The repeated runs have the same random numbers: what is chance stays, too.
-        cause, text = CANNOT_TELL, f"{text} Or it is chance: try another seed."
+        cause, text = CANNOT_TELL, f"{text} It may be chance: try another seed."
     return Diagnosis(cause, p_value, f"{cause}: {what}. {text}", repeat=repeat)
 
 

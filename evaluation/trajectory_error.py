@@ -282,7 +282,7 @@ def _paired(**positions: ArrayLike) -> tuple[Array, Array]:
     arrays = {name: as_floats(name, value) for name, value in positions.items()}
     for name, rows in arrays.items():
         if rows.ndim != 2 or rows.shape[1] != 2 or not len(rows):
-            raise ValueError(f"{name} must be n >= 1 positions, got shape {rows.shape}")
+            raise ValueError(f"{name} must have shape (n, 2), n >= 1, got {rows.shape}")
         if not np.isfinite(rows).all():
             raise ValueError(f"{name} must be finite, got nan or inf")
     first, second = arrays.values()

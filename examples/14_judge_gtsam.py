@@ -2,8 +2,8 @@
 
 slamgym writes drives, the program reads odometry and readings from them, and writes a
 pose with covariance for every step. `judge` then compares both with the truth, as
-`monte_carlo` does for filters of slamgym. Nothing of slamgym is between the program and
-its files: the same works in any language, see 16_judge_a_program_in_c.c.
+`monte_carlo` does for filters of slamgym. The program needs only the
+files, so any language will do: see 16_judge_a_program_in_c.c.
 
 The program is iSAM2 on a graph of the poses and landmarks. GTSAM states the covariance
 of a pose in the robot's own frame. A program that passes it on as it is says

@@ -1,8 +1,8 @@
 """Plug in a sensor of your own: a sonar that measures the delay of an echo.
 
-A sensor is one function h of the landmark in the robot's frame, with its four slopes,
-and its inverse, for numbers and arrays. `check_sensor` tests them, and every filter of
-the EKF family takes the sensor.
+A sensor is a function h of the landmark's position in the robot's frame, with its four
+partial derivatives, and the inverse of h; both accept numbers and arrays.
+`check_sensor` tests them, and every filter of the EKF family accepts the sensor.
 
 Run it::
 
@@ -20,7 +20,7 @@ Pair = tuple[Any, Any]
 
 
 def h(x: Any, y: Any) -> tuple[Pair, tuple[Any, Any, Any, Any]]:
-    """Return the bearing β and the delay of an echo, and their slopes by x and y."""
+    """Return the bearing β and the delay of an echo, and their derivatives."""
     r2 = x * x + y * y
     r = np.sqrt(r2)
     return (np.arctan2(y, x), 2 * r / 1500), (
@@ -32,7 +32,7 @@ def h(x: Any, y: Any) -> tuple[Pair, tuple[Any, Any, Any, Any]]:
 
 
 def inverse(bearing: Any, delay: Any) -> Pair:
-    """Return the place (x, y) of a reading."""
+    """Return the position (x, y) of the landmark of a reading."""
     r = 1500 * delay / 2
     return r * np.cos(bearing), r * np.sin(bearing)
 
@@ -60,7 +60,7 @@ def main() -> None:
         noise = rng.normal(0.0, (0.02, 1e-4))
         slam.update([(bearing + noise[0], delay + noise[1])], [0])
         slam.observe_pose(rng.normal(0.0, 0.05), [0, 0, 1], 0.05**2)  # a compass
-    print(f"the rock is at {slam.belief().landmarks[0].round(1)}, truly at {rock}")
+    print(f"position of the rock: {slam.belief().landmarks[0].round(1)}, true: {rock}")
 
 
 if __name__ == "__main__":

@@ -147,7 +147,9 @@ def swapped_drives(
                 swaps.append((names[k], names[bad[np.nanargmin(ratios)]]))
     if not swaps:
         return ""
-    fits = [f"that of drive {a} fits the truth of {b}" for a, b in swaps[:2]]
+    fits = [
+        f"the estimate of drive {a} fits the truth of drive {b}" for a, b in swaps[:2]
+    ]
     said = " and ".join(fits)
     return f"estimates or truths of {len(swaps)} drives are swapped: {said}."
 
@@ -180,9 +182,9 @@ def stray_poses(ratios: Array, names: Sequence[object]) -> str:
         return ""
     run, step = np.argwhere(lone)[0]
     return (
-        f"{lone.sum()} poses are far from the truth, between others that are not, as "
-        f"in swapped rows; the first is step {step} of drive {names[run]}: without "
-        f"them, NEES / 3 is {rest.mean():.2f}."
+        f"{lone.sum()} poses are far from the truth although their neighbours are not, "
+        f"as in swapped rows; the first is step {step} of drive {names[run]}, and "
+        f"without these poses, NEES / 3 is {rest.mean():.2f}."
     )
 
 

@@ -433,11 +433,11 @@ def _unmatched(estimate: Estimate, steps: int, dt: float) -> str:
         return f"its time stamps are seconds, not steps of {dt:g} s"
     if missing := np.setdiff1d(due, times.round()).tolist():
         return (
-            f"it has no pose for {len(missing)} of the steps 0 to {steps - 1}, first "
-            f"for step {missing[0]}"
+            f"it has no pose for {len(missing)} of the steps 0 to {steps - 1}; the "
+            f"first of them is step {missing[0]}"
         )
     row = int((abs(times[:steps] - due) > _ON_TIME).argmax())
-    return f"pose {row} is of step {times[row]:.6g}: every step must have one pose"
+    return f"pose {row} is that of step {times[row]:.6g}; each step needs one"
 
 
 def _invalid(

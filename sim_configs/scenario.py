@@ -140,8 +140,8 @@ class Sensor(Part):
         expect("'bearing_range', 'position', 'bearing', 'range' or 'module:SENSOR'"),
     ] = setting(
         "bearing_range",
-        "what one reading holds: (β, r), (x, y) in the robot's frame, β, r, or the "
-        "numbers of a sensor of your own, 'module:SENSOR'",
+        "content of one reading: (β, r), (x, y) in the robot's frame, β, r, or the "
+        "numbers of your own sensor, 'module:SENSOR'",
     )
     std: MeasurementStd = Field(
         description="of one reading: (σβ, σr) [rad, m], (σx, σy) [m], (σβ, 0), (σr, 0)"
@@ -322,18 +322,18 @@ class Robot(Part):
         expect("'unicycle', 'differential' or 'bicycle'"),
     ] = setting("unicycle", "how the robot moves, and what its odometry reports")
     track_width: Positive | None = setting(
-        None, "distance of the wheels of a differential drive [m]"
+        None, "distance between the wheels of a differential drive [m]"
     )
     wheelbase: Positive | None = setting(
-        None, "distance of the axles of a bicycle drive [m]"
+        None, "distance between the axles of a bicycle drive [m]"
     )
     max_steering: _Steering | None = setting(
         None, "limit of the steering angle of a bicycle drive [rad]"
     )
     reference: Point | None = setting(
         None,
-        "position of the robot's pose and sensor on a bicycle, from the middle of the "
-        "rear axle: ahead and to the left [m]",
+        "position of the pose and the sensor of a bicycle: distance ahead and to the "
+        "left of the middle of the rear axle [m]",
     )
 
     def _broken_rules(self) -> Iterator[str]:
@@ -413,7 +413,9 @@ class Scenario(Part):
         """Raise a `ScenarioError` if sensor or drive is not the default."""
         for name, label in self.models.items():
             usual = {"sensor": "bearing_range", "motion": "unicycle"}[name]
-            raise ScenarioError(f"{part} takes {name} = '{usual}' only, got '{label}'")
+            raise ScenarioError(
+                f"{part} accepts only {name} = '{usual}', got '{label}'"
+            )
 
     def _broken_rules(self) -> Iterator[str]:
         yield from self._broken_sizes()

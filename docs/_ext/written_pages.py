@@ -240,7 +240,10 @@ def _first_sentence(thing: object) -> str:
 
 def examples_page() -> str:
     """Return the page that shows the programs of ``examples``, folded."""
-    parts = ["# Examples", "Each program runs as it is, in a clone of the repository."]
+    parts = [
+        "# Examples",
+        "You can run each program without changes in a clone of the repository.",
+    ]
     for path in sorted((ROOT / "examples").glob("[0-9]*")):
         language = {".py": "python", ".c": "c"}[path.suffix]
         code = path.read_text()

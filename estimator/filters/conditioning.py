@@ -78,7 +78,7 @@ class PoseReading(NamedTuple):
             argument_checks.refuse_beyond(name, array, array.tolist())
         if not np.allclose(R, R.T) or np.linalg.eigvalsh(R)[0] <= 0:
             raise ValueError(
-                f"covariance must be symmetric positive definite, got {R.tolist()}"
+                f"covariance must be symmetric and positive definite, got {R.tolist()}"
             )
         return cls(z, H, (R + R.T) / 2)
 

@@ -610,7 +610,8 @@ def checked_rules(
     as_read = range_noise_at == "reading"
     if as_read and not sensor.places:
         raise ValueError(
-            f"range_noise_at must be 'expected': sensor '{sensor.name}' reads no place"
+            f"range_noise_at must be 'expected': one reading of sensor "
+            f"'{sensor.name}' does not locate a landmark"
         )
     if sensor.std is constant_std and (range_std_per_metre or bearing_std_metres):
         raise ValueError(

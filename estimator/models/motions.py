@@ -309,16 +309,16 @@ def check_motion(motion: str | Motion, trials: int = 1000) -> None:
     moved = model.displacements(odometry)
     mistakes = {
         "must not write into its arguments": not np.array_equal(kept, odometry),
-        "must give the same for arrays as for numbers": not np.allclose(
+        "must return the same values for arrays as for numbers": not np.allclose(
             [model.displacement(*row) for row in odometry.tolist()], moved, atol=1e-12
         ),
-        "must move nothing at rest, (0, 0)": bool(np.any(moved[0])),
+        "must be zero for the odometry (0, 0)": bool(np.any(moved[0])),
         "must be finite": not np.isfinite(moved).all(),
     }
     steps = model.displacements(odometry + 1e-6) - moved
-    mistakes["must be smooth: 1e-6 moved it by more than 1e-3"] = (
-        np.abs(steps).max() > 1e-3
-    )
+    mistakes[
+        "must be smooth: a change of 1e-6 in the odometry changes it by more than 1e-3"
+    ] = np.abs(steps).max() > 1e-3
     for mistake, made in mistakes.items():
         if made:
             raise ValueError(f"the displacement of motion '{model.name}' {mistake}")

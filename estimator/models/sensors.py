@@ -258,11 +258,11 @@ def find_sensor(sensor: str | Sensor) -> Sensor:
         except Exception as error:
             kind = type(error).__name__
             raise ValueError(
-                f"cannot import sensor '{sensor}', {kind}: {error}"
+                f"cannot import sensor '{sensor}': {kind}: {error}"
             ) from error
     if not isinstance(found, Sensor):
         hint, known = closest(str(sensor), SENSORS), ", ".join(SENSORS)
-        raise ValueError(f"unknown sensor '{sensor}'{hint} (there are {known})")
+        raise ValueError(f"unknown sensor '{sensor}'{hint} (known: {known})")
     return found
 
 
@@ -271,7 +271,7 @@ def only_bearing_range(sensor: str | Sensor, part: str) -> None:
     found = find_sensor(sensor)
     if found is not BEARING_RANGE:
         raise ValueError(
-            f"{part} takes bearing_range readings only, got sensor '{found.name}'"
+            f"{part} accepts only sensor 'bearing_range', got '{found.name}'"
         )
 
 
@@ -279,7 +279,7 @@ def only_placing(sensor: Sensor, part: str) -> None:
     """Refuse sensors whose readings do not place a landmark one by one."""
     if not sensor.places:
         raise ValueError(
-            f"{part} needs readings that place a landmark one by one, got sensor "
+            f"{part} needs a sensor whose single reading locates a landmark, got "
             f"'{sensor.name}'"
         )
 
@@ -438,7 +438,7 @@ def _check_shape(sensor: Sensor) -> None:
 
 
 def _name(sensor: Sensor, column: int) -> str:
-    return sensor.columns[column] if column < sensor.size else "the void number"
+    return sensor.columns[column] if column < sensor.size else "the unused number"
 
 
 def _check_slopes(sensor: Sensor, x: Array, y: Array) -> None:
@@ -455,7 +455,7 @@ def _check_slopes(sensor: Sensor, x: Array, y: Array) -> None:
             _refuse(
                 sensor,
                 f"∂{_name(sensor, column)}/∂{'xy'[axis]} at ({x[k]:.3g}, {y[k]:.3g}) "
-                f"is {numeric[k, column]:.6g} by differences, "
+                f"is {numeric[k, column]:.6g} by finite differences, "
                 f"but h returns {given[k, column, axis]:.6g}",
             )
 
@@ -470,7 +470,7 @@ def _check_angles(sensor: Sensor) -> None:
             _refuse(
                 sensor,
                 f"{_name(sensor, column)} jumps by 2π around the robot: "
-                "declare it in angles, so that differences are wrapped",
+                "set its entry of angles to True, so that its differences are wrapped",
             )
 
 
@@ -496,7 +496,7 @@ def _check_std(sensor: Sensor, noise: Array, distances: Array) -> None:
         if len(std) != 2 or not all(np.isfinite(std)) or not min(std) > 0:
             _refuse(
                 sensor,
-                f"std at {distance:.3g} m must be two finite numbers > 0 for "
+                f"std must return two finite numbers > 0 at {distance:.3g} m for "
                 f"measurement_std {noise.tolist()}, got {std}",
             )
 
@@ -508,4 +508,4 @@ def _check_compiled(sensor: Sensor, x: Array, y: Array) -> None:
         compiled = expected(float(x[k]), float(y[k]), 0.0)
         plain = sensor.read(x[k : k + 1], y[k : k + 1])[0]
         if not np.allclose(sensor.difference(compiled, plain), 0, atol=1e-9):
-            _refuse(sensor, f"h compiled returns {compiled}, and {plain} in numpy")
+            _refuse(sensor, f"h returns {compiled} if compiled, but {plain} in numpy")

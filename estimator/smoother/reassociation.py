@@ -172,7 +172,9 @@ class _Search:
         starts = self.smoothed(labels, poses, places), self.begun(labels)
         states = [state for state in starts if state is not None]
         if not states:
-            raise np.linalg.LinAlgError("the drive as given cannot be smoothed")
+            raise np.linalg.LinAlgError(
+                "the drive cannot be smoothed with its given association"
+            )
         return min(states, key=lambda state: state.score)
 
     def begun(self, labels: IntArray) -> _State | None:

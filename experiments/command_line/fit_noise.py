@@ -14,7 +14,7 @@ class FitNoiseOptions(Options):
     Attributes
     ----------
     write
-        Put the suggested noise into the header of LOG, a slamlog 1.
+        Write the suggested noise into the header of LOG, which must be a slamlog.
     """
 
     write: bool = declared(False, "--write")

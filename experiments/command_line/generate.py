@@ -22,15 +22,15 @@ class GenerateOptions(Options):
     episodes
         Number of episodes; episode i has seed SEED + i.
     format_
-        npz, parquet and minari hold everything; slamlog, g2o and tum hold what their
-        formats express.
+        npz, parquet and minari hold all data; slamlog, g2o and tum hold the parts that
+        their formats can express.
     shard
         Episodes in each file or folder of the data set.
     smallest_std
         Smallest standard deviation in files of g2o [m, rad].
     believer
-        A filter whose beliefs after every scan are written beside the truth (npz,
-        parquet and minari).
+        A filter; its beliefs after every scan are written with the truth (npz, parquet
+        and minari).
     out
         The folder to write: new, empty, or begun by the same command, which then
         continues, perhaps with more episodes.
@@ -38,7 +38,7 @@ class GenerateOptions(Options):
 
     episodes: int = declared(REQUIRED, "N", min=1)
     format_: str = declared("npz", "--format NAME")
-    shard: int | None = declared(None, "N", "100, fewer if they are large", min=1)
+    shard: int | None = declared(None, "N", "100, or fewer large ones", min=1)
     smallest_std: float | None = declared(None, "--smallest-std S", "0.001")
     believer: str | None = declared(None, "--estimator -e NAME", "none")
     out: Path | None = declared(None, "DIR", "results/<name>-<controller>-<format>")

@@ -20,21 +20,23 @@ class JudgeOptions(Options):
     drives
         The folder of slamgym generate that holds the truth.
     truths
-        The true path of a drive from elsewhere: TUM, or a log with ground truth; or a
-        folder of such files. May be repeated.
+        The true path of a drive that generate did not write: TUM, a log with ground
+        truth, or a folder of such files. May be repeated.
     covariances
         The error whose covariances the files hold.
     frame
         The error whose NEES decides.
     align
-        Move all estimates by this motion; fit brings each path closest to its truth,
-        and leaves no verdict.
+        Move all estimates by this motion. fit moves each path as close to its truth as
+        possible, so there is no verdict.
     out
         The folder to write: new, empty, or with earlier output of slamgym.
     """
 
-    drives: Path | None = declared(None, "DIR", "the estimates, if generate wrote them")
-    truths: list[Path] | None = declared(None, "--truth FILE", "that of the drives")
+    drives: Path | None = declared(None, "DIR", "FILES, if generate wrote them")
+    truths: list[Path] | None = declared(
+        None, "--truth FILE", "the truth in the drives"
+    )
     covariances: str = declared("additive", "additive|invariant|right|left")
     frame: str = declared("invariant", "invariant|additive")
     align: str | None = declared(None, "fit|X,Y,THETA", "none")

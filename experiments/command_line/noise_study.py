@@ -46,12 +46,12 @@ class NoiseStudyOptions(options.Options):
     Attributes
     ----------
     estimator
-        A filter, as for replay; with --runs, several with commas between.
+        A filter, as for replay; with --runs, several filters separated by commas.
     runs
-        For a scenario: with more than one, each change is a Monte Carlo.
+        Runs of a scenario; if more than one, each change is a Monte Carlo.
     change
-        With --runs: whether noises change in world and filter, in the world alone, or
-        in what the filter assumes.
+        With --runs: change the noise in world and filter, in the world alone, or in the
+        assumptions of the filter alone.
     """
 
     estimator: str = options.declared("invariant", "--estimator -e NAME")

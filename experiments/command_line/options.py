@@ -161,7 +161,7 @@ class Options:
     gate_probability: float | None = declared(None, "P", "none rejected")
     range_std_per_metre: float | None = declared(None, "K", "from the log, else 0")
     noise_at_rest: bool | None = declared(
-        None, "--noise-at-rest/--no-noise-at-rest", "from the log, else not"
+        None, "--noise-at-rest/--no-noise-at-rest", "from the log, else no"
     )
     hide_identities: bool = declared(False, "--hide-identities")
     robot: int | None = declared(None, "K", "the lowest number")
@@ -171,10 +171,10 @@ class Options:
     steps: int | None = declared(None, "N", "those of the scenario")
     controller: str = declared("open_loop", "NAME")
     set_: list[str] | None = declared(None, "--set KEY=VALUE")
-    resolution: float = declared(0.0, "R", "each counts")
-    jobs: int | None = declared(None, "--jobs -j N", "this process alone")
+    resolution: float = declared(0.0, "R", "all are distinct")
+    jobs: int | None = declared(None, "--jobs -j N", "none, this process only")
     backend: str | None = declared(None, "loky|dask|ray")
-    scheduler: str | None = declared(None, "ADDRESS", "a cluster of this machine")
+    scheduler: str | None = declared(None, "ADDRESS", "a cluster on this machine")
     out: Path | None = declared(None, "DIR", "results/<name>-<estimator>")
     every_step: bool | None = declared(
         None, "--every-step/--no-every-step", "if there are 60 steps or fewer"

@@ -34,10 +34,10 @@ class SmoothOptions(options.Options):
     robust
         Give outliers less weight.
     associate
-        Repair the association of readings without identity by the whole drive.
+        Use the whole drive to repair the association of readings without identity.
     """
 
-    robust: str | None = options.declared(None, "huber|cauchy", "all weigh the same")
+    robust: str | None = options.declared(None, "huber|cauchy", "equal weights")
     associate: bool = options.declared(False, "--associate")
 
 
@@ -53,7 +53,7 @@ def replay(
         typer.Argument(
             metavar="LOG",
             help="A slamlog CSV, a course data.txt, a Freiburg sensor.dat, iSAM or g2o "
-            "text, or a UTIAS MR.CLAM folder; the content decides.",
+            "text, or a folder of UTIAS MR.CLAM or Victoria Park; the content decides.",
         ),
     ],
     *,

@@ -220,7 +220,7 @@ def smoothing_figures(summary: dict[str, Any]) -> Table:
     ]
     if (repair := summary["repair"]) is not None:
         scores = f"score {repair['first']:.1f}, then {repair['last']:.1f}"
-        rows.append(("association", f"{scores}; {repair['unused']} readings of none"))
+        rows.append(("association", f"{scores}; {repair['unused']} readings unused"))
     return named_rows(rows)
 
 
@@ -262,8 +262,8 @@ def association_table(scores: dict[str, Any]) -> Table:
         ("precision", shares),
     ]
     if scores["oracle_errors"] is not None:
-        bar = f"{scores['oracle_errors']:.1%} of the readings would be wrong"
-        of_readings.append(("with the true pose and map", bar))
+        bar = f"{scores['oracle_errors']:.1%} of the readings are wrong"
+        of_readings.append(("with true pose and map", bar))
     return named_rows(of_readings + of_the_map, title)
 
 

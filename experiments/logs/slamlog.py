@@ -230,10 +230,12 @@ class _SlamlogParser:
         x, y, heading, std, heading_std = others
         here = math.isfinite(x), math.isfinite(heading)
         if math.isnan(x) != math.isnan(y) or not any(here):
-            raise line.error("x and y, theta, or all", ",".join(fields[1:4]))
+            raise line.error("x and y, or theta, or all three", ",".join(fields[1:4]))
         for is_here, each in zip(here, (std, heading_std), strict=True):
             if is_here and not each > 0:
-                raise line.error("a standard deviation > 0 of what is read", str(each))
+                raise line.error(
+                    "a standard deviation > 0 for each part that is given", str(each)
+                )
         row = PoseRow(t, (x, y, heading), (std, heading_std))
         self.recorder.add_pose(line, row)
 

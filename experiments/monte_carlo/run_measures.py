@@ -266,7 +266,7 @@ def _measure_map(true_pose: Array, truth: Array, belief: Belief) -> dict[str, Va
     ids = list(belief.landmark_ids)
     if len(set(ids)) < len(ids) or not set(ids) <= set(range(len(truth))):
         raise ValueError(
-            f"landmark_ids must be different ones of 0 … {len(truth) - 1}, "
+            f"landmark_ids must be distinct and from 0 to {len(truth) - 1}, "
             f"got {tuple(ids)}"
         )
     true_state, size = np.append(true_pose, truth[ids].ravel()), 2 * len(ids)

@@ -121,7 +121,9 @@ def _with_all_readings(drive: Drive, log: SlamLog, slam: SlamEstimator) -> Drive
     made = getattr(slam, "decisions", None)
     scans = [scan.measurements for scan in log.scans]
     if made is None or len(made) != len(scans) or len(drive.scans) != len(scans):
-        raise ValueError("the filter reports no associations: give it a management")
+        raise ValueError(
+            "the filter reports no associations: set its option management"
+        )
     own = count(
         1 + max((i for m in made for i in m.row_ids if i is not None), default=0)
     )

@@ -200,4 +200,4 @@ def test_11_gives_every_reading_to_its_landmark_by_default(run):
 
 
 def test_15_maps_a_rock_with_a_sensor_of_its_own_and_a_compass(run):
-    assert "the rock is at [8. 3.]" in run("15_your_own_sensor")
+    assert "position of the rock: [8. 3.]" in run("15_your_own_sensor")

@@ -197,7 +197,7 @@ def test_what_a_model_does_not_have_is_refused(changes, message):
 
 
 def test_a_car_has_no_controller_that_turns_at_rest():
-    with pytest.raises(ValueError, match="'waypoints' turns at rest"):
+    with pytest.raises(ValueError, match="'waypoints' turns the robot at rest"):
         make_controller("waypoints", load_scenario("bicycle"), np.random.default_rng(0))
 
 

@@ -235,5 +235,5 @@ def test_plans_of_another_drive_are_refused():
 
 
 def test_the_smoother_refuses_another_sensor():
-    with pytest.raises(ValueError, match="the smoother takes bearing_range"):
+    with pytest.raises(ValueError, match="the smoother accepts only sensor"):
         SmoothingSlam(**NOISE, sensor="position")

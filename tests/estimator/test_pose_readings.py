@@ -172,7 +172,7 @@ def test_a_refused_reading_changes_nothing(case, management):
 @pytest.mark.parametrize("label", ["submaps", "sparse_information"])
 def test_other_filters_refuse_in_one_sentence(label):
     slam = make(label, management=True)
-    with pytest.raises(ValueError, match="does not take readings of the pose"):
+    with pytest.raises(ValueError, match="does not accept readings of the pose"):
         slam.observe_pose(0.0, [0, 0, 1], 1.0)
 
 

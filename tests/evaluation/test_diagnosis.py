@@ -241,7 +241,7 @@ def test_an_excess_that_may_be_chance_is_no_wrong_covariance():
     found = diagnose(**scores, small_noise=small, rejected=True)
     assert found.p_value > 0.02
     assert found.cause == "cannot tell"
-    assert found.sentence.endswith("Or it is chance: try another seed.")
+    assert found.sentence.endswith("may be chance: try another seed.")
 
 
 def test_an_excess_that_remains_in_the_pose_alone_does_not_vanish():

@@ -195,9 +195,9 @@ def test_unknown_headings_stay_unknown_and_spoil_no_others():
         (
             [[1, 2, 3]],
             [[1, 2]],
-            r"estimate must be n >= 1 positions, got shape \(1, 3\)",
+            r"estimate must have shape \(n, 2\), n >= 1, got \(1, 3\)",
         ),
-        (np.empty((0, 2)), np.empty((0, 2)), "estimate must be n >= 1 positions"),
+        (np.empty((0, 2)), np.empty((0, 2)), "estimate must have shape"),
         ([[1, 2]], [[1, math.nan]], "truth must be finite"),
         ([[1, 2]], [[1, 2], [3, 4]], "as many positions, got 1 and 2"),
         ([["a", "b"]], [[1, 2]], "estimate must be numbers"),

@@ -763,10 +763,10 @@ def test_a_car_that_stands_or_backs_does_so(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"speed": np.ones((3, 1))}, "one length"),
-        ({"steering": np.full((81, 1), np.nan)}, "finite numbers as steering"),
+        ({"speed": np.ones((3, 1))}, "equal length"),
+        ({"steering": np.full((81, 1), np.nan)}, "finite numbers in steering"),
         ({"steering": np.full((81, 1), 1.2)}, "steering within"),
-        ({"time": np.arange(22968, 20967, -25)[:, None]}, "not to decrease"),
+        ({"time": np.arange(22968, 20967, -25)[:, None]}, "never decreases"),
     ],
 )
 def test_a_damaged_drive_of_victoria_park_is_named(tmp_path, changes, message):

@@ -273,14 +273,15 @@ WRONG = {
     ),
     "swapped": (
         lambda x, P: (swapped(x), swapped(P)),
-        "convention: estimates or truths of 2 drives are swapped: that of drive "
-        f"{SEED} fits the truth of {SEED + 1} and that of drive {SEED + 1} fits the "
-        f"truth of {SEED}.",
+        "convention: estimates or truths of 2 drives are swapped: the estimate of "
+        f"drive {SEED} fits the truth of drive {SEED + 1} and the estimate of drive "
+        f"{SEED + 1} fits the truth of drive {SEED}.",
     ),
     "rows": (
         lambda x, P: (x[:, ROWS], P[:, ROWS]),
-        f"convention: {2 * RUNS} poses are far from the truth, between others that are "
-        f"not, as in swapped rows; the first is step 5 of drive {SEED}: without them, ",
+        f"convention: {2 * RUNS} poses are far from the truth although their "
+        "neighbours are not, as in swapped rows; the first is step 5 of drive "
+        f"{SEED}, and without ",
     ),
 }
 
@@ -350,7 +351,7 @@ def test_the_errors_of_a_filter_are_no_stray_poses():
     ratios[1, 20:24] = 300.0  # it lasts
     assert not stray_poses(ratios, "abc")
     ratios[1, 21:24] = 1.0
-    assert "the first is step 20 of drive b: without" in stray_poses(ratios, "abc")
+    assert "the first is step 20 of drive b, and without" in stray_poses(ratios, "abc")
     ratios[2, ::4] = 300.0  # too many
     assert not stray_poses(ratios, "abc")
 
@@ -421,11 +422,11 @@ BROKEN = {
     "missing": (lambda lines: None, "there is no file of estimates"),
     "short": (
         lambda lines: lines[:-1],
-        "it has no pose for 1 of the steps 0 to 29, first for step 29",
+        "it has no pose for 1 of the steps 0 to 29; the first of them is step 29",
     ),
     "without some rows": (
         lambda lines: lines[:7] + lines[9:],
-        "it has no pose for 2 of the steps 0 to 29, first for step 7",
+        "it has no pose for 2 of the steps 0 to 29; the first of them is step 7",
     ),
     "late from the start": (
         lambda lines: [
@@ -443,11 +444,11 @@ BROKEN = {
     ),
     "a step twice": (
         lambda lines: [*lines[:-1], lines[-2]],
-        "it has no pose for 1 of the steps 0 to 29, first for step 29",
+        "it has no pose for 1 of the steps 0 to 29; the first of them is step 29",
     ),
     "not in order": (
         lambda lines: [*lines[:3], lines[4], lines[3], *lines[5:]],
-        "pose 3 is of step 4: every step must have one pose",
+        "pose 3 is that of step 4; each step needs one",
     ),
     "not symmetric": (
         lambda lines: [

@@ -104,8 +104,8 @@ def test_dead_reckoning_without_noise_gives_the_path():
 @pytest.mark.parametrize(
     ("format", "name", "message"),
     [
-        ("g2o", "position", "format 'g2o' takes sensor = 'bearing_range' only"),
-        ("g2o", "bicycle", "format 'g2o' takes motion = 'unicycle' only"),
+        ("g2o", "position", "format 'g2o' accepts only sensor = 'bearing_range'"),
+        ("g2o", "bicycle", "format 'g2o' accepts only motion = 'unicycle'"),
         ("tum", "differential", "the format 'tum' takes the odometry of a unicycle"),
     ],
 )
@@ -115,7 +115,9 @@ def test_a_format_refuses_models_that_it_cannot_hold(format, name, message):
 
 
 def test_active_slam_refuses_other_models():
-    with pytest.raises(ValueError, match="active SLAM takes motion = 'unicycle' only"):
+    with pytest.raises(
+        ValueError, match="active SLAM accepts only motion = 'unicycle'"
+    ):
         ActiveSlamEnv("bicycle")
 
 
@@ -125,7 +127,7 @@ def test_an_estimator_without_the_sensor_is_refused():
             """Take the noise alone."""
 
     register_estimator("own_without_models", Own)
-    with pytest.raises(ValueError, match="does not take sensor = 'position'"):
+    with pytest.raises(ValueError, match="does not accept sensor = 'position'"):
         settings_for_scenario(load_scenario("position"), estimator="own_without_models")
 
 

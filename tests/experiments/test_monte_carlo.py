@@ -462,7 +462,7 @@ def test_a_belief_that_is_no_map_of_the_world_ends_its_own_run_only(whole):
     assert failed.sel(estimator="gone") == RUNS
     assert failed.sel(estimator="blind") == RUNS
     said = [set(results.message.sel(estimator=name).values) for name in filters]
-    assert any("landmark_ids must be different ones of 0 … 5" in m for m in said[0])
+    assert any("landmark_ids must be distinct and from 0 to 5" in m for m in said[0])
     assert said[1] == {"SystemExit: 3"}
     assert said[2] == {"the belief about the map is not finite"}
     xr.testing.assert_equal(

@@ -116,7 +116,7 @@ def test_a_malformed_row_is_refused_with_its_line(row, tmp_path):
 
 def test_a_filter_that_takes_no_such_readings_says_so(log):
     settings = settings_for(log, estimator="submaps")
-    with pytest.raises(ValueError, match="does not take readings of the pose"):
+    with pytest.raises(ValueError, match="does not accept readings of the pose"):
         replay(log, settings.make(log.start))
 
 

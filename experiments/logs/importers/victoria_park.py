@@ -59,7 +59,7 @@ def read_victoria_park(path: str | PathLike[str]) -> slamlog.SlamLog:
     times, x, y = _columns(folder / GPS, "timeGps", "Lo_m", "La_m")
     if not (folder / TREES).is_file():
         raise slamlog.LogError(
-            f"{folder}: expected {TREES}, the trees, got no such file"
+            f"{folder}: expected {TREES} with the trees, got no such file"
         )
     trees = slamlog.read_slamlog(folder / TREES)
     if (np.abs(steering) >= np.pi / 4).any():
@@ -87,7 +87,7 @@ def read_victoria_park(path: str | PathLike[str]) -> slamlog.SlamLog:
             "epoch": repr(EPOCH),
             "groundtruth_kind": "GPS",
             "groundtruth_offset": ANTENNA,
-            "left_out": f"{len(trees.scans) - len(scans)} scans outside of the drive",
+            "left_out": f"{len(trees.scans) - len(scans)} scans not during the drive",
         },
         motion="midpoint",
         events=tuple(events),
@@ -111,12 +111,12 @@ def _columns(path: Path, time: str, *names: str) -> list[Array]:
         columns.append(column.ravel())
         if len(column.ravel()) < 2 or len(columns[-1]) != len(columns[0]):
             raise slamlog.LogError(
-                f"{path}: expected columns {time}, {', '.join(names)} of one length, "
+                f"{path}: expected columns {time}, {', '.join(names)} of equal length, "
                 f"got {len(columns[-1])} numbers of {name}"
             )
         if not np.isfinite(columns[-1]).all():
-            raise slamlog.LogError(f"{path}: expected finite numbers as {name}")
+            raise slamlog.LogError(f"{path}: expected finite numbers in {name}")
     columns[0] = np.round(columns[0] / 1000 - EPOCH, TIME_DIGITS)
     if (np.diff(columns[0]) < 0).any():
-        raise slamlog.LogError(f"{path}: expected {time} not to decrease")
+        raise slamlog.LogError(f"{path}: expected {time} that never decreases")
     return columns
