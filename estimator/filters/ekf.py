@@ -258,7 +258,7 @@ class EkfSlam(MapFilter):
         Readings below this range [m], and those of landmarks expected below it, are
         skipped, because they have no usable bearing.
     motion : str or Motion
-        The drive whose odometry `predict` takes, see :func:`~slamgym.find_motion`.
+        The drive whose odometry `predict` takes, see `find_motion`.
 
     Raises
     ------

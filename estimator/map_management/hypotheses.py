@@ -118,7 +118,7 @@ def _overlaps(views: Sequence[MapView]) -> BoolArray:
 
 
 def cost_of(report: UpdateReport) -> float:
-    """Return νᵀ S⁻¹ ν + ln |S| of a reading, or SPREAD if it was rejected."""
+    """Return νᵀ S⁻¹ ν + ln det S of a reading, or SPREAD if it was rejected."""
     if not report.degrees_of_freedom:
         return SPREAD
     return report.nis + 2 * float(np.log(report.innovation_factor.diagonal()).sum())
@@ -238,7 +238,7 @@ class HypothesisSlam:
     ) -> UpdateReport:
         """Correct every hypothesis with a reading of the pose.
 
-        Its cost, νᵀ S⁻¹ ν + ln |S|, is added to that of the hypothesis, unless the gate
+        Its cost, νᵀ S⁻¹ ν + ln det S, is added to that of the hypothesis, unless the gate
         of the best one rejects it.  Parameters and report as in `EkfSlam.observe_pose`.
         """
         given = PoseReading.checked(reading, matrix, covariance)

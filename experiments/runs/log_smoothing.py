@@ -70,7 +70,7 @@ def smooth_log(
         Of `SMOOTHER`; by ``management`` it associates readings without identity.
     associate : bool
         Whether to repair the associations of the filter by the whole drive, see
-        :func:`~slamgym.estimator.smoother.reassociate`.
+        `reassociate`.
     progress, repairing : callable, optional
         Called with (steps done, steps) of the filter, and of the repair.
 
