@@ -239,7 +239,8 @@ class HypothesisSlam:
         """Correct every hypothesis with a reading of the pose.
 
         Its cost, νᵀ S⁻¹ ν + ln det S, is added to that of the hypothesis, unless the
-        gate of the best one rejects it.  Parameters and report as in `EkfSlam.observe_pose`.
+        gate of the best one rejects it.  Parameters and report are those of
+        `EkfSlam.observe_pose`.
         """
         given = PoseReading.checked(reading, matrix, covariance)
         before, steps = self.hypotheses, self.steps + 1
