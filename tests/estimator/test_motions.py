@@ -128,7 +128,7 @@ def test_a_drive_passes_its_check_and_is_found_by_its_name(motion):
 @pytest.mark.parametrize(
     ("displacement", "mistake"),
     [
-        (lambda a, b: (a + 0.1, 0 * a, b), "at rest"),
+        (lambda a, b: (a + 0.1, 0 * a, b), "must be zero"),
         (lambda a, b: (a, 0 * a, np.divide(b, 1.0 * (a == 0))), "finite"),
         (lambda a, b: (a, 0 * a, np.sum(b)), "arrays"),
         (lambda a, b: (a, 0 * a, np.sign(b)), "smooth"),
