@@ -310,7 +310,7 @@ def test_sensors_are_found_by_name_and_by_path():
     assert find_sensor("position") is find_sensor(path) is find_sensor(POSITION)
     with pytest.raises(ValueError, match="unknown sensor 'postion'; did you mean 'pos"):
         find_sensor("postion")
-    with pytest.raises(ValueError, match="cannot import sensor 'nowhere:X', ModuleNot"):
+    with pytest.raises(ValueError, match="cannot import sensor 'nowhere:X': ModuleNot"):
         find_sensor("nowhere:X")
 
 
