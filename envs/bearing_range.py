@@ -125,8 +125,8 @@ class BearingRangeSensor:
         if self._reads_places is not None:
             readings[0], readings[1] = self._reads_places(x, y)
             readings += error
-            if self._wraps is not None:
-                wrap_bearings(readings[self._wraps])
+            for row in self._wraps:
+                wrap_bearings(readings[row])
         else:
             self._disturb(readings, error, settings or self._settings)
         if np.count_nonzero(mask) < mask.size:
@@ -151,22 +151,21 @@ class BearingRangeSensor:
             readings[1] = 0.0
 
 
-def _reading_of_places(kind: str) -> tuple[Any, int | None]:
-    """Return what maps (x, y) to a reading, and which number of it is an angle.
+def _reading_of_places(kind: str) -> tuple[Any, list[int]]:
+    """Return what maps (x, y) to a reading, and which of its numbers are angles.
 
-    Both are None for the sensors of bearings and ranges.  A kind "module:SENSOR" is a
+    This is None for the sensors of bearings and ranges.  A kind "module:SENSOR" is a
     sensor that the user has written.
     """
     module, colon, name = kind.partition(":")
     if not colon:
-        return (lambda x, y: (x, y)) if kind == "position" else None, None
+        return (lambda x, y: (x, y)) if kind == "position" else None, []
     try:
         own = getattr(import_module(module), name)
+        h, angles = own.h, [row for row, wraps in enumerate(own.wraps) if wraps]
     except (ImportError, AttributeError) as error:
         raise ValueError(f"cannot import sensor.kind = '{kind}': {error}") from error
-    return (lambda x, y: own.h(x, y)[0]), next(
-        (row for row, is_angle in enumerate(own.wraps) if is_angle), None
-    )
+    return (lambda x, y: h(x, y)[0]), angles
 
 
 def _in_view(

@@ -471,7 +471,7 @@ class UpdateReport:
 
     #: νᵀ S⁻¹ ν, χ² distributed when the filter is consistent.
     nis: float = 0.0
-    #: Of the NIS: twice the number of associated readings.
+    #: Of the NIS: how many numbers the readings hold that corrected the belief.
     degrees_of_freedom: int = 0
     #: Mapped landmarks whose readings corrected the belief.
     associated_ids: tuple[int, ...] = ()
@@ -483,9 +483,9 @@ class UpdateReport:
     skipped_ids: tuple[int, ...] = ()
     #: Mapped landmarks within 10 σ of the robot, where linearising is unsafe.
     near_ids: tuple[int, ...] = ()
-    #: ν, shape (m, 2), rows (bearing, range) [rad, m].
+    #: ν, a row of two numbers for each reading; (k,) for a reading of the pose.
     innovation: Array = field(default_factory=lambda: np.empty((0, 2)))
-    #: L, shape (2m, 2m), lower triangular, L Lᵀ = S; or a function that returns it.
+    #: L, lower triangular, L Lᵀ = S of all these numbers; or a function returning it.
     factor: Array | Callable[[], Array] = field(
         default_factory=lambda: np.empty((0, 0))
     )

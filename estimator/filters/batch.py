@@ -332,14 +332,16 @@ class BatchSlam(BatchOfBeliefs):
             νᵀ S⁻¹ ν and k; 0 and 0 for a run that has not used its reading.
         """
         chosen = chosen_runs(runs, self.runs) & (self.failed_at == NEVER)
-        z = np.array(readings, dtype=np.float64)
+        z = argument_checks.as_floats("readings", readings).copy()
+        if z.shape[:1] != (self.runs,):
+            raise ValueError(
+                f"readings must have a row for each of {self.runs} runs, got shape "
+                f"{z.shape}"
+            )
         z[~chosen] = 0.0
         given = PoseReading.checked(z, matrix, covariance, (self.runs,))
-        size, n, rows = (
-            len(given.matrix),
-            3 + 2 * self.landmarks,
-            np.flatnonzero(chosen),
-        )
+        size, n = len(given.matrix), 3 + 2 * self.landmarks
+        rows = np.flatnonzero(chosen)
         found = given.of(rows).correct(
             self._means[rows, :n],
             self._covariances[rows, :n, :n],

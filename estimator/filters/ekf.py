@@ -603,7 +603,8 @@ def checked_rules(
 ) -> Rules:
     """Return the rules of an update, from the arguments of :class:`.ekf.EkfSlam`."""
     if sensor.size == 1 and np.size(measurement_std) == 1:
-        measurement_std = float(np.ravel(measurement_std)[0]), 1.0
+        given = argument_checks.as_floats("measurement_std", measurement_std)
+        measurement_std = float(given.ravel()[0]), 1.0
     std = argument_checks.standard_deviations("measurement_std", measurement_std, 2)
     argument_checks.one_of("landmark_init", landmark_init, ("full", "independent"))
     argument_checks.one_of("range_noise_at", range_noise_at, ("expected", "reading"))

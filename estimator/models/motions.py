@@ -223,7 +223,11 @@ def find_motion(motion: str | Motion) -> Motion:
         raise ValueError(f"motion must be a label or a Motion, got {motion!r}")
     if re.fullmatch(r"[\w.]+:\w+", motion):
         module, name = motion.split(":")
-        return find_motion(getattr(import_module(module), name))
+        try:
+            found = getattr(import_module(module), name)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"cannot import motion '{motion}': {error}") from error
+        return find_motion(found)
     match = re.fullmatch(r"\s*(\w+)\s*(?:\[(.*)\])?\s*", motion, re.DOTALL)
     name = match[1] if match else motion
     if match is None or name not in MOTIONS:

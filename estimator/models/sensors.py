@@ -135,7 +135,7 @@ class Sensor:
 
     def difference(self, readings: Array, expected: Array) -> Array:
         """Return readings − expected, shape (..., 2), wrapped where an angle."""
-        apart = np.asarray(readings) - expected
+        apart = np.subtract(readings, expected, dtype=np.float64)
         for column, wraps in enumerate(self.wraps):
             if wraps:
                 apart[..., column] = bearing_range.wrap_angle(apart[..., column])

@@ -233,6 +233,7 @@ class Drive:
         """
         made = copy(self)
         made._motions, made._pending = list(self._motions), list(self._pending)
+        made._observed = {pose: list(z) for pose, z in self._observed.items()}
         kept = iter([Sightings(z[ids >= 0], ids[ids >= 0]) for z, ids in scans])
         made._sightings = [[next(kept) for _ in own] for own in self._sightings]
         return made

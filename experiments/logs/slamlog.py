@@ -226,7 +226,8 @@ class _SlamlogParser:
         )
 
     def _take_pose(self, line: LogLine, fields: list[str]) -> None:
-        t, *others = (line.to_real(f) if f else math.nan for f in fields)
+        t = line.to_real(fields[0])
+        others = (line.to_real(f) if f else math.nan for f in fields[1:])
         x, y, heading, std, heading_std = others
         here = math.isfinite(x), math.isfinite(heading)
         if math.isnan(x) != math.isnan(y) or not any(here):

@@ -237,3 +237,9 @@ def test_plans_of_another_drive_are_refused():
 def test_the_smoother_refuses_another_sensor():
     with pytest.raises(ValueError, match="the smoother accepts only sensor"):
         SmoothingSlam(**NOISE, sensor="position")
+
+
+@pytest.mark.parametrize("path", ["nowhere:CAR", "slamgym.sim_configs:CAR"])
+def test_a_drive_that_cannot_be_imported_is_named(path):
+    with pytest.raises(ValueError, match=f"cannot import motion '{path}'"):
+        find_motion(path)

@@ -23,6 +23,7 @@ from slamgym.estimator.filters.conditioning import (
     slopes_at,
 )
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
+from slamgym.estimator.smoother import Drive
 
 NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
 START_STD = (0.3, 0.3, 0.4)
@@ -296,3 +297,18 @@ def test_observe_conditions_on_any_first_components():
     K = P[:, 2:4].sum(axis=1) / 8
     np.testing.assert_allclose(found.mean, mean + K * 4)
     np.testing.assert_allclose(found.covariance, P - 8 * np.outer(K, K))
+
+
+def test_a_batch_refuses_readings_of_another_number_of_runs():
+    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
+    batch = make_batch("ekf", runs=3, landmarks=2, **noise)
+    with pytest.raises(ValueError, match="a row for each of 3 runs"):
+        batch.observe_pose(np.zeros((2, 1)), [0, 0, 1], 1.0)
+
+
+def test_a_drive_with_other_readings_has_its_own_readings_of_the_pose():
+    made = Drive(MOTION_STD, MEASUREMENT_STD)
+    made.observe_pose(0.1, [0, 0, 1], 1.0)
+    other = made.with_scans([])
+    other.observe_pose(0.2, [0, 0, 1], 1.0)
+    assert (made.pose_components, other.pose_components) == (1, 2)

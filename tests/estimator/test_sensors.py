@@ -540,3 +540,14 @@ def test_past_poses_do_not_exceed_their_limit():
     assert slam.landmark_ids == ()
     assert len(slam.map.slots) == 2 * MOST_POSES
     assert len(slam.waiting.ids) == MOST_POSES
+
+
+def test_readings_of_whole_numbers_are_compared_as_real_numbers():
+    apart = find_sensor("bearing").difference(np.array([[4, 0]]), np.array([[0, 0]]))
+    np.testing.assert_allclose(apart, [[4 - 2 * np.pi, 0.0]])
+
+
+@pytest.mark.parametrize("wrong", [None, [None], "a"])
+def test_a_noise_that_is_no_number_is_refused(wrong):
+    with pytest.raises(ValueError, match="measurement_std"):
+        make_estimator("ekf", motion_std=MOTION, measurement_std=wrong, sensor="range")
