@@ -66,6 +66,14 @@ class OneLineErrors(TyperGroup):
             sys.exit(exit_code_of(error))
         sys.exit(result if isinstance(result, int) else 0)
 
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Look up a command; its help names arguments without their types."""
+        command: Any = super().get_command(ctx, cmd_name)
+        for parameter in command.params if command else ():
+            if parameter.param_type_name == "argument":
+                parameter.display_type_rich = lambda ctx: None
+        return command
+
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""
         try:

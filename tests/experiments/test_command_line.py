@@ -1,6 +1,7 @@
 import csv
 import json
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -891,6 +892,7 @@ def test_help_fits_into_80_columns_with_an_example(command, monkeypatch):
     assert "Usage:" in text
     assert max(map(len, text.splitlines())) <= 80
     assert f"slamgym {command} " in text.partition("Examples:")[2] + " "
+    assert not re.search("<(str|path|file|dir|int|float)", text)  # words of Python
 
 
 @pytest.mark.parametrize("command", COMMANDS)
