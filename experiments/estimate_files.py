@@ -107,16 +107,15 @@ def _each_estimate(path: Path) -> Iterator[tuple[Any, Estimate]]:
 
 def paths_by_label(estimates: Any) -> dict[str, list[Path]]:
     """Return paths by the labels of estimators."""
+
+    def paths_in(given: Any) -> list[Path]:
+        return list(map(Path, [given] if isinstance(given, str | PathLike) else given))
+
+    named: dict[str, list[Path]] = {}
     if isinstance(estimates, Mapping):
-        named = {
-            str(label): [Path(each)] if isinstance(each, str | PathLike)
-            else [Path(one) for one in each]
-            for label, each in estimates.items()
-        }  # fmt: skip
+        named = {str(label): paths_in(each) for label, each in estimates.items()}
     else:
-        one = isinstance(estimates, str | PathLike)
-        named = {}
-        for path in [Path(estimates)] if one else map(Path, estimates):
+        for path in paths_in(estimates):
             folder = path if path.is_dir() else path.parent
             label = folder.resolve().name or "estimates"
             named.setdefault(label, []).append(path)
@@ -130,15 +129,12 @@ def paths_by_label(estimates: Any) -> dict[str, list[Path]]:
 
 def files_in(paths: Sequence[Path]) -> list[Path]:
     """List files, and those with a known ending in folders."""
-    return [
-        file
-        for path in paths
-        for file in (
-            sorted(f for f in path.iterdir() if f.suffix in _ENDINGS and f.is_file())
-            if path.is_dir()
-            else [path]
-        )
-    ]
+    found: list[Path] = []
+    for path in paths:
+        inside = path.iterdir() if path.is_dir() else ()
+        known = sorted(f for f in inside if f.suffix in _ENDINGS and f.is_file())
+        found += known if path.is_dir() else [path]
+    return found
 
 
 def name_of(path: Path) -> Any:

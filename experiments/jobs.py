@@ -96,7 +96,7 @@ def resume(
     OSError
         If a worker process is killed.
     """
-    report, unit = progress or _no_progress, steps or 1
+    report, unit = progress or (lambda done, runs: None), steps or 1
     finished = runs - sum(map(len, missing))
     done = finished * unit
 
@@ -118,10 +118,6 @@ def resume(
         raise OSError(
             f"a worker process was killed, perhaps for lack of memory; {kept}"
         ) from error
-
-
-def _no_progress(done: int, runs: int) -> None:
-    """Report nothing."""
 
 
 def _computed(

@@ -383,10 +383,8 @@ def _measured(
     """Measure the estimates of one estimator on the drives of a chunk."""
     truth = chunk.runs.true_poses
     count, steps, _ = truth.shape
-    poses, claims = (
-        np.full((count, steps, 3), np.nan),
-        np.full((count, steps, 3, 3), np.nan),
-    )
+    poses = np.full((count, steps, 3), np.nan)
+    claims = np.full((count, steps, 3, 3), np.nan)
     failures: dict[int, Failure] = {}
     for run, each in enumerate(files):
         reason = each if isinstance(each, str) else _unmatched(each, steps, chunk.dt)

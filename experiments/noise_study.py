@@ -32,7 +32,7 @@ from .logs.ground_truth import path_accuracy
 from .logs.slamlog import SlamLog
 from .runs.filter_settings import SIGMAS, FilterSettings, settings_for
 from .runs.log_replay import Replay, replay
-from .runs.summary import map_accuracy, nees_summary, nis_summary
+from .runs.summary import map_accuracy, nees_summary, nis_summary, rmse_table
 from .runs.trace import RunTrace, finite, mean, root_mean_square, standard_error
 
 if TYPE_CHECKING:
@@ -158,19 +158,20 @@ def _measured(done: Replay, variation: Variation, settings: FilterSettings) -> N
     std = dict(zip(SIGMAS, stds, strict=True)).get(variation.sigma)
     value = "" if std is None else f" = {std:.3g} {_UNITS[variation.sigma]}"
     trace = done.trace
-    landmarks, path = map_accuracy(trace), path_accuracy(done.log, trace.t, trace.poses)
-    nees, nis = nees_summary(trace), nis_summary(trace)
+    of_map = rmse_table(map_accuracy(trace)) or {}
+    of_path = rmse_table(path_accuracy(done.log, trace.t, trace.poses)) or {}
+    nees, nis = nees_summary(trace) or {}, nis_summary(trace) or {}
     areas = ellipse_areas(trace.landmark_covariances)
     row = NoiseRow(
         *variation,
         std=std,
         pose_area=float(ellipse_areas(trace.pose_covariances[-1:, :2, :2])[0]),
         landmark_area=finite(areas.mean()) if len(areas) else None,
-        landmark_rmse=finite(landmarks.raw_rmse) if landmarks else None,
-        landmark_rmse_aligned=finite(landmarks.aligned_rmse) if landmarks else None,
-        ate=finite(path.raw_rmse) if path else None,
-        nees_per_degree=nees["per_degree"] if nees else None,
-        nis_per_degree=nis["per_degree"] if nis else None,
+        landmark_rmse=of_map.get("raw"),
+        landmark_rmse_aligned=of_map.get("aligned"),
+        ate=of_path.get("raw"),
+        nees_per_degree=nees.get("per_degree"),
+        nis_per_degree=nis.get("per_degree"),
     )
     return NoiseRun(f"{variation}{value}", row, trace)
 

@@ -72,19 +72,27 @@ def true_landmarks_of(
     if identities is not None:
         ids = [identities.get(i, NO_LANDMARK) for i in ids]
     elif len(landmarks) and len(log.landmarks) and hides_identities(log):
-        return _nearest(log.landmarks, landmarks)
+        places = mutual_nearest(log.landmarks, landmarks)
+        return np.where(places[:, None] >= 0, log.landmarks[places], np.nan)
     known = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
     if known.keys().isdisjoint(ids):
         return None
     return np.array([known.get(i, np.full(2, np.nan)) for i in ids])
 
 
-def _nearest(truth: Array, landmarks: Array) -> Array:
-    """Return the true position of each landmark, (n, 2); nan where there is none."""
-    gaps = np.linalg.norm(landmarks[:, None] - truth, axis=2)
+def mutual_nearest(truth: Array, landmarks: Array) -> IntArray:
+    """Return the row of the true landmark of each mapped one, shape (n,), else -1.
+
+    Two landmarks are paired if each is the nearest of the other.
+    """
+    if not len(landmarks) or not len(truth):
+        return np.full(len(landmarks), -1)
+    from scipy.spatial.distance import cdist  # noqa: PLC0415 (slow to import)
+
+    gaps = cdist(landmarks, truth)
     nearest = gaps.argmin(axis=1)
     is_mutual = gaps.argmin(axis=0)[nearest] == np.arange(len(landmarks))
-    return np.where(is_mutual[:, None], truth[nearest], np.nan)
+    return np.where(is_mutual, nearest, -1)
 
 
 def path_accuracy(log: SlamLog, times: Array, poses: Array) -> PositionAccuracy | None:

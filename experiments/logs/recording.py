@@ -8,7 +8,7 @@ Symbols
 u = (d, α)   odometry: drive d, then turn α [m, rad]
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -72,8 +72,9 @@ def record_episode(
         "slamgym/LandmarkWorld-v0", scenario=world, disable_env_checker=True
     )
     observation, info = env.reset(seed=seed)
-    events: list[Event] = [*_scan(0.0, observation, info)]
-    events += _fix(0.0, world, info)
+    simulated = cast(LandmarkWorldEnv, env.unwrapped)
+    start, landmarks = simulated.start_estimate, simulated.landmarks
+    events: list[Event] = [*_scan(0.0, observation, info), *_fix(0.0, world, info)]
     poses = [info["pose"]]
     for step in range(world.steps):
         action = controller.act(info["pose"], step)
@@ -81,14 +82,12 @@ def record_episode(
         distance, turn = observation["odometry"].tolist()
         t = float(step + 1)
         events.append(OdometryRow(t, distance, turn, dt=1.0))
-        events += _scan(t, observation, info)
-        events += _fix(t, world, info)
+        events += [*_scan(t, observation, info), *_fix(t, world, info)]
         poses.append(info["pose"])
         if progress is not None:
             progress(step + 1, world.steps)
-    log = _log(world, seed, env, events, np.array(poses))
     env.close()
-    return log
+    return log_of_episode(world, seed, start, landmarks, events, np.array(poses))
 
 
 def _scan(t: float, observation: Observation, info: dict[str, Any]) -> list[Scan]:
@@ -113,22 +112,39 @@ def _fix(t: float, scenario: Scenario, info: dict[str, Any]) -> list[PoseRow]:
     return [PoseRow(t, (*position, heading), std)]
 
 
-def _log(
+def log_of_episode(
     scenario: Scenario,
     seed: int,
-    env: gymnasium.Env[Any, Any],
-    events: list[Event],
+    start: Array,
+    landmarks: Array,
+    events: Sequence[Event],
     poses: Array,
 ) -> SlamLog:
-    world = cast(LandmarkWorldEnv, env.unwrapped)
+    """Return the log of a simulated episode, whose time counts steps.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The world.
+    seed : int
+        Its seed.
+    start : ndarray, shape (3,)
+        Initial pose of filters [m, m, rad].
+    landmarks : ndarray, shape (n, 2)
+        True positions [m].
+    events : sequence of Event
+        Odometry and readings.
+    poses : ndarray, shape (steps + 1, 3)
+        True poses [m, m, rad].
+    """
     times = np.arange(len(poses), dtype=np.float64)
     return SlamLog(
         name=scenario.name,
         header=log_header(scenario, seed),
         motion=scenario.models.get("motion", "turn-last"),
-        start=world.start_estimate,
-        landmark_ids=np.arange(len(world.landmarks)),
-        landmarks=world.landmarks,
+        start=start,
+        landmark_ids=np.arange(len(landmarks)),
+        landmarks=landmarks,
         events=tuple(events),
         ground_truth=np.column_stack([times, poses]),
     )

@@ -211,7 +211,7 @@ class _SlamlogParser:
         self.landmarks[landmark_id] = (line.to_real(fields[1]), line.to_real(fields[2]))
 
     def _take_odometry(self, line: LogLine, fields: list[str]) -> None:
-        self.recorder.add_odometry(line, OdometryRow(*map(line.to_real, fields)))
+        self.recorder.add_row(line, OdometryRow(*map(line.to_real, fields)))
 
     def _take_measurement(self, line: LogLine, fields: list[str]) -> None:
         t, bearing, distance = map(line.to_real, (fields[0], fields[2], fields[3]))
@@ -237,8 +237,7 @@ class _SlamlogParser:
                 raise line.error(
                     "a standard deviation > 0 for each part that is given", str(each)
                 )
-        row = PoseRow(t, (x, y, heading), (std, heading_std))
-        self.recorder.add_pose(line, row)
+        self.recorder.add_row(line, PoseRow(t, (x, y, heading), (std, heading_std)))
 
     def _take_groundtruth(self, line: LogLine, fields: list[str]) -> None:
         t, x, y = map(line.to_real, fields[:3])
@@ -487,7 +486,7 @@ class EventRecorder:
     --------
     >>> line = LogLine("drive.csv", 1, "")
     >>> recorder = EventRecorder()
-    >>> recorder.add_odometry(line, OdometryRow(1.0, 3.0, 0.0, dt=1.0))
+    >>> recorder.add_row(line, OdometryRow(1.0, 3.0, 0.0, dt=1.0))
     >>> recorder.add_reading(line, Reading(1.0, 0, 0.1, 2.0))
     >>> recorder.add_reading(line, Reading(1.0, 4, 0.2, 5.0))
     >>> row, scan = recorder.finish()
@@ -501,16 +500,13 @@ class EventRecorder:
         self._seen: set[int] = set()
         self._time = -math.inf
 
-    def add_odometry(self, line: LogLine, row: OdometryRow) -> None:
-        """Append an odometry row; raise LogError if t or dt runs backwards."""
-        if row.dt < 0:
-            raise line.error("dt >= 0", str(row.dt))
-        self._advance(line, row.t)
-        self._close_scan()
-        self._events.append(row)
+    def add_row(self, line: LogLine, row: OdometryRow | PoseRow) -> None:
+        """Append a row that is no part of a scan; raise LogError if t runs backwards.
 
-    def add_pose(self, line: LogLine, row: PoseRow) -> None:
-        """Append a reading of the pose; raise LogError if t runs backwards."""
+        So does a negative dt of odometry.
+        """
+        if isinstance(row, OdometryRow) and row.dt < 0:
+            raise line.error("dt >= 0", str(row.dt))
         self._advance(line, row.t)
         self._close_scan()
         self._events.append(row)
@@ -519,8 +515,8 @@ class EventRecorder:
         self, line: LogLine, step: int, *, before: float, d: float, after: float
     ) -> None:
         """Append a motion of one step as two turn-last rows, the first with dt = 0."""
-        self.add_odometry(line, OdometryRow(float(step), 0.0, before, dt=0.0))
-        self.add_odometry(line, OdometryRow(float(step), d, after, dt=1.0))
+        self.add_row(line, OdometryRow(float(step), 0.0, before, dt=0.0))
+        self.add_row(line, OdometryRow(float(step), d, after, dt=1.0))
 
     def add_reading(self, line: LogLine, reading: Reading) -> None:
         """Append a reading; raise LogError if it contradicts the rows before it."""

@@ -39,11 +39,6 @@ if TYPE_CHECKING:
 
 # --------------------------------------------------------------------------------------
 # Keep the results of a Monte Carlo as blocks of runs, in memory or in a folder.
-#
-# A folder holds ``job.json``, the description of the job, and ``blocks/runs-*.npz``.
-# Each block appears complete or not at all, so that a job may be killed at any time and
-# then continues after its last complete block. Blocks of one job from several machines
-# may be put into one folder.
 
 
 Blocks = Iterable[tuple[range, list[run_measures.Block]]]

@@ -133,7 +133,9 @@ def replay(
     steps = list(recording.steps_of(log))
     times = np.array([step.t for step in steps], dtype=np.float64)
     show_truth = _truth_source(estimator, log, times)
-    recorder = RunRecorder(estimator, len(steps), _history(estimator, keep_history))
+    most = _MOST_JOINED if isinstance(estimator, SupportsJoin) else _MOST_MAPS
+    history = MapHistory(None if keep_history else most)
+    recorder = RunRecorder(estimator, len(steps), history)
     decisions = DecisionRecorder(estimator)
     watch, progress = watch or _unwatched, progress or _unwatched
     with one_blas_thread():
@@ -143,10 +145,8 @@ def replay(
                 for row in step.motions:
                     for odometry, dt in recording.predictions(row, log.motion):
                         estimator.predict(odometry, dt)
-                predicted, report = (
-                    map_editor.marginal_without_joining(estimator, ()),
-                    None,
-                )
+                predicted = map_editor.marginal_without_joining(estimator, ())
+                report: UpdateReport | None = None
                 if step.scan is not None:
                     report = estimator.update(step.scan.measurements, _ids(step.scan))
                     decisions.add(report, ground_truth.true_ids_of(step.scan))
@@ -164,18 +164,11 @@ def replay(
         trace,
         recorder.belief,
         scans=sum(step.scan is not None for step in steps),
-        readings=recorder.counts(),
-        changes=recorder.changes(),
+        readings=ReadingCounts(**recorder.readings),
+        changes=MapChanges(**recorder.changes),
         last_seen=recorder.last_seen,
         decisions=made,
     )
-
-
-def _history(estimator: SlamEstimator, keep_all: bool) -> MapHistory:
-    if keep_all:
-        return MapHistory(None)
-    joins = isinstance(estimator, SupportsJoin)
-    return MapHistory(_MOST_JOINED if joins else _MOST_MAPS)
 
 
 def _unwatched(*_: object) -> None:
@@ -243,28 +236,32 @@ class ReadingCounts(NamedTuple):
     ambiguous: int = 0
 
 
+_PREDICTED, _UPDATED = 0, 1
+
+
 class RunRecorder:
     """Collect beliefs and reports, step by step, into the arrays of a trace."""
 
     def __init__(self, slam: SlamEstimator, steps: int, history: MapHistory) -> None:
         self._slam, self._steps = slam, steps
-        self._predicted = _PoseTrack(steps)
-        self._updated = _PoseTrack(steps)
+        self._poses = np.empty((2, steps, 3))  # predicted, then updated
+        self._covariances = np.empty((2, steps, 3, 3))
         self._nis = np.zeros(steps)
         self._dof = np.zeros(steps, dtype=np.int64)
         self._history = history
         self._first: dict[int, tuple[Array, Array]] = {}
         self._first_covariance: Array | None = None
-        self._readings: Counter[str] = Counter()
-        self._changes: Counter[str] = Counter()
         self._ids: tuple[int, ...] = ()
+        #: The fields of `ReadingCounts` and of `MapChanges`.
+        self.readings: Counter[str] = Counter()
+        self.changes: Counter[str] = Counter()
         #: The step of the last reading of each landmark.
         self.last_seen: dict[int, int] = {}
 
     def add(self, predicted: Belief, report: UpdateReport | None) -> None:
         """Record one step, after the scan at its end."""
         step = len(self._history)
-        self._predicted.put(step, predicted)
+        self._put(_PREDICTED, step, predicted)
         updated = predicted
         if report is not None:
             updated = map_editor.marginal_without_joining(self._slam, ())
@@ -274,30 +271,26 @@ class RunRecorder:
             seen = (*report.associated_ids, *report.added_ids)
             self.last_seen |= dict.fromkeys(seen, step)
             self._keep_new(map_editor.mapped_ids(self._slam))
-        self._updated.put(step, updated)
+        self._put(_UPDATED, step, updated)
         is_last = step == self._steps - 1
         if is_last:
             self.belief = self._slam.belief()
             if isinstance(self._slam, SupportsJoin):
-                self._updated.put(step, self.belief)  # the joined map corrects the pose
+                self._put(_UPDATED, step, self.belief)  # the joined map corrects it
         is_due = is_last or self._history.is_due(step, self._ids)
         self._history.append(map_editor.view_map(self._slam) if is_due else None)
 
-    def counts(self) -> ReadingCounts:
-        """Count the readings."""
-        return ReadingCounts(**self._readings)
-
-    def changes(self) -> MapChanges:
-        """Count the changes of the map."""
-        return MapChanges(**self._changes)
+    def _put(self, track: int, step: int, belief: Belief) -> None:
+        self._poses[track, step] = belief.pose
+        self._covariances[track, step] = belief.pose_covariance
 
     def _count(self, report: UpdateReport) -> None:
         for outcome in ("associated", "added", "rejected", "skipped", "near"):
-            self._readings[outcome] += len(getattr(report, f"{outcome}_ids"))
-        self._readings["tentative"] += len(report.tentative_rows)
-        self._readings["ambiguous"] += len(report.ambiguous_rows)
+            self.readings[outcome] += len(getattr(report, f"{outcome}_ids"))
+        self.readings["tentative"] += len(report.tentative_rows)
+        self.readings["ambiguous"] += len(report.ambiguous_rows)
         for change in ("confirmed", "removed", "merged"):
-            self._changes[change] += len(getattr(report, f"{change}_ids"))
+            self.changes[change] += len(getattr(report, f"{change}_ids"))
 
     def trace(
         self,
@@ -311,16 +304,16 @@ class RunRecorder:
         first = [self._first[i] for i in belief.landmark_ids]
         first_covariance = self._first_covariance
         if first_covariance is None:
-            first_covariance = self._updated.covariances[0]
+            first_covariance = self._covariances[_UPDATED, 0]
         return RunTrace(
             estimator=name,
             t=times,
             time_unit="steps" if (times == np.arange(len(times))).all() else "s",
             frame=belief.frame,
-            predicted_poses=self._predicted.poses,
-            predicted_pose_covariances=self._predicted.covariances,
-            poses=self._updated.poses,
-            pose_covariances=self._updated.covariances,
+            predicted_poses=self._poses[_PREDICTED],
+            predicted_pose_covariances=self._covariances[_PREDICTED],
+            poses=self._poses[_UPDATED],
+            pose_covariances=self._covariances[_UPDATED],
             true_poses=ground_truth.true_poses_of(log, times),
             nis=self._nis,
             nis_dof=self._dof,
@@ -349,19 +342,7 @@ class RunRecorder:
         pairs = zip(belief.landmarks, belief.landmark_covariances, strict=True)
         self._first |= dict(zip(new, pairs, strict=True))
         self._ids = ids
-        self._changes["most"] = max(self._changes["most"], len(ids))
-
-
-class _PoseTrack:
-    """Poses (steps, 3) and their covariances (steps, 3, 3)."""
-
-    def __init__(self, steps: int) -> None:
-        self.poses = np.empty((steps, 3))
-        self.covariances = np.empty((steps, 3, 3))
-
-    def put(self, step: int, belief: Belief) -> None:
-        self.poses[step] = belief.pose
-        self.covariances[step] = belief.pose_covariance
+        self.changes["most"] = max(self.changes["most"], len(ids))
 
 
 class MapHistory(Sequence[MapEstimate]):

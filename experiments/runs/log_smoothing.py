@@ -101,7 +101,7 @@ def smooth_log(
             repair = reassociate(
                 _with_all_readings(recorder.recorded(), log, slam),
                 start=filtered.trace.poses[_scan_steps(log)],
-                progress=repairing or _unwatched,
+                progress=repairing or (lambda done, steps: None),
             )
             drive = smooth_repaired(repair, **recorder.kernel)
         elif smoother is not None:
@@ -139,10 +139,6 @@ def _scan_steps(log: SlamLog) -> IntArray:
     """Return the steps whose poses are those of a drive: the first, and all scans."""
     scanned = [step.scan is not None for step in steps_of(log)]
     return np.flatnonzero([True, *scanned[1:]])
-
-
-def _unwatched(done: int, steps: int) -> None:
-    """Watch nothing."""
 
 
 def summarise_smoothing(

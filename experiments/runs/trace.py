@@ -18,6 +18,8 @@ from ...estimator import interface
 from ...estimator.map_management.policy import policy_of
 from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation import association_scores, trajectory_error
+from ..logs.ground_truth import mutual_nearest
+from ..logs.slamlog import NO_LANDMARK
 
 Integers = NDArray[np.integer]
 
@@ -261,7 +263,14 @@ def compare_association(
         )
         identities = run.identities()
     else:
-        identities = mutual_nearest(truth, landmark_ids, landmarks)
+        rows = mutual_nearest(truth.positions, landmarks)
+        identities = dict(
+            zip(
+                landmark_ids,
+                np.append(truth.ids, NO_LANDMARK)[rows].tolist(),
+                strict=True,
+            )
+        )
     there, of = truth.positions[is_known], place[is_known]
     moved = alignment(identities, truth, landmark_ids, landmarks)
     return RunAssociation(
@@ -270,23 +279,6 @@ def compare_association(
         association_scores.gospa(moved.apply(landmarks), there, places=of),
         resolution,
     )
-
-
-def mutual_nearest(
-    truth: TrueLandmarks, landmark_ids: Sequence[int], landmarks: Array
-) -> dict[int, int]:
-    """Pair mapped and true landmarks that are nearest to each other."""
-    if not len(landmarks) or not len(truth.ids):
-        return {}
-    from scipy.spatial.distance import cdist  # noqa: PLC0415 (slow to import)
-
-    gaps = cdist(landmarks, truth.positions)
-    nearest, back = gaps.argmin(axis=1), gaps.argmin(axis=0)
-    return {
-        i: int(truth.ids[j])
-        for k, (i, j) in enumerate(zip(landmark_ids, nearest.tolist(), strict=True))
-        if back[j] == k
-    }
 
 
 def alignment(

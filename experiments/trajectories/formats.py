@@ -26,7 +26,7 @@ from ...sim_configs import Scenario
 from ...sim_configs.field_types import unknown_choice
 from ...sim_configs.scenario_files import scenario_text
 from ..logs import slamlog
-from ..logs.recording import log_header
+from ..logs.recording import log_of_episode
 from ..runs.filter_settings import settings_for_scenario
 from .trajectory import (
     ARRAYS,
@@ -382,17 +382,8 @@ def to_slamlog(trajectory: Trajectory) -> slamlog.SlamLog:
                 of = None if true_ids is None else true_ids[step][seen]
                 scan = slamlog.Scan(float(step), readings, true_ids=of)
             events.append(scan)
-    times = np.arange(len(trajectory.poses), dtype=np.float64)
-    return slamlog.SlamLog(
-        name=trajectory.scenario.name,
-        header=log_header(trajectory.scenario, trajectory.seed),
-        motion=trajectory.scenario.models.get("motion", "turn-last"),
-        start=trajectory.start_estimate,
-        landmark_ids=np.arange(len(landmarks)),
-        landmarks=landmarks,
-        events=tuple(events),
-        ground_truth=np.column_stack([times, trajectory.poses]),
-    )
+    world, seed, start = trajectory.scenario, trajectory.seed, trajectory.start_estimate
+    return log_of_episode(world, seed, start, landmarks, events, trajectory.poses)
 
 
 def _trajectory(log: slamlog.SlamLog, about: dict[str, Any]) -> Trajectory:
@@ -401,14 +392,14 @@ def _trajectory(log: slamlog.SlamLog, about: dict[str, Any]) -> Trajectory:
     measurements = np.zeros((len(moves) + 1, rows, 2))
     mask = np.zeros((len(moves) + 1, rows), dtype=np.bool_)
     true_ids = np.full(mask.shape, slamlog.NO_LANDMARK, dtype=np.int64)
-    for scan in _scans(log):
+    for scan in log.scans:
         ids = scan.landmark_ids
         places = int(scan.t), np.arange(len(scan.measurements)) if ids is None else ids
         measurements[places], mask[places] = scan.measurements, True
         if scan.true_ids is not None:
             true_ids[places] = scan.true_ids
     hides = not about["scenario"].sensor.identities
-    known = all(scan.true_ids is not None for scan in _scans(log))
+    known = all(scan.true_ids is not None for scan in log.scans)
     return Trajectory(
         **about,
         start_estimate=log.start,
@@ -419,10 +410,6 @@ def _trajectory(log: slamlog.SlamLog, about: dict[str, Any]) -> Trajectory:
         mask=mask,
         landmark_ids=true_ids if hides and known else None,
     )
-
-
-def _scans(log: slamlog.SlamLog) -> Iterator[slamlog.Scan]:
-    return (event for event in log.events if isinstance(event, slamlog.Scan))
 
 
 #: The formats, or the modules that define them and load a library.

@@ -109,7 +109,7 @@ def _take_odometry(recorder: EventRecorder, line: LogLine, step: int) -> None:
     fields = line.text.split()
     line.check_count(fields, (2,), "odometry d α")
     d, alpha = map(line.to_real, fields)
-    recorder.add_odometry(line, OdometryRow(float(step), d, alpha, dt=1.0))
+    recorder.add_row(line, OdometryRow(float(step), d, alpha, dt=1.0))
 
 
 def _take_scan(recorder: EventRecorder, line: LogLine, step: int, count: int) -> None:

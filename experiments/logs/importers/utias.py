@@ -176,7 +176,7 @@ def _merge(odometry: Array, readings: TimedReadings) -> tuple[slamlog.Event, ...
         seen.setdefault(reading.t, []).append((line, reading))
     recorder = slamlog.EventRecorder()
     for row in odometry_between(stamps, moved, [reading.t for _, reading in readings]):
-        recorder.add_odometry(MERGED, row)
+        recorder.add_row(MERGED, row)
         for line, reading in seen.get(row.t, []):
             recorder.add_reading(line, reading)
     return recorder.finish()
