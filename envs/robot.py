@@ -125,11 +125,7 @@ class UnicycleBody(Restorable):
             Share of the displacement, in [0, 1], that the walls allowed. Walls do not
             affect the turn.
         """
-        if self._drive is None:
-            forward, sideways = command[0] + slip[0], slip[1]
-        else:
-            forward, sideways = self._drive.path(command[0], command[1])
-            forward, sideways = forward + slip[0], sideways + slip[1]
+        forward, sideways = _path(self._drive, command, slip)
         dx, dy = displacement(forward, sideways, self._cos, self._sin)
         share = 1.0
         if self._walls:
@@ -420,11 +416,7 @@ class UnicycleBodies(Restorable):
             that do not move; None without walls.
         """
         change = np.empty(self._pose.shape)
-        if self._drive is None:
-            forward, sideways = commands[:, 0] + slip[:, 0], slip[:, 1]
-        else:
-            forward, sideways = self._drive.path(commands[:, 0], commands[:, 1])
-            forward, sideways = forward + slip[:, 0], sideways + slip[:, 1]
+        forward, sideways = _path(self._drive, commands.T, slip.T)
         change[0], change[1] = displacement(forward, sideways, self._cos, self._sin)
         if moving is not None:
             change[:2] *= moving  # no wall is asked about those that stay
@@ -452,6 +444,14 @@ class UnicycleBodies(Restorable):
 def _as_pairs(numbers: ComplexArray) -> Array:
     """View complex numbers, (B, 1), as rows (real, imaginary), (B, 2)."""
     return numbers.view(np.float64)
+
+
+def _path(drive: Drive | None, command: Any, slip: Any) -> tuple[Any, Any]:
+    """Return the displacement in the robot's frame; numbers or arrays."""
+    if drive is None:
+        return command[0] + slip[0], slip[1]
+    forward, sideways = drive.path(command[0], command[1])
+    return forward + slip[0], sideways + slip[1]
 
 
 def displacement(
@@ -493,7 +493,18 @@ _NO_ERROR = (0.0, 0.0)
 _NO_ERRORS = np.array(0.0)
 
 
-class OdometrySensor:
+class _Odometry:
+    """The settings of the odometry of a scenario's robots."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._slips = scenario.motion.noise_in == "motion"
+        self._noise_at_rest = scenario.motion.noise_at_rest
+        faults = scenario.present_faults
+        self._gain, self._turn = 1.0 + faults.odometry_scale, faults.odometry_turn
+        self._drive = drive_of(scenario.robot)
+
+
+class OdometrySensor(_Odometry):
     """The odometry of one robot.
 
     Parameters
@@ -510,13 +521,6 @@ class OdometrySensor:
     >>> sensor.read((1.0, 0.2), share=0.5, error=(0.0, 0.1))
     array([0.5, 0.3])
     """
-
-    def __init__(self, scenario: Scenario) -> None:
-        self._slips = scenario.motion.noise_in == "motion"
-        self._noise_at_rest = scenario.motion.noise_at_rest
-        faults = scenario.present_faults
-        self._gain, self._turn = 1.0 + faults.odometry_scale, faults.odometry_turn
-        self._drive = drive_of(scenario.robot)
 
     def split_noise(
         self, command: Command, noise: Sequence[float]
@@ -570,7 +574,7 @@ class OdometrySensor:
         return np.array([driven, turned + error[1]])
 
 
-class VectorOdometrySensor:
+class VectorOdometrySensor(_Odometry):
     """The odometry of B robots; the vector form of `OdometrySensor`.
 
     Parameters
@@ -582,12 +586,8 @@ class VectorOdometrySensor:
     """
 
     def __init__(self, scenario: Scenario, count: int) -> None:
-        self._slips = scenario.motion.noise_in == "motion"
-        self._noise_at_rest = scenario.motion.noise_at_rest
+        super().__init__(scenario)
         self._no_slip = np.zeros((count, 3))
-        faults = scenario.present_faults
-        self._gain, self._turn = 1.0 + faults.odometry_scale, faults.odometry_turn
-        self._drive = drive_of(scenario.robot)
 
     def split_noise(self, commands: Array, noise: Array) -> tuple[Array, Array]:
         """Split noise, (B, 3), into slip, (B, 3), and odometry error, (B, 2) or ().

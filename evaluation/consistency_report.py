@@ -242,11 +242,9 @@ def _same_shape(
     scores = argument_checks.as_floats("nees", nees)
     if scores.ndim != 2 or scores.shape[1] < 2:
         raise ValueError(f"nees must be shape (runs, steps >= 2), got {scores.shape}")
-    scans = argument_checks.as_floats("nis", nis)
+    scans = argument_checks.shaped("nis", nis, scores.shape)
     freedom = np.asarray(nis_dof, dtype=np.int64)
-    for name, array in (("nis", scans), ("nis_dof", freedom)):
-        if array.shape != scores.shape:
-            raise ValueError(f"{name} must be shape {scores.shape}, got {array.shape}")
+    argument_checks.shaped("nis_dof", freedom, scores.shape)
     return scores, scans, freedom
 
 

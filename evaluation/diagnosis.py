@@ -199,7 +199,10 @@ def _blamed(
 ) -> Blame | None:
     if mistakes is None or not np.any(mistakes):
         return None
-    paired = None if known is None else _paired(known, nees, pose)
+    paired = None
+    if known is not None:  # at the steps that count
+        paired = argument_checks.shaped("known_nees", known, np.shape(nees))
+        paired = paired[:, paired.shape[1] - pose.shape[1] :]
     return blame_association(pose, np.asarray(mistakes, float), paired)
 
 
@@ -218,23 +221,9 @@ def _also(
     return text
 
 
-def _paired(known_nees: ArrayLike, nees: ArrayLike, pose: Array) -> Array:
-    """Return the NEES with known identities, at the steps that count."""
-    known = argument_checks.as_floats("known_nees", known_nees)
-    if known.shape != np.shape(nees):
-        raise ValueError(
-            f"known_nees must be shape {np.shape(nees)}, got {known.shape}"
-        )
-    return known[:, known.shape[1] - pose.shape[1] :]
-
-
 def _checked_sums(noise: ArrayLike, runs: int) -> Array:
-    sums, shape = (
-        argument_checks.as_floats("noise", noise),
-        (runs, len(CHANNELS), len(MOMENTS)),
-    )
-    if sums.shape != shape:
-        raise ValueError(f"noise must be shape {shape}, got {sums.shape}")
+    shape = runs, len(CHANNELS), len(MOMENTS)
+    sums = argument_checks.shaped("noise", noise, shape)
     if not np.isfinite(sums).all():
         raise ValueError("noise must be finite: leave out runs that failed")
     return sums
@@ -242,13 +231,9 @@ def _checked_sums(noise: ArrayLike, runs: int) -> Array:
 
 def _checked(nees: ArrayLike, heading_nees: ArrayLike) -> tuple[Array, Array]:
     pose = argument_checks.as_floats("nees", nees)
-    heading = argument_checks.as_floats("heading_nees", heading_nees)
     if pose.ndim != 2 or not pose.shape[1]:
         raise ValueError(f"nees must be shape (runs, steps), got {pose.shape}")
-    if heading.shape != pose.shape:
-        raise ValueError(
-            f"heading_nees must be shape {pose.shape}, got {heading.shape}"
-        )
+    heading = argument_checks.shaped("heading_nees", heading_nees, pose.shape)
     known = np.isfinite(pose)
     first = int(known.all(axis=0).argmax())
     if not known[:, first:].all():

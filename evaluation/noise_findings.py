@@ -296,12 +296,12 @@ def noise_sums(
     moved = argument_checks.as_floats("odometry", odometry)
     if moved.shape == (*shape, 2):
         moved = np.insert(moved, 1, 0.0, axis=2)
-    moved = _shaped("odometry", moved, (*shape, 3))
+    moved = argument_checks.shaped("odometry", moved, (*shape, 3))
     if seen.shape != (*shape, points.shape[1]) or len(points) != len(poses):
         raise ValueError(
             f"visible must be shape {(*shape, points.shape[1])}, got {seen.shape}"
         )
-    readings = _shaped("measurements", measurements, (*seen.shape, 2))
+    readings = argument_checks.shaped("measurements", measurements, (*seen.shape, 2))
     motion = argument_checks.standard_deviations("motion_std", motion_std, 3)
     sensor = argument_checks.standard_deviations("measurement_std", measurement_std, 2)
     steps = np.ones(shape, bool) if noisy_steps is None else np.asarray(noisy_steps)
@@ -310,13 +310,6 @@ def noise_sums(
         *_sensor_noise(poses, points, readings, seen, sensor, range_std_per_metre),
     ]
     return np.stack([_summed(noise, len(poses)) for noise in channels], axis=1)
-
-
-def _shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = argument_checks.as_floats(name, value)
-    if array.shape != shape:
-        raise ValueError(f"{name} must be shape {shape}, got {array.shape}")
-    return array
 
 
 def _motion_noise(

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array
 from ..estimator.models.bearing_range import wrap_angle
-from ..estimator.support.argument_checks import as_floats
+from ..estimator.support.argument_checks import as_floats, shaped
 
 
 class Alignment(NamedTuple):
@@ -181,9 +181,7 @@ def landmark_distances(
     """
     estimate, true = _paired(landmarks=landmarks, truth=truth)
     e = estimate - true
-    P = as_floats("covariances", covariances)
-    if P.shape != (len(e), 2, 2):
-        raise ValueError(f"covariances must be shape ({len(e)}, 2, 2), got {P.shape}")
+    P = shaped("covariances", covariances, (len(e), 2, 2))
     if not (np.linalg.eigvalsh(P) > 0).all():
         raise ValueError("covariances must be positive definite, got one that is not")
     weighted = np.linalg.solve(P, e[..., None])[..., 0]

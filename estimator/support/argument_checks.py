@@ -65,6 +65,14 @@ def as_floats(name: str, value: ArrayLike) -> Array:
         raise ValueError(f"{name} must be numbers, got {value!r}") from None
 
 
+def shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Return ``value`` as float64 of one shape, or refuse it."""
+    array = as_floats(name, value)
+    if array.shape != shape:
+        raise ValueError(f"{name} must be shape {shape}, got {array.shape}")
+    return array
+
+
 def scan(
     measurements: ArrayLike, columns: tuple[str, ...] = ("bearing", "range")
 ) -> Array:

@@ -15,7 +15,7 @@ from uuid import uuid4
 import numpy as np
 
 from ....arrays import Array, IntArray
-from ...support.argument_checks import LOWEST_ID, LandmarkIds, refuse_reserved
+from ...support.argument_checks import LOWEST_ID
 from ...support.undo import Undo
 
 CACHE_SIZE = 8  # number of submaps of a folder that are kept in memory
@@ -342,10 +342,3 @@ def link_name(slot: int) -> int:
 def slot_of_link(name: int) -> int:
     """Return the slot of a link."""
     return name - LOWEST_ID
-
-
-def refuse_link_names(landmark_ids: LandmarkIds | None) -> None:
-    """Raise a ValueError for identities in the range of link names."""
-    ids = np.asarray(() if landmark_ids is None else landmark_ids)
-    if ids.dtype.kind == "i":
-        refuse_reserved(ids.ravel().tolist())

@@ -31,7 +31,6 @@ from .store import (
     MemoryStore,
     Submap,
     SubmapStore,
-    refuse_link_names,
     slot_of_link,
 )
 
@@ -261,7 +260,7 @@ class SubmapSlam(SubmapQueries):
                 f"landmarks of one scan, got {self._rule.size}"
             )
         ids = argument_checks.given_identities(landmark_ids, len(readings), self)
-        refuse_link_names(ids)
+        argument_checks.refuse_reserved(ids)
         argument_checks.refuse_unusable(readings, ids)
         self._claim_folder()
 
@@ -526,7 +525,7 @@ def _numbers(state: Mapping[str, Any], key: str, limit: int) -> IntArray:
 
 def _index(state: Mapping[str, Any], ids: list[int], count: int) -> LandmarkIndex:
     """Return the landmarks of the map with their slots."""
-    refuse_link_names(ids)
+    argument_checks.refuse_reserved(ids)
     slots = _numbers(state, "slots", count).ravel()
     if len(slots) != len(ids) or (np.diff(slots) <= 0).any():
         raise ValueError(
