@@ -15,13 +15,13 @@ Every function accepts leading axes for worlds that are simulated together.
 
 import math
 from collections.abc import Sequence
-from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..arrays import Array, BoolArray, ComplexArray, IntArray
 from ..sim_configs import Scenario
+from ..suggestions import imported
 from .noise_streams import SensorNoise, SensorSettings, largest_noise
 from .robot import wrap_bearings
 
@@ -157,15 +157,13 @@ def _reading_of_places(kind: str) -> tuple[Any, list[int]]:
     This is None for the sensors of bearings and ranges.  A kind "module:SENSOR" is a
     sensor that the user has written.
     """
-    module, colon, name = kind.partition(":")
-    if not colon:
+    if ":" not in kind:
         return (lambda x, y: (x, y)) if kind == "position" else None, []
-    try:
-        own = getattr(import_module(module), name)
-        h, angles = own.h, [row for row, wraps in enumerate(own.wraps) if wraps]
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"cannot import sensor.kind = '{kind}': {error}") from error
-    return (lambda x, y: h(x, y)[0]), angles
+    refusal = f"cannot import sensor.kind = '{kind}': "
+    h, wraps = (imported(f"{kind}.{part}", refusal) for part in ("h", "wraps"))
+    return (lambda x, y: h(x, y)[0]), [
+        row for row, is_angle in enumerate(wraps) if is_angle
+    ]
 
 
 def _in_view(

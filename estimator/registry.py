@@ -9,12 +9,11 @@ import inspect
 import re
 import tomllib
 from collections.abc import Callable, Mapping
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from ..suggestions import closest
+from ..suggestions import closest, imported
 from .filters import ekf
 from .filters.batch import BatchSlam
 from .filters.ideal import IdealEkfSlam
@@ -95,7 +94,10 @@ def find_estimator(name: str) -> EstimatorFactory:
     if not isinstance(factory, str):
         return factory
     if ":" in factory:
-        return _imported(factory)
+        made: EstimatorFactory = imported(
+            factory, f"cannot import estimator '{factory}', ", kind=True
+        )
+        return made
     hint, known = closest(name, _factories), ", ".join(_factories)
     raise ValueError(f"unknown estimator '{name}'{hint} (there are {known})")
 
@@ -216,18 +218,6 @@ def make_batch(
         initial_pose_std=initial_pose_std,
         threads=threads,
     )
-
-
-def _imported(path: str) -> EstimatorFactory:
-    module, _, attribute = path.partition(":")
-    try:
-        made = getattr(import_module(module), attribute)
-    except Exception as error:
-        kind = type(error).__name__
-        raise ValueError(
-            f"cannot import estimator '{path}', {kind}: {error}"
-        ) from error
-    return cast("EstimatorFactory", made)
 
 
 def _unknown_option(

@@ -20,6 +20,5 @@ if TYPE_CHECKING:
     from .sensors import Sensor as Sensor
     from .sensors import check_sensor as check_sensor
     from .sensors import find_sensor as find_sensor
-    from .sensors import register_sensor as register_sensor
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

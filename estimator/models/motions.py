@@ -24,14 +24,13 @@ import re
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST, Array
-from ...suggestions import closest
+from ...suggestions import closest, imported
 from ..support import argument_checks
 from .rigid_motion import composed
 
@@ -69,8 +68,6 @@ class Motion:
     def moved(self, odometry: ArrayLike) -> tuple[float, float, float]:
         """Return b of one reading, or refuse it."""
         first, second = argument_checks.pair("odometry", odometry)
-        if self.displacement is _ahead:
-            return first, 0.0, second
         dx, dy, turn = map(float, self.displacement(first, second))
         if not (abs(dx) <= LARGEST and abs(dy) <= LARGEST and abs(turn) <= LARGEST):
             raise ValueError(
@@ -222,12 +219,7 @@ def find_motion(motion: str | Motion) -> Motion:
     if not isinstance(motion, str):
         raise ValueError(f"motion must be a label or a Motion, got {motion!r}")
     if re.fullmatch(r"[\w.]+:\w+", motion):
-        module, name = motion.split(":")
-        try:
-            found = getattr(import_module(module), name)
-        except (ImportError, AttributeError) as error:
-            raise ValueError(f"cannot import motion '{motion}': {error}") from error
-        return find_motion(found)
+        return find_motion(imported(motion, f"cannot import motion '{motion}': "))
     match = re.fullmatch(r"\s*(\w+)\s*(?:\[(.*)\])?\s*", motion, re.DOTALL)
     name = match[1] if match else motion
     if match is None or name not in MOTIONS:
@@ -307,8 +299,7 @@ def check_motion(motion: str | Motion, trials: int = 1000) -> None:
         With the first mistake found.
     """
     model, rng = find_motion(motion), np.random.default_rng(0)
-    odometry = rng.uniform(-1.0, 1.0, (trials, 2))
-    odometry[0] = 0.0
+    odometry = np.vstack([np.zeros(2), rng.uniform(-1.0, 1.0, (trials, 2))])
     kept = odometry.copy()
     moved = model.displacements(odometry)
     mistakes = {

@@ -1,8 +1,11 @@
-"""Suggest the name that was meant, for error messages."""
+"""Find what a user names: import its path, or suggest the name that was meant."""
 
 from collections.abc import Iterable
 from difflib import SequenceMatcher
+from importlib import import_module
 from itertools import islice
+from operator import attrgetter
+from typing import Any
 
 _SIMILAR = 0.6  # of at most 1
 
@@ -40,3 +43,25 @@ def closest(word: str, words: Iterable[str]) -> str:
         nearest = list(islice(beginning, 1))
     suggested = " or ".join(f"'{known[name]}'" for name in nearest)
     return f"; did you mean {suggested}?" if nearest else ""
+
+
+def imported(path: str, refusal: str, *, kind: bool = False) -> Any:
+    """Return what an import path "module:NAME" names, or "module:NAME.PART".
+
+    Raises
+    ------
+    ValueError
+        If it cannot be imported: the refusal, perhaps the kind of the error, and the
+        error.
+
+    Examples
+    --------
+    >>> imported("math:tau", "no such number: ") == 2 * imported("math:pi", "")
+    True
+    """
+    module, _, name = path.partition(":")
+    try:
+        return attrgetter(name)(import_module(module))
+    except Exception as error:
+        of_kind = f"{type(error).__name__}: " if kind else ""
+        raise ValueError(f"{refusal}{of_kind}{error}") from error

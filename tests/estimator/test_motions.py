@@ -121,6 +121,7 @@ def test_a_bicycle_rolls_on_its_rear_axle_and_carries_its_sensor():
 @pytest.mark.parametrize("motion", DRIVES, ids=lambda motion: motion.name)
 def test_a_drive_passes_its_check_and_is_found_by_its_name(motion):
     check_motion(motion)
+    check_motion(motion, trials=0)  # at rest only
     assert find_motion(motion.name) == motion
     assert pickle.loads(pickle.dumps(motion)) == motion
 
