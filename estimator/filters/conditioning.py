@@ -207,7 +207,7 @@ def observe(
             break
     shift = np.where(moves[..., None], first[0], shift)
     gains = np.where(moves[..., None, None], first[1], gains)
-    return ObservedMap(*composed(mean, _reduced(covariance, gains), shift), nu, L, nis)
+    return ObservedMap(*retracted(mean, _reduced(covariance, gains), shift), nu, L, nis)
 
 
 def _reduced(covariance: Array, gains: Array) -> Array:
@@ -348,7 +348,7 @@ def coincide(
     P = covariance - gains.T @ gains
     if frame == "additive":
         return ConditionedMap(mean - gains.T @ np.linalg.solve(L, offset), P)
-    return composed(mean, P, _turned_shift(L, gains, offset))
+    return retracted(mean, P, _turned_shift(L, gains, offset))
 
 
 def _turned_shift(
@@ -372,7 +372,7 @@ def _columns(slots: int | Sequence[int]) -> IntArray:
     return np.asarray((first[:, None] + np.arange(2)).ravel())
 
 
-def composed(mean: Array, covariance: Array, shift: Array) -> ConditionedMap:
+def retracted(mean: Array, covariance: Array, shift: Array) -> ConditionedMap:
     """Compose an invariant correction δ with states, and transform P to match.
 
     ::

@@ -52,7 +52,7 @@ from ..models.sensors import Sensor
 from ..support import saved_states
 from ..support.argument_checks import LOWEST_ID, RESERVED_IDS
 from ..support.saved_states import NUMBERS, WHOLE, Table, with_prefix, without_prefix
-from .conditioning import composed
+from .conditioning import retracted
 from .gaussian_map import GaussianMap
 
 #: Past poses kept; beyond it, the one nearest to the pose before it goes.
@@ -400,7 +400,7 @@ def _conditioned(
     P = (P + P.T) / 2
     mean = np.concatenate([mean, fit.point])
     if rules.frame == INVARIANT:
-        mean, P = composed(mean, P, shift)
+        mean, P = retracted(mean, P, shift)
     else:
         mean = mean + shift
     return BeliefArrays(mean, P, mean)

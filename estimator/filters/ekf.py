@@ -81,7 +81,7 @@ class MapFilter(ObservesPoses):
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
         self.map.reset(first, np.diag(std**2))
         if self.waiting is not None:
-            self.waiting = Waiting()
+            self.waiting, self._report = Waiting(), None
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise landmarks; the remaining belief is unchanged to the last bit.
@@ -186,6 +186,7 @@ class MapFilter(ObservesPoses):
             self.map.restore(state)
             if self.waiting is not None:
                 self.waiting = Waiting(state["waiting_ids"], state["waiting_readings"])
+                self._report = None
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
@@ -382,14 +383,14 @@ class EkfSlam(MapFilter):
         if sensor is not BEARING_RANGE:
             kernel = for_sensor(kernel, sensor)
             if self.waiting is not None:
-                return self._update_and_collect(kernel, readings, ids)
+                return self._update_and_collect(kernel, readings, ids, self.waiting)
         status = self.map.take_in(kernel, readings, ids)
         if status != DONE:
             self._refuse(status, readings, ids)
         return self.map.report()
 
     def _update_and_collect(
-        self, kernel: UpdateKernel, readings: Array, ids: IntArray
+        self, kernel: UpdateKernel, readings: Array, ids: IntArray, waiting: Waiting
     ) -> UpdateReport:
         """Update with readings of mapped landmarks; let those of others wait."""
         argument_checks.refuse_reserved(ids.tolist())
@@ -402,7 +403,7 @@ class EkfSlam(MapFilter):
             left = self.map.parts.ledger[OUTCOME, : len(ids)] == WAITING
             new = Waiting(np.column_stack([ids, ids])[left], readings[left])
             self.waiting, placed = collect(
-                self.map, self.sensor, self.rules, self.waiting or Waiting(), new
+                self.map, self.sensor, self.rules, waiting, new
             )
             self._report = report.replace(added_ids=placed)
         return self._report

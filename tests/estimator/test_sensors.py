@@ -519,6 +519,17 @@ def test_waiting_filters_continue_from_a_saved_state_bit_for_bit():
         other.load_state_dict(state)
 
 
+def test_a_new_run_begins_without_a_report():
+    slam = waiting_filter("invariant", RANGE)
+    drive_past(slam, RANGE, 30)
+    state = slam.state_dict()
+    assert len(slam.report().innovation)
+    slam.reset(np.zeros(3), np.full(3, 0.1))
+    assert not len(slam.report().innovation)
+    slam.load_state_dict(state)
+    assert not len(slam.report().innovation)
+
+
 def test_an_update_that_fails_leaves_the_readings_waiting():
     slam = waiting_filter("ekf", RANGE)
     drive_past(slam, RANGE, 5)
