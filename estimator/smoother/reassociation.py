@@ -425,16 +425,18 @@ class _Search:
 
     def result(self, state: _State, first_score: float) -> Reassociation:
         """Return the drive with the associations of a state."""
-        lengths = [len(scan.ids) for scan in self.drive.scans]
-        ids = np.split(state.labels, np.cumsum(lengths)[:-1])
         drive = self.relabelled(state.labels)
+        ids = self.by_scan(state.labels)
         return Reassociation(drive, state.poses, ids, state.score, first_score)
+
+    def by_scan(self, labels: IntArray) -> list[IntArray]:
+        """Return the labels of each scan."""
+        lengths = [len(scan.ids) for scan in self.drive.scans]
+        return np.split(labels, np.cumsum(lengths)[:-1])
 
     def relabelled(self, labels: IntArray) -> Drive:
         """Return the drive with other landmarks for its readings."""
-        lengths = [len(scan.ids) for scan in self.drive.scans]
-        ids = np.split(labels, np.cumsum(lengths)[:-1])
-        pairs = zip(self.drive.scans, ids, strict=True)
+        pairs = zip(self.drive.scans, self.by_scan(labels), strict=True)
         return self.drive.with_scans([Sightings(z, i) for (z, _), i in pairs])
 
 

@@ -25,9 +25,9 @@ from .utias import TIME_DIGITS, odometry_between
 
 DRIVE, GPS, TREES = "aa3_dr.mat", "aa3_gpsx.mat", "victoria_park.csv"
 EPOCH = 20.967  # [s] on the car's clock: the time 0 of the trees, the first GPS fix
-CAR = bicycle(2.83)  # the pose is that of the middle of the rear axle
 ENCODER = 0.76  # the left rear wheel is so far from the middle of the axle [m]
 WHEELBASE = 2.83  # [m]
+CAR = bicycle(WHEELBASE)  # the pose is that of the middle of the rear axle
 ANTENNA = "3.78,0.5"  # ahead and to the left of it [m]
 
 
@@ -107,14 +107,15 @@ def _columns(path: Path, time: str, *names: str) -> list[Array]:
         raise slamlog.LogError(f"{path}: expected a MATLAB file, {error}") from None
     columns = []
     for name in (time, *names):
-        column = np.asarray(found.get(name, [])).astype(np.float64, casting="unsafe")
-        columns.append(column.ravel())
-        if len(column.ravel()) < 2 or len(columns[-1]) != len(columns[0]):
+        numbers = np.asarray(found.get(name, [])).ravel()
+        column = numbers.astype(np.float64, casting="unsafe")
+        columns.append(column)
+        if len(column) < 2 or len(column) != len(columns[0]):
             raise slamlog.LogError(
                 f"{path}: expected columns {time}, {', '.join(names)} of equal length, "
-                f"got {len(columns[-1])} numbers of {name}"
+                f"got {len(column)} numbers of {name}"
             )
-        if not np.isfinite(columns[-1]).all():
+        if not np.isfinite(column).all():
             raise slamlog.LogError(f"{path}: expected finite numbers in {name}")
     columns[0] = np.round(columns[0] / 1000 - EPOCH, TIME_DIGITS)
     if (np.diff(columns[0]) < 0).any():
