@@ -194,7 +194,7 @@ def observe(
         return ObservedMap(mean + shift, _reduced(covariance, gains), nu, L, nis)
     first, moves = (shift, gains), np.ones(nis.shape, dtype=np.bool_)
     for _ in range(0 if once else MOST_ITERATIONS):
-        at = _moved(mean, shift)
+        at = moved(mean, shift)
         slopes = slopes_at(H, at[..., :2] - mean[..., :2])
         root, rows = _whitened(covariance, slopes, R)
         again = innovation(at)[..., None] + slopes @ shift[..., :m, None]
@@ -380,14 +380,14 @@ def retracted(mean: Array, covariance: Array, shift: Array) -> ConditionedMap:
         q ← R(t) q + V(t) (δq − t J q) = q + V(t) δq,    θ ← θ + t,    t = δθ
         P ← T P Tᵀ,    T = I + v e_θᵀ,    v = J (q⁺ − q)
     """
-    moved = _moved(mean, shift)
-    way = state_of(1j * points_of(moved - mean), np.zeros(mean.shape[:-1]))[..., None]
+    new = moved(mean, shift)
+    way = state_of(1j * points_of(new - mean), np.zeros(mean.shape[:-1]))[..., None]
     cross = way * covariance[..., 2:3, :]
     square = covariance[..., 2:3, 2:3] * (way * _turned(way))
-    return ConditionedMap(moved, covariance + (cross + _turned(cross)) + square)
+    return ConditionedMap(new, covariance + (cross + _turned(cross)) + square)
 
 
-def _moved(mean: Array, shift: Array) -> Array:
+def moved(mean: Array, shift: Array) -> Array:
     """Return the states after a correction, over any leading axes."""
     turn = shift[..., 2]
     moves = left_jacobian(turn)[..., None] * points_of(shift)

@@ -15,7 +15,9 @@ poses c, k readings satisfy::
     l ← l̂ + G ν,   P_ll = M,   P_xl = −P H_cᵀ Gᵀ
     x ← x + P H_cᵀ W' ν,   P ← P − P H_cᵀ W' H_c P
 
-This is the limit of a Kalman update of a landmark without prior knowledge.
+This is the limit of a Kalman update of a landmark without prior knowledge.  Filters
+that linearise more than once repeat it at the corrected poses and place until these
+settle [4]_: over many steps, the heading drifts by more than a reading's noise.
 
 A landmark is placed when linearisation holds [2]_ and its place is not ambiguous.  Its
 standard deviation, relative to the robot, is below a tenth of its distance from every
@@ -30,6 +32,8 @@ References
 .. [2] T. Bailey, Constrained initialisation for bearing-only SLAM, ICRA 2003.
 .. [3] E. Olson, J. Leonard, S. Teller, Robust range-only beacon localization, IEEE
    Journal of Oceanic Engineering 31(4), 2006.
+.. [4] B. Bell, F. Cathey, The iterated Kalman filter update as a Gauss-Newton
+   method, IEEE Transactions on Automatic Control 38(2), 1993.
 """
 
 from __future__ import annotations
@@ -52,7 +56,7 @@ from ..models.sensors import Sensor
 from ..support import saved_states
 from ..support.argument_checks import LOWEST_ID, RESERVED_IDS
 from ..support.saved_states import NUMBERS, WHOLE, Table, with_prefix, without_prefix
-from .conditioning import retracted
+from .conditioning import moved, retracted
 from .gaussian_map import GaussianMap
 
 #: Past poses kept; beyond it, the one nearest to the pose before it goes.
@@ -61,6 +65,8 @@ CERTAIN = 10.0  # distance of a placed landmark, in its standard deviations
 BENT = 0.1  # second-order change of its readings, in theirs
 UNLIKELY = 23.0  # 2 log 10⁵: excess of the cost of other places
 DIRECTIONS, DISTANCES = 24, np.geomspace(0.5, 100.0, 12)  # first guesses, [m]
+MOST_STEPS = 20  # of Gauss and Newton
+SETTLED = 1e-4  # change in their last step, relative to the distance
 SAME = 0.02  # places this near, relative to their distance, are one
 
 
@@ -159,7 +165,7 @@ def _poses(gaussian: GaussianMap) -> list[int]:
 def _add_pose(gaussian: GaussianMap, rules: Rules) -> int:
     """Append the present pose to the map; return its number."""
     mean, P, reference = gaussian.used
-    n, last = len(mean), max(_poses(gaussian), default=-1)
+    n, last = len(mean), [-1, *_poses(gaussian)][-1]  # the newest one
     at = mean if rules.linearisation == AT_ESTIMATE else reference
     extend = np.zeros((n + 4, n))
     extend[:n] = np.eye(n)
@@ -202,7 +208,7 @@ def _forget_poses(gaussian: GaussianMap, waiting: Waiting) -> Waiting:
     return waiting
 
 
-class _Seen(NamedTuple):
+class SeenLandmark(NamedTuple):
     """Readings of one landmark from k past poses."""
 
     sensor: Sensor
@@ -255,33 +261,71 @@ class _Seen(NamedTuple):
         distances = np.linalg.norm(state[self.columns[:, :2]] - point, axis=1)
         return float(np.abs(bends / (2 * self.stds(distances))).max())
 
+    def from_known_poses(self, state: Array, point: Array) -> tuple[Array, float]:
+        """Return axes of one σ of a place, if poses were known, and its distance.
+
+        No filter can be more certain of the place, seen from the robot.
+        """
+        H = self.weighted(state, point[None])[1][0]
+        information, axes = np.linalg.eigh(H.T @ H)
+        with np.errstate(divide="ignore"):
+            spread = axes / np.sqrt(np.maximum(information, 0.0))
+        return spread.T, self.nearest(state, point)
+
+    def nearest(self, state: Array, point: Array) -> float:
+        """Return the distance of a place from the nearest of the poses."""
+        return float(np.linalg.norm(state[self.columns[:, :2]] - point, axis=1).min())
+
     def stds(self, distances: Array) -> Array:
         """Return the standard deviations of the readings, shape (..., 2)."""
         std = self.sensor.std(self.noise, distances)
         return np.stack(np.broadcast_arrays(distances, *std)[1:], axis=-1)
 
-    def fit(self, state: Array, P: Array, reference: Array, point: Array) -> _Fit:
-        """Fit a place to the readings under the uncertainty of the poses."""
+    def fit(
+        self, mean: Array, P: Array, reference: Array | None, point: Array, turns: bool
+    ) -> _Fit | None:
+        """Fit a place to the readings under the uncertainty of the poses.
+
+        Gauss-Newton steps move the place for the poses of the mean, which a filter
+        linearises at its reference; or, without a reference, place and poses together.
+        None where they do not settle.
+        """
         k, size = len(self.readings), self.sensor.size
         rows = np.flatnonzero(np.arange(2 * k) % 2 < size)
-        columns = self.columns.ravel()
-        own = P[np.ix_(columns, columns)]
-        for _ in range(4):
+        chosen = np.append(self.columns, 2)
+        own = P[np.ix_(chosen, chosen)]
+        state, shift, joint = mean, np.zeros(len(mean) + 2), reference is None
+        for _ in range(MOST_STEPS if joint else 4):
+            turn = shift[2] if turns else 0.0
+            origin = _rotated(point, -turn)
+            at = state if reference is None else reference
             expected = self.linearise(state, point)[0]
-            _, blocks, Hl = self.linearise(reference, point)
+            _, blocks, Hl = self.linearise(at, point)
+            Hc = np.zeros((k, 2, 4 * k + 1))
+            Hc[:, :, :-1].reshape(k, 2, k, 4)[np.arange(k), :, np.arange(k)] = blocks
+            Hc, Hl = Hc.reshape(2 * k, -1)[rows], Hl.reshape(2 * k, 2)[rows]
             nu = self.sensor.difference(self.readings, expected).ravel()[rows]
-            Hc = np.zeros((k, 2, k, 4))
-            Hc[np.arange(k), :, np.arange(k)] = blocks
-            Hc = Hc.reshape(2 * k, -1)[rows]
+            if joint:  # readings do not change as all points turn about the origin
+                if turns:
+                    around = _across(mean[self.columns].reshape(-1, 2)).ravel()
+                    Hc[:, -1] = -(Hc[:, :-1] @ around + Hl @ _across(origin))
+                nu = nu + Hc @ shift[chosen] + Hl @ (turn * _across(origin))
             apart = state[self.columns[:, :2]] - point
             std = self.stds(np.linalg.norm(apart, axis=1)).ravel()[rows]
             W = np.asarray(np.linalg.inv(Hc @ own @ Hc.T + np.diag(std**2)))
-            Hl = Hl.reshape(2 * k, 2)[rows]
             M = np.asarray(np.linalg.inv(Hl.T @ W @ Hl))
-            G = M @ Hl.T @ W
-            best = _Fit(point, nu, Hc, W, M, G, Hl)
-            point = point + G @ nu
-        return best
+            best = _Fit(origin, nu, Hc, W, M, M @ Hl.T @ W, Hl)
+            if joint:
+                shift = best.shift(P[chosen])
+                before = np.append(state[self.columns], point)
+                state = _moved(np.append(mean, origin), shift, turns)
+                state, point = state[:-2], state[-2:]
+                change = np.abs(np.append(state[self.columns], point) - before).max()
+                if change < SETTLED * np.linalg.norm(apart, axis=1).min():
+                    return best
+            else:
+                point = point + best.G @ nu
+        return None if joint else best
 
 
 class _Fit(NamedTuple):
@@ -306,6 +350,11 @@ class _Fit(NamedTuple):
         """νᵀ W' ν, χ² of the readings at the best place."""
         return float(self.nu @ self.left() @ self.nu)
 
+    def shift(self, P: Array) -> Array:
+        """Return the correction of state and place, from the rows of P for H_c."""
+        moved = (self.Hc @ P).T @ (self.left() @ self.nu)
+        return np.concatenate([moved, self.G @ self.nu])
+
     def left(self) -> Array:
         """Return W'."""
         rest = self.W - self.W @ self.Hl @ self.G
@@ -319,33 +368,57 @@ def _place(
     mean, P, reference = gaussian.used
     firsts = [3 + 2 * gaussian.slots[_names(k)[0]] for k in mine.ids[:, 1].tolist()]
     columns = np.array(firsts)[:, None] + np.arange(4)
-    seen = _Seen(sensor, tuple(rules[FIRST_STD:AFTER_STDS]), mine.readings, columns)
+    seen = SeenLandmark(
+        sensor, tuple(rules[FIRST_STD:AFTER_STDS]), mine.readings, columns
+    )
     at = mean if rules.linearisation == AT_ESTIMATE else reference
     try:
-        fits = [seen.fit(mean, P, at, point) for point in _guesses(seen, mean)]
+        best = _best_fit(seen, mean, P, at, rules)
     except np.linalg.LinAlgError:
+        best = None
+    if best is None:
         return False
-    fits = sorted((fit for fit in fits if fit.is_sound), key=lambda fit: fit.cost)
-    if not fits:
+    columns = np.append(columns, 2)
+    grown = _conditioned(mean, P, best, columns, rules.frame == INVARIANT)
+    point, axes = grown.mean[-2:], _spread(grown.mean, grown.covariance)
+    if _is_vague(axes, seen.nearest(grown.mean, point)):
         return False
-    best, poses = fits[0], mean[columns[:, :2]]
-    nearest = np.linalg.norm(poses - best.point, axis=1).min()
-    for other in fits[1:]:
-        is_same = np.linalg.norm(other.point - best.point) < SAME * nearest
-        if not is_same and other.cost < best.cost + UNLIKELY:
-            return False
-    grown = _conditioned(mean, P, best, columns.ravel(), rules)
-    axes = _spread(grown.mean, grown.covariance)
-    if not CERTAIN * np.linalg.norm(axes, axis=1).max() <= nearest:
-        return False
-    if seen.bend(mean, best.point, axes) > BENT:
+    if seen.bend(grown.mean, point, axes) > BENT:
         return False
     first = np.concatenate([reference, grown.mean[-2:]])
     _hold(gaussian, BeliefArrays(grown.mean, grown.covariance, first), (landmark,))
     return True
 
 
-def _guesses(seen: _Seen, state: Array) -> list[Array]:
+def _best_fit(
+    seen: SeenLandmark, mean: Array, P: Array, reference: Array, rules: Rules
+) -> _Fit | None:
+    """Fit the only place that the readings allow; None where there are more or none."""
+    turns, points = rules.frame == INVARIANT, _guesses(seen, mean)
+    if all(_is_vague(*seen.from_known_poses(mean, point)) for point in points):
+        return None
+    fits = [seen.fit(mean, P, reference, point, turns) for point in points]
+    sound = [fit for fit in fits if fit is not None and fit.is_sound]
+    if not sound:
+        return None
+    best, *others = sorted(sound, key=lambda fit: fit.cost)
+    near = SAME * seen.nearest(mean, best.point)
+    for other in others:
+        is_same = np.linalg.norm(other.point - best.point) < near
+        if not is_same and other.cost < best.cost + UNLIKELY:
+            return None
+    if rules.iterations == 1:
+        return best
+    joint = seen.fit(mean, P, None, best.point, turns)
+    return joint if joint is not None and joint.is_sound else None
+
+
+def _is_vague(axes: Array, distance: float) -> bool:
+    """Return whether a place is too uncertain for its distance; axes are of one σ."""
+    return not CERTAIN * np.linalg.norm(axes, axis=1).max() <= distance
+
+
+def _guesses(seen: SeenLandmark, state: Array) -> list[Array]:
     """Return different places at which the squared errors of the readings are least.
 
     From the best distance in each direction, Levenberg's method descends to a minimum
@@ -357,15 +430,18 @@ def _guesses(seen: _Seen, state: Array) -> list[Array]:
     grid = grid + state[seen.columns[:, :2]].mean(axis=0)
     nu, H = seen.weighted(state, grid.reshape(-1, 2))
     cost = (nu**2).sum(axis=1)
-    least = cost.reshape(DIRECTIONS, -1).argmin(axis=1)
-    chosen = np.arange(DIRECTIONS) * len(DISTANCES) + least
+    cost_along = cost.reshape(DIRECTIONS, -1)
+    least = cost_along.min(axis=1)
+    dips = (least <= np.roll(least, 1)) & (least <= np.roll(least, -1))
+    chosen = np.arange(DIRECTIONS) * len(DISTANCES) + cost_along.argmin(axis=1)
+    chosen = chosen[dips]
     points, nu, H, cost = (
         grid.reshape(-1, 2)[chosen],
         nu[chosen],
         H[chosen],
         cost[chosen],
     )
-    damping = np.full(DIRECTIONS, 1e-2)
+    damping = np.full(len(chosen), 1e-2)
     for _ in range(15):
         N = H.transpose(0, 2, 1) @ H
         scale = damping * (N[:, 0, 0] + N[:, 1, 1]) + 1e-300
@@ -374,11 +450,14 @@ def _guesses(seen: _Seen, state: Array) -> list[Array]:
         new_nu, new_H = seen.weighted(state, points + step)
         new_cost = (new_nu**2).sum(axis=1)
         better = new_cost < cost
+        gain = np.max(np.where(better, (cost - new_cost) / (1e-9 + cost), 0.0))
         damping = np.where(better, damping / 5, damping * 5)
         points = np.where(better[:, None], points + step, points)
         nu = np.where(better[:, None], new_nu, nu)
         H = np.where(better[:, None, None], new_H, H)
         cost = np.where(better, new_cost, cost)
+        if better.any() and gain < 1e-6:
+            break
     found: list[Array] = []
     centre = state[seen.columns[:, :2]].mean(axis=0)
     for point in points[np.argsort(cost)]:
@@ -389,21 +468,35 @@ def _guesses(seen: _Seen, state: Array) -> list[Array]:
 
 
 def _conditioned(
-    mean: Array, P: Array, fit: _Fit, columns: IntArray, rules: Rules
+    mean: Array, P: Array, fit: _Fit, columns: IntArray, turns: bool
 ) -> BeliefArrays:
     """Return the belief with the landmark, after all of its readings."""
-    cross = fit.Hc @ P[columns]
-    left = fit.left()
-    shift = np.concatenate([cross.T @ (left @ fit.nu), fit.G @ fit.nu])
+    cross, shift = fit.Hc @ P[columns], fit.shift(P[columns])
     to_landmark = -cross.T @ fit.G.T
-    P = np.block([[P - cross.T @ left @ cross, to_landmark], [to_landmark.T, fit.M]])
+    P = np.block(
+        [[P - cross.T @ fit.left() @ cross, to_landmark], [to_landmark.T, fit.M]]
+    )
     P = (P + P.T) / 2
-    mean = np.concatenate([mean, fit.point])
-    if rules.frame == INVARIANT:
+    mean = np.append(mean, fit.point)
+    if turns:
         mean, P = retracted(mean, P, shift)
     else:
         mean = mean + shift
     return BeliefArrays(mean, P, mean)
+
+
+def _moved(mean: Array, shift: Array, turns: bool) -> Array:
+    """Return the state after a correction, in the frame of the filter."""
+    return moved(mean, shift) if turns else np.asarray(mean + shift)
+
+
+def _across(points: Array) -> Array:
+    """Return J of points (..., 2), turned by 90°."""
+    return np.stack([-points[..., 1], points[..., 0]], axis=-1)
+
+
+def _rotated(point: Array, turn: float) -> Array:
+    return np.asarray(point * np.cos(turn) + _across(point) * np.sin(turn))
 
 
 def _spread(mean: Array, P: Array) -> Array:

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from dense_ekf import DenseEkf
 from numeric_jacobian import numeric_jacobian
+from scipy.optimize import least_squares
 
 from slamgym.estimator import make_batch, make_estimator
-from slamgym.estimator.filters.delayed_landmarks import MOST_POSES
+from slamgym.estimator.filters.delayed_landmarks import MOST_POSES, SeenLandmark
 from slamgym.estimator.filters.imagine import imagine
 from slamgym.estimator.models import bearing_range
 from slamgym.estimator.models.sensors import (
@@ -26,6 +27,8 @@ from slamgym.estimator.models.sensors import (
     kernel_parts,
     read_bearing_range,
 )
+from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.sim_configs import load_scenario
 
 MOTION = 0.05, 0.03, 0.02
 STD = {
@@ -496,6 +499,58 @@ def test_readings_that_waited_are_used_once_as_by_least_squares():
     assert (np.abs(belief.mean - expected) < 0.05 * std_of).all()
     scale = np.outer(std_of, std_of)
     np.testing.assert_allclose(belief.covariance / scale, covariance / scale, atol=0.02)
+
+
+@pytest.mark.parametrize("sensor", [BEARING, RANGE])
+def test_place_and_poses_are_fitted_together_as_by_least_squares(sensor):
+    """With poses so uncertain that one linearisation is not enough."""
+    rng = np.random.default_rng(2)
+    along, turn = np.arange(6.0), 0.1 * np.arange(6)
+    p = np.stack([along, 0.1 * along**2], axis=1)
+    q = p + np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    true = np.concatenate([[5.0, 2.5, 0.5], np.stack([p, q], axis=1).ravel()])
+    root = 0.03 * rng.normal(size=(len(true), 40)) * np.sqrt(along.repeat(4)[-1])
+    P, mean = root @ root.T, true + root @ rng.normal(size=40)
+    columns, place = 3 + np.arange(24).reshape(6, 4), np.array([2.0, 4.0])
+    noise = (0.01, 1.0, 0.0, 0.0)
+    exact = SeenLandmark(sensor, noise, np.zeros((6, 2)), columns)
+    seen = exact._replace(readings=exact.linearise(true, place)[0])
+
+    def residuals(x):
+        state = mean + root @ x[:-2]
+        return np.append(seen.weighted(state, x[None, -2:])[0][0], x[:-2])
+
+    best = least_squares(residuals, np.append(np.zeros(40), place), xtol=1e-12)
+    fit = seen.fit(mean, P, None, place + 0.3, turns=False)
+    shift = fit.shift(P[np.append(columns, 2)])
+    expected = np.append(mean + root @ best.x[:-2], best.x[-2:])
+    np.testing.assert_allclose(
+        np.append(mean, fit.point) + shift, expected, rtol=0, atol=1e-3
+    )
+    once = seen.fit(mean, P, mean, place + 0.3, turns=False)
+    moved = np.append(mean, once.point) + once.shift(P[np.append(columns, 2)])
+    assert np.abs(moved - expected).max() > 1e-2  # so it matters here
+
+
+def test_a_heading_that_has_drifted_loses_no_run_of_bearings():
+    """With one linearisation of the places, the errors are 1 m."""
+    runs = simulate_runs(load_scenario("bearing").with_changes(steps=160), 1, 777002)
+    slam = make_estimator(
+        "invariant",
+        motion_std=(0.02, 0.01, 0.02),
+        measurement_std=(0.02,),
+        sensor="bearing",
+    )
+    slam.reset(runs.initial_poses[0], np.full(3, 1e-4))
+    errors = []
+    for step in range(161):
+        if step:
+            slam.predict(runs.odometry[0, step])
+        seen = np.flatnonzero(runs.visible[0, step])
+        slam.update(runs.measurements[0, step, seen], seen)
+        errors.append(slam.belief().pose[:2] - runs.true_poses[0, step, :2])
+    assert len(slam.landmark_ids) >= 15
+    assert np.linalg.norm(errors, axis=1).max() < 0.3
 
 
 def test_waiting_filters_continue_from_a_saved_state_bit_for_bit():
