@@ -240,7 +240,9 @@ def test_the_smoother_refuses_another_sensor():
         SmoothingSlam(**NOISE, sensor="position")
 
 
-@pytest.mark.parametrize("path", ["nowhere:CAR", "slamgym.sim_configs:CAR"])
-def test_a_drive_that_cannot_be_imported_is_named(path):
+@pytest.mark.parametrize("path", ["nowhere:CAR", "slamgym.sim_configs:CAR", "torn:CAR"])
+def test_a_drive_that_cannot_be_imported_is_named(path, tmp_path, monkeypatch):
+    (tmp_path / "torn.py").write_text("CAR = 1 / 0")
+    monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ValueError, match=f"cannot import motion '{path}'"):
         find_motion(path)
