@@ -7,6 +7,7 @@ summary.
 
 import json
 import math
+import tomllib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ import xarray as xr
 
 from ...arrays import AnyArray, Array
 from ...estimator.models.rigid_motion import ErrorFrame
+from ...estimator.models.sensors import find_sensor
 from ...evaluation.association_scores import CUTOFF, Gospa
 from ...evaluation.consistency_report import ConsistencyReport
 from ...evaluation.error_bound import Efficiency, efficiency
@@ -139,7 +141,8 @@ def summarise_estimator(
         ``diagnosis``, see :func:`.verdict.diagnosis_summary`;
         ``association``, see :func:`.association.association_summary`;
         ``unused_readings``, the share of readings of known identity that corrected
-        nothing and added no landmark, None where identities are hidden.
+        nothing and added no landmark, None where identities are hidden or readings of
+        a sensor may wait.
     """
     found = _computed(scores, frame)
     claimed = found["heading_std_end"]["claimed"]
@@ -202,12 +205,23 @@ def consistency_of(
 
 def _unused_readings(scores: EstimatorScores) -> float | None:
     """Divide the readings that a gate or the least range rejected by all readings."""
-    if KNOWN_IDS_ATE in scores.results:
+    if KNOWN_IDS_ATE in scores.results or _may_wait(scores.results.attrs):
         return None
     corrected = scores.per_run("nis_dof").sum(axis=1) / 2
     added = scores.per_run("relative_map_dof") / 2
     readings = scores.per_run("readings")
     return quotient(readings - corrected - added, readings)
+
+
+def _may_wait(attrs: dict[str, Any]) -> bool:
+    """Return whether filters may use readings later than they were made."""
+    world = tomllib.loads(attrs.get("assumed", attrs["scenario"]))
+    try:
+        return not find_sensor(
+            world.get("sensor", {}).get("kind", "bearing_range")
+        ).places
+    except ValueError:  # a sensor of the user, not on this machine
+        return True
 
 
 # --------------------------------------------------------------------------------------

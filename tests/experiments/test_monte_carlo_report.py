@@ -509,6 +509,19 @@ def test_readings_that_a_gate_rejects_are_counted():
     assert 0.4 < strict["unused_readings"] < 0.9
 
 
+def test_readings_that_wait_are_not_called_unused():
+    world = load_scenario("bearing").with_changes(steps=10)
+    results = monte_carlo(world, "ekf", 2)
+    assert (
+        summarise_monte_carlo(results)["estimators"]["ekf"]["unused_readings"] is None
+    )
+    results.attrs["scenario"] = 'sensor = {kind = "nowhere:SONAR"}'
+    results.attrs.pop("assumed", None)
+    assert (
+        summarise_monte_carlo(results)["estimators"]["ekf"]["unused_readings"] is None
+    )
+
+
 @pytest.mark.parametrize("width", [85.0, 170.0])
 @pytest.mark.parametrize(
     "draw", [nees_figure, runs_figure, heading_figure, nis_figure, rmse_figure]
