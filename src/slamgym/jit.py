@@ -23,6 +23,7 @@ import numba
 import numpy as np
 from numba import config, njit, types
 from numba.core import compiler, serialize
+from numba.core.runtime.nrt import rtsys
 from numba.extending import intrinsic
 
 _PLAIN = bool(getattr(config, "DISABLE_JIT", 0))
@@ -282,7 +283,7 @@ class KernelCache:
     def _loaded(self, signature: Any, target_context: Any) -> Any:
         if self._fingerprint is None:
             return None
-        target_context.refresh()
+        rtsys.initialize(target_context)
         name = self._file_name(signature, target_context.codegen())
         for folder in (cache_folder(), _private_folder()):
             content = _read(folder / name) if folder else None

@@ -62,6 +62,20 @@ print(*sys.modules)
 
 
 @pytest.mark.slow
+def test_kernels_that_are_loaded_import_no_compiler():
+    code = """
+import sys
+from slamgym import EkfSlam
+from slamgym.estimator.kernels.filter_memory import move_pose
+EkfSlam((0.1, 0.05, 0.03), (0.02, 0.1)).predict((0.1, 0.2))
+print(sum(move_pose.stats.cache_hits.values()), *sys.modules)
+"""
+    _, loading = (run_python(code).split() for _ in range(2))
+    assert loading[0] == "1"
+    assert not {"numba.np.linalg", "numba.np.npyimpl"} & set(loading)
+
+
+@pytest.mark.slow
 def test_commands_load_optimisation_and_spatial_trees_only_to_match_landmarks():
     code = """
 import sys
