@@ -7,7 +7,7 @@ together and with batched filters.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -337,9 +337,8 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         )
         return outcome.rewards, outcome.terminated
 
-    def _begin(self, worlds: BoolArray, seeds: Sequence[int | None] = ()) -> None:
-        """Start episodes in some worlds, each with its first scan."""
-        super()._begin(worlds, seeds)
+    def _follow(self, worlds: BoolArray) -> None:
+        """Start the filters of some worlds, each with its first scan."""
         self._explorers.begin(self._worlds.start_estimates, worlds)
         self._scan(worlds, ~worlds)
         self.task.begin(self._filters.storage(), worlds)
@@ -347,16 +346,15 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
     def _scan(self, worlds: BoolArray, moved: BoolArray) -> None:
         """Update the filters of some worlds with one scan each."""
         true_ids = self._worlds.landmark_ids
-        self._explorers.scan(super()._seen(), worlds, moved, true_ids)
+        self._explorers.scan(self._worlds.observations, worlds, moved, true_ids)
         if self.render_mode is not None:
             self.show_beliefs(list(map(self._filters.belief, range(self.num_envs))))
 
     def _seen(self) -> Observations:
         return self.task.observations()
 
-    def _infos(self) -> dict[str, Any]:
-        landmarks = self._worlds.complex_landmarks
-        return {**super()._infos(), **self._explorers.infos(landmarks, self._ended)}
+    def _more_infos(self) -> dict[str, Any]:
+        return self._explorers.infos(self._worlds.complex_landmarks, self._ended)
 
 
 # --------------------------------------------------------------------------------------

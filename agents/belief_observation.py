@@ -374,18 +374,24 @@ class SeparateFilters(Restorable):
 
     def state(self) -> State:
         """Return the states of the filters, for `restore`."""
-        states = [cast("SlamEstimator", slam).state_dict() for slam in self.filters]
+        states = [
+            cast("EkfSlam", slam).map.block.copy()
+            if is_live
+            else cast("SlamEstimator", slam).state_dict()
+            for slam, is_live in zip(self.filters, self._live, strict=True)
+        ]
         return states, self._steps[:], self._beliefs[:], self._stored[:]
 
     def restore(self, state: State) -> None:
         """Return to states of these filters."""
         states, *rest = state
-        for slam, own in zip(self.filters, states, strict=True):
-            restore(slam, own)
         self._steps, self._beliefs, self._stored = (part[:] for part in rest)
-        for run, slam in enumerate(self.filters):
+        for run, (slam, own) in enumerate(zip(self.filters, states, strict=True)):
             if self._live[run]:
+                cast("EkfSlam", slam).map.resume(own)
                 self._stored[run] = live_storage(cast("EkfSlam", slam), self._rows)
+            else:
+                restore(slam, own)
 
     def reset(self, poses: Array, pose_std: Any, *, runs: BoolArray) -> None:
         """Start new runs in some worlds, at poses (B, 3) with deviations (3,)."""

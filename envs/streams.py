@@ -38,8 +38,8 @@ def episode_keys(generators: Sequence[np.random.Generator]) -> WordArray:
     >>> bool((keys == episode_keys([rng])).all())
     True
     """
-    words = [rng.bit_generator.random_raw() for rng in generators for _ in range(2)]
-    return np.array(words, dtype=np.uint64).reshape(-1, 2)
+    keys = [rng.bit_generator.random_raw(2) for rng in generators]
+    return np.array(keys, dtype=np.uint64).reshape(-1, 2)
 
 
 def drawn_scenarios(scenario: Scenario, keys: WordArray) -> list[Scenario]:

@@ -284,6 +284,7 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
             self._rngs[world], self._seeds[world] = rng, used
         self._worlds.reset(self._generators(), worlds)
         self._note_begun(worlds)
+        self._follow(worlds)
 
     def _note_begun(self, worlds: BoolArray) -> None:
         self._steps_left[worlds] = self._steps
@@ -315,14 +316,12 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
         """
         return np.zeros(self.num_envs), np.zeros(self.num_envs, np.bool_)
 
+    def _follow(self, worlds: BoolArray) -> None:
+        """Do what else follows the start of episodes in some worlds."""
+
     def _seen(self) -> Observations:
         """Return the present observations; some may be those of the last step."""
-        worlds = self._worlds
-        return {
-            "landmarks": worlds.measurements,
-            "mask": worlds.mask,
-            "odometry": worlds.odometry,
-        }
+        return self._worlds.observations
 
     def _observations(self) -> Observations:
         observations = self._seen()
@@ -338,7 +337,11 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
             infos["landmark_ids"] = worlds.landmark_ids
         if worlds.pose_readings is not None:
             infos |= worlds.pose_sensors.by_name(worlds.pose_readings)
-        return infos
+        return infos | self._more_infos()
+
+    def _more_infos(self) -> Infos:
+        """Return the infos besides those of the worlds."""
+        return {}
 
     def _begun_worlds(self) -> WorldBatch:
         if not self._worlds.begun:

@@ -139,6 +139,15 @@ class WorldBatch(Restorable):
         self._landmarks = np.zeros(shape, dtype=np.complex128)
 
     @property
+    def observations(self) -> dict[str, AnyArray]:
+        """Readings, mask and odometry, as `LandmarkWorldEnv` observes them."""
+        return {
+            "landmarks": self.measurements,
+            "mask": self.mask,
+            "odometry": self.odometry,
+        }
+
+    @property
     def landmarks(self) -> Array:
         """True positions, shape (B, N, 2) [m], a copy."""
         return self._landmarks.copy().view(np.float64).reshape(self.count, -1, 2)

@@ -105,9 +105,13 @@ class GaussianMap:
         return {"block": self.block}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Continue with a memory, on cache lines again."""
-        block = aligned_zeros(len(state["block"]))
-        block[:] = state["block"]
+        """Continue with a memory."""
+        self.resume(state["block"])
+
+    def resume(self, memory: Array) -> None:
+        """Continue with a copy of a memory, on cache lines again."""
+        block = aligned_zeros(len(memory))
+        block[:] = memory
         self._become(block)
 
     def reset(self, pose: Array, pose_covariance: Array) -> None:

@@ -1,5 +1,6 @@
 """Objects whose state can be taken, and restored later: worlds that a planner tries."""
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -31,18 +32,24 @@ class Restorable:
 
 def copied(value: Any) -> Any:
     """Return a copy of what a state holds: states of parts, and of generators."""
-    if isinstance(value, np.ndarray | list):
-        return value.copy()
+    copy = _COPIES.get(type(value))
+    if copy is not None:
+        return copy(value)
     if isinstance(value, Restorable):
         return value.state()
-    if isinstance(value, np.random.Generator):
-        return value.bit_generator.state
-    if isinstance(value, tuple):
-        parts = map(copied, value)
-        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
-    if isinstance(value, dict):
-        return {key: copied(part) for key, part in value.items()}
+    if isinstance(value, tuple):  # a named one
+        return type(value)(*map(copied, value))
     return value
+
+
+#: By the type itself, because a tree of tests takes longer than most copies.
+_COPIES: dict[type, Callable[[Any], Any]] = {
+    np.ndarray: np.ndarray.copy,
+    list: list.copy,
+    np.random.Generator: lambda rng: rng.bit_generator.state,
+    tuple: lambda parts: tuple(map(copied, parts)),
+    dict: lambda parts: {key: copied(part) for key, part in parts.items()},
+}
 
 
 def put_back(part: object, value: Any) -> bool:
