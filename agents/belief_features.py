@@ -29,7 +29,7 @@ from ..estimator.kernels.kalman_gain import largest_variance
 from ..estimator.models.bearing_range import wrap_angle_jit
 from ..jit import jit, njit_internal
 from ..sim_configs import Scenario
-from ..sim_configs.layouts import possible_positions
+from ..sim_configs.landmarks_and_controls import possible_positions
 from .estimator_choice import BeliefOfMap
 
 Bounds = tuple[float, float, float, float]

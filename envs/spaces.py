@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array, BoolArray
 from ..sim_configs import Scenario
-from ..sim_configs.layouts import possible_positions
+from ..sim_configs.landmarks_and_controls import possible_positions
 from ..sim_configs.scenario_files import widest_scenario
 from .noise_streams import MANY_STD, largest_noise
 

@@ -14,7 +14,7 @@ import numpy as np
 from ..arrays import Array, ComplexArray, IntArray, WordArray
 from ..jit import add_words, jit, multiply_words, njit_internal
 from ..sim_configs import Scenario, place_landmarks
-from ..sim_configs.layouts import TRIES_PER_LANDMARK, RandomLayout
+from ..sim_configs.landmarks_and_controls import TRIES_PER_LANDMARK, RandomLayout
 from ..sim_configs.scenario import RANGES
 from ..sim_configs.scenario_files import copied_draw
 

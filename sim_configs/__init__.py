@@ -6,7 +6,7 @@ from ..public_names import attach
 
 if TYPE_CHECKING:
     from .field_types import ScenarioError as ScenarioError
-    from .layouts import place_landmarks as place_landmarks
+    from .landmarks_and_controls import place_landmarks as place_landmarks
     from .scenario import Robot as Robot
     from .scenario import Scenario as Scenario
     from .scenario import action_sequence as action_sequence

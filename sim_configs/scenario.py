@@ -15,7 +15,6 @@ from pydantic import Field, ValidationError
 
 from ..arrays import LARGEST, LARGEST_EPISODE, LARGEST_MAP, LARGEST_RANGE_GROWTH, Array
 from ..suggestions import closest
-from .controls import CircleSequence, ControlSequence, command_cycle
 from .field_types import (
     BOUNDED,
     DIVISIBLE,
@@ -44,7 +43,13 @@ from .field_types import (
     expect,
     setting,
 )
-from .layouts import LandmarkLayout, place_landmarks
+from .landmarks_and_controls import (
+    CircleSequence,
+    ControlSequence,
+    LandmarkLayout,
+    command_cycle,
+    place_landmarks,
+)
 
 _Degrees = Annotated[
     float,

@@ -12,7 +12,7 @@ from . import run, replay, fit_noise, monte_carlo, generate  # noqa: F401
 from . import judge, noise_study, render_video  # noqa: F401 (each adds its command)
 from .options import Options, takes
 from .program import command, main
-from .reporter import Reporter
+from .program import Reporter
 
 __all__ = ["main"]
 

@@ -14,8 +14,7 @@ from rich.text import Text
 from ...sim_configs import load_scenario
 from ...sim_configs.field_types import unknown_choice
 from . import options
-from .program import FAILURE, BadInputError, command, interruptible
-from .reporter import Reporter
+from .program import FAILURE, BadInputError, Reporter, command, interruptible
 
 FORMATS = ("pdf", "svg", "png")
 

@@ -16,7 +16,7 @@ from ...sim_configs.field_types import unknown_choice
 from ...suggestions import closest
 from .. import figures
 from . import options, program
-from .reporter import Reporter
+from .program import Reporter
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

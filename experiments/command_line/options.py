@@ -21,8 +21,7 @@ import typer
 
 from ...sim_configs import Scenario, list_presets, load_scenario
 from ...sim_configs.field_types import unknown_choice
-from .program import BadInputError, BrokenFilterError
-from .reporter import Reporter
+from .program import BadInputError, BrokenFilterError, Reporter
 
 if TYPE_CHECKING:
     from ...envs.controllers import Controller

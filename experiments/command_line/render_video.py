@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...sim_configs import Scenario
 from .options import REQUIRED, Options, ScenarioName, declared, refuse_broken, takes
-from .program import command
-from .reporter import Tick
+from .program import Tick, command
 
 if TYPE_CHECKING:
     from ...envs.controllers import Controller

@@ -20,7 +20,7 @@ from ..viewers import RunFrames, ViewedRun, write_rerun, write_run_page
 from ..viewers.rerun_recording import import_rerun
 from . import options, program, tables
 from .output_folder import write_summary
-from .reporter import Reporter
+from .program import Reporter
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -74,6 +74,7 @@ MOVED = {
     "evaluation.time_average_tests": "evaluation.hypothesis_tests",
     "evaluation.whiteness": "evaluation.hypothesis_tests",
     "sim_configs.drawn_scenarios": "sim_configs.scenario_files",
+    "sim_configs.layouts": "sim_configs.landmarks_and_controls",
     "sim_configs.randomisation": "sim_configs.scenario",
     "sim_configs.scenario_errors": "sim_configs.field_types",
     "sim_configs.scenario_parts": "sim_configs.scenario",

@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 from slamgym import jit as kernel_cache
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.experiments import figures
+from slamgym.experiments.command_line import program, run_files, tables
 from slamgym.experiments.command_line import program as errors
-from slamgym.experiments.command_line import reporter, run_files, tables
 from slamgym.experiments.command_line import run_files as warm_up
 from slamgym.experiments.command_line.app import main
 from slamgym.experiments.jobs import MANIFEST
@@ -828,7 +828,7 @@ def test_a_compilation_is_noted_once_and_nothing_else_is(capsys, monkeypatch):
         return 2 * x
 
     monkeypatch.setattr(kernel_cache, "_save", lambda name, content: None)
-    report = reporter.Reporter(as_json=True)
+    report = program.Reporter(as_json=True)
     for kinds, note in (((1.0, 1), "compiling the kernel, once"), ((1.0, 1), "")):
         with report.note_if_compiling("the kernel"):
             assert [double(x) for x in kinds] == [2, 2]

@@ -21,7 +21,7 @@ from comparison import tree
 from presets import PRESETS
 
 from slamgym.envs.controllers import CONTROLLERS
-from slamgym.experiments.command_line import reporter
+from slamgym.experiments.command_line import program
 from slamgym.experiments.command_line.generate import generate as generate_command
 from slamgym.experiments.command_line.options import Options
 from slamgym.experiments.command_line.program import InterruptedRunError
@@ -626,7 +626,7 @@ def terminal(monkeypatch, between):
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
     monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setattr(reporter, "_BETWEEN", between)
+    monkeypatch.setattr(program, "_BETWEEN", between)
     return screen
 
 
@@ -640,7 +640,7 @@ def test_the_bar_shows_speed_and_time_left_on_a_terminal(tmp_path, monkeypatch):
 def test_what_was_done_earlier_counts_for_no_speed(monkeypatch):
     screen = terminal(monkeypatch, between=0.0)
     earlier = 10**9
-    with reporter.Reporter(as_json=True).progress("driving", unit="steps") as tick:
+    with program.Reporter(as_json=True).progress("driving", unit="steps") as tick:
         for done in range(4):
             tick(earlier + done, earlier + 4)
             time.sleep(0.1)
@@ -652,7 +652,7 @@ def test_what_was_done_earlier_counts_for_no_speed(monkeypatch):
 
 def test_a_bar_that_is_moved_all_the_time_looks_up_now_and_then(monkeypatch):
     screen = terminal(monkeypatch, between=60.0)
-    with reporter.Reporter(as_json=True).progress("driving", unit="steps") as tick:
+    with program.Reporter(as_json=True).progress("driving", unit="steps") as tick:
         for done in range(1, 9):
             tick(done, 9)
         time.sleep(0.3)

@@ -15,7 +15,7 @@ import xarray as xr
 from typer.testing import CliRunner
 
 from slamgym.experiments.command_line.app import main
-from slamgym.experiments.command_line.reporter import Reporter
+from slamgym.experiments.command_line.program import Reporter
 from slamgym.experiments.command_line.run_files import warm_up
 from slamgym.experiments.jobs import MANIFEST, WRITER, replace_own
 from slamgym.experiments.monte_carlo import merge_blocks, monte_carlo

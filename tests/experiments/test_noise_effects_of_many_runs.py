@@ -12,7 +12,7 @@ from slamgym.experiments.command_line.noise_study import (
     effects_study,
     write_study,
 )
-from slamgym.experiments.command_line.reporter import Reporter
+from slamgym.experiments.command_line.program import Reporter
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.monte_carlo.verdict import scores_of
 from slamgym.experiments.noise_study import (

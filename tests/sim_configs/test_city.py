@@ -5,8 +5,11 @@ import pytest
 
 from slamgym.envs.controllers import planned_path
 from slamgym.sim_configs import ScenarioError, load_scenario, place_landmarks
-from slamgym.sim_configs.controls import BlocksSequence, command_cycle
-from slamgym.sim_configs.layouts import StreetsLayout
+from slamgym.sim_configs.landmarks_and_controls import (
+    BlocksSequence,
+    StreetsLayout,
+    command_cycle,
+)
 
 CITY = StreetsLayout(
     columns=3, rows=2, side=10.0, width=4.0, per_front=2, origin=(100.0, 50.0)

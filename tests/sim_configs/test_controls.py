@@ -12,7 +12,7 @@ from slamgym.sim_configs import (
     list_presets,
     load_scenario,
 )
-from slamgym.sim_configs.controls import (
+from slamgym.sim_configs.landmarks_and_controls import (
     CircleSequence,
     CommandSequence,
     FigureEightSequence,

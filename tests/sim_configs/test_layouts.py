@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slamgym.sim_configs import ScenarioError, load_scenario, place_landmarks
-from slamgym.sim_configs.layouts import (
+from slamgym.sim_configs.landmarks_and_controls import (
     CorridorLayout,
     GridLayout,
     PointsLayout,
