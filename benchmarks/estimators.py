@@ -31,7 +31,7 @@ from rich.table import Table
 from second_core import two_processes
 
 from slamgym.estimator import EkfSlam, make_batch, make_estimator
-from slamgym.estimator.kernels.filter_memory import move_pose, update_map
+from slamgym.estimator.filters.gaussian_map import move_pose, update_map
 
 MOTION_STD, MEASUREMENT_STD = np.array([0.05, 0.02, 0.02]), np.array([0.02, 0.08])
 NOISE: dict[str, Any] = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ..interface import Belief, MapView, UpdateReport, describe_filter
-from ..kernels.filter_memory import REPEATED, move_pose, update_map
 from ..kernels.kalman_gain import (
     ADDITIVE,
     AFTER_STDS,
@@ -29,6 +28,7 @@ from ..kernels.kalman_gain import (
     PROJECTED,
     USED,
     WAITING,
+    BeliefArrays,
     Rules,
 )
 from ..kernels.scan_update import DONE, NOT_USABLE
@@ -45,13 +45,16 @@ from ..support.argument_checks import LandmarkIds, landmark_pairs
 from ..support.memory_limit import covariance_bytes
 from ..support.saved_states import with_prefix
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
+from .conditioning import ObservesPoses, coincide
 from .delayed_landmarks import Waiting, collect, is_landmark, read_waiting
 from .gaussian_map import (
     MAP_STATE,
+    REPEATED,
     GaussianMap,
-    ObservesPoses,
     UpdateKernel,
+    move_pose,
     not_positive_definite,
+    update_map,
 )
 
 
@@ -116,8 +119,17 @@ class MapFilter(ObservesPoses):
             If a distance has no uncertainty; nothing is merged.
         """
         kept, gone = landmark_pairs(pairs, self.slots)
-        at_reference = self.rules.linearisation != AT_ESTIMATE
-        self.map.merge(kept, gone, frame=self.frame, at_reference=at_reference)
+        (mean, P, reference), slots = self.map.used, self.map.slots
+        at_estimate = self.rules.linearisation == AT_ESTIMATE
+        merged = coincide(
+            mean,
+            P,
+            [slots[i] for i in kept],
+            [slots[i] for i in gone],
+            frame=self.frame,
+            reference=None if at_estimate else reference,
+        )
+        self.map.keep_without(BeliefArrays(*merged, reference), gone)
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
         """Return the belief as a snapshot, of the whole map or of a part of it.

@@ -1,6 +1,8 @@
 """A Gaussian over robot pose and landmarks, in arrays that grow with the map.
 
-`GaussianMap` holds the memory of a filter, and a `ScanReport` the results of a scan.
+`GaussianMap` holds the memory of a filter: a single block, which Python passes to
+kernels as one argument.  `update_map` takes in one scan, and `move_pose` one odometry
+reading.  A `ScanReport` holds the results of a scan.
 """
 
 from __future__ import annotations
@@ -11,49 +13,41 @@ from typing import Any, NamedTuple
 from weakref import ref
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
+from ...jit import jit, njit_internal
 from ..interface import Belief, MapView, UpdateReport
-from ..kernels.filter_memory import (
-    IN_USE,
-    LANDMARKS,
-    NIS,
-    NO_ROOM,
-    SCANNED,
-    STEPS,
-    Parts,
-    new_block,
-    parts_of,
-)
-from ..kernels.kalman_gain import (
-    ADDED,
-    BLOCK,
-    COLUMN,
-    FIRST,
-    GATED,
-    INNOVATION,
-    JACOBIAN,
-    META_WIDTH,
-    NEAR,
-    NUMBERS_READ,
-    OUTCOME,
-    ROOT,
-    SKIPPED,
-    USED,
-    BeliefArrays,
-    Rules,
-    Workspace,
-    new_workspace,
-)
-from ..models.rigid_motion import ErrorFrame
+from ..kernels import kalman_gain as gain
+from ..kernels.kalman_gain import BeliefArrays, Rules, Workspace, new_workspace
+from ..kernels.scan_update import DONE, update_belief
+from ..models.rigid_motion import ErrorFrame, predict
+from ..support import saved_states as saved
 from ..support.memory_limit import aligned_zeros, landmarks_that_fit
-from ..support.saved_states import COVARIANCE, IDS, NUMBERS, Table
 from ..support.undo import Undo
-from .conditioning import FRAMES, ObservedMap, PoseReading, coincide, gate_of
 
 set_attribute = object.__setattr__  # of frozen dataclasses
 FIRST_LANDMARKS = FIRST_READINGS = 8  # that a new map has room for
+
+# Status of an update besides those of `update_belief`.
+REPEATED, NO_ROOM = -3, -4
+
+# The block begins with these integers.
+
+CAPACITY = 0  # length of the mean
+HEIGHT = 1  # of the rows of the workspace
+BEFORE = 2  # height of its copy of P
+LANDMARKS = 3  # number of landmarks in the map
+TABLED = 4  # how many of them are in the table
+STEPS = 5  # how many odometry readings and scans the belief has taken in
+SCANNED, IN_USE = 6, 7  # number of readings in the last scan, and of those in use
+STARTS = 13  # where each part begins, and the end
+NUMBERS = 24
+
+# Values in floating point; the rules come first.
+MOTION = len(Rules._fields)  # (σx², σy², σα²) per step
+MOVED = MOTION + 3  # the same for the last motion
+NIS = MOVED + 3  # of the last scan
+VALUES = 24
 
 #: Takes block, readings and ids in; returns the status.
 UpdateKernel = Callable[..., int]
@@ -76,7 +70,6 @@ class GaussianMap:
 
     Examples
     --------
-    >>> from slamgym.estimator.kernels.filter_memory import update_map
     >>> from slamgym.estimator.kernels.scan_update import DONE
     >>> gaussian = GaussianMap((*Rules(), 0.1, 0.1, 0.1))
     >>> gaussian.take_in(update_map, np.array([[0.0, 2.0]]), np.array([7])) == DONE
@@ -279,7 +272,7 @@ class GaussianMap:
 
     def remove(self, ids: Sequence[int]) -> None:
         """Marginalise landmarks; all other numbers keep their last bit."""
-        self._keep_without(self.used, ids)
+        self.keep_without(self.used, ids)
 
     def bookmark(self) -> Undo:
         """Return what takes back later changes, but for those made by kernels."""
@@ -292,41 +285,12 @@ class GaussianMap:
         mean, covariance, reference = self.arrays
         return BeliefArrays(mean[:n], covariance[:n, :n], reference[:n])
 
-    def _keep_without(self, used: BeliefArrays, ids: Sequence[int]) -> None:
+    def keep_without(self, used: BeliefArrays, ids: Sequence[int]) -> None:
+        """Continue with a belief over the present map, without these landmarks."""
         gone, slots = set(ids), [self.slots[i] for i in ids]
         kept = BeliefArrays(*(without_landmarks(array, slots) for array in used))
         left = [i for i in self.slots if i not in gone]
         self.hold(kept, left, block=self.blank(self.room))
-
-    def merge(
-        self,
-        kept: Sequence[int],
-        gone: Sequence[int],
-        *,
-        frame: ErrorFrame,
-        at_reference: bool,
-    ) -> None:
-        """Condition on landmarks being one in pairs, and remove the second of each.
-
-        Parameters
-        ----------
-        kept, gone : sequence of int
-            The landmarks.
-        frame : {"additive", "invariant"}
-            Error frame of the filter.
-        at_reference : bool
-            Whether the filter linearises at its reference points.
-        """
-        mean, covariance, reference = self.used
-        merged = coincide(
-            mean,
-            covariance,
-            [self.slots[i] for i in kept],
-            [self.slots[i] for i in gone],
-            frame=frame,
-            reference=reference if at_reference else None,
-        )
-        self._keep_without(BeliefArrays(*merged, reference), gone)
 
     def view(self) -> MapView:
         """Return the whole map without a copy."""
@@ -357,84 +321,207 @@ class GaussianMap:
         self.hold(BeliefArrays(*saved), np.asarray(state["landmark_ids"]).tolist())
 
 
-class ObservesPoses:
-    """A filter on a Gaussian map that takes readings of its pose."""
+# --------------------------------------------------------------------------------------
+# The memory of a filter, and the two steps that kernels take in it.
 
-    #: The belief, in the arrays that steps change.
-    map: GaussianMap
-    #: What distinguishes this filter's updates from another's.
-    rules: Rules
 
-    @property
-    def frame(self) -> ErrorFrame:
-        """Coordinates in which the filter takes its error to be Gaussian."""
-        return FRAMES[self.rules.frame]
+class Parts(NamedTuple):
+    """The parts of a block, in their order; each begins on a cache line."""
 
-    def observe_pose(
-        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
-    ) -> UpdateReport:
-        """Correct the belief with a reading of the pose, such as compass or GPS.
+    numbers: IntArray  # (NUMBERS,)
+    values: Array  # (VALUES,)
+    mean: Array  # this and the next two as in BeliefArrays
+    covariance: Array
+    reference: Array
+    rows: Array  # this and the next as in Workspace
+    before: Array
+    ids: IntArray  # (capacity,) identity of the landmark in each slot
+    table: IntArray  # slots + 1 by a hash of these identities; 0 is empty
+    scan_ids: IntArray  # (readings,) of the last scan
+    ledger: IntArray  # (LEDGER_HEIGHT, readings) of the last scan
 
-        The reading is z = H (x, y, θ) + w.  A compass has H = [0 0 1], a GPS
-        H = [1 0 0; 0 1 0].
 
-        Parameters
-        ----------
-        reading : array_like, shape (k,)
-            z [m or rad]; a component that depends on the heading alone is an angle.
-        matrix : array_like, shape (k, 3)
-            H.
-        covariance : array_like, shape (k, k)
-            R, of the noise w; positive definite.
+def new_block(capacity: int, readings: int, values: Array) -> Array:
+    """Allocate the memory of a filter with an empty map.
 
-        Returns
-        -------
-        UpdateReport
-            NIS, innovation (k,) and its covariance.  It has no degrees of freedom where
-            the gate of the filter, if any, rejects the reading.
+    Parameters
+    ----------
+    capacity, readings : int
+        Least length of the mean, and of the list of readings in a scan.
+    values : ndarray
+        The rules, and the variances of the motion per step.
+    """
+    iterated = values[gain.ITERATIONS] > 1
+    capacity, readings = (-(-size // 8) * 8 for size in (capacity, readings))
+    height = gain.FIRST + (2 if iterated else 1) * (2 * readings + 2)
+    before, table = min(capacity, gain.LARGE + 6), 1 << capacity.bit_length()
+    sizes = [
+        VALUES,
+        capacity,
+        capacity**2,
+        capacity,
+        height * (capacity + gain.META_WIDTH),
+    ]
+    sizes += [before**2, capacity, table, readings, gain.LEDGER_HEIGHT * readings]
+    starts = NUMBERS + np.cumsum([0, *sizes])
+    block = aligned_zeros(int(starts[-1]))
+    numbers = block[:NUMBERS].view(np.int64)
+    numbers[: BEFORE + 1] = capacity, height, before
+    numbers[STARTS:] = starts
+    block[NUMBERS : NUMBERS + len(values)] = values
+    return block
 
-        Raises
-        ------
-        ValueError
-            If an argument is malformed; the belief is then as before.
 
-        Examples
-        --------
-        >>> from slamgym.estimator import InvariantEkfSlam
-        >>> slam = InvariantEkfSlam((0, 0, 0), (0.1, 0.1), initial_pose_std=(1, 1, 1))
-        >>> slam.observe_pose(0.5, [0, 0, 1], 1.0).degrees_of_freedom
-        1
-        >>> slam.belief().pose
-        array([0.  , 0.  , 0.25])
-        """
-        given = PoseReading.checked(reading, matrix, covariance)
-        (mean, P, reference), map_ = self.map.used, self.map
-        found = self._observe(given, mean, P)
-        size = found.innovation.size
-        if not found.nis <= gate_of(self.rules, size):
-            return UpdateReport()
-        after = BeliefArrays(found.mean, found.covariance, reference)
-        map_.hold(after, map_.slots, block=map_.blank(map_.room), steps=1)
-        return UpdateReport(
-            nis=float(found.nis),
-            degrees_of_freedom=size,
-            innovation=found.innovation,
-            factor=found.factor,
-        )
+def parts_of(block: Array) -> Parts:
+    """Return the parts of a block by name, without a copy."""
+    numbers = block[:NUMBERS].view(np.int64)
+    n, height, before = numbers[CAPACITY], numbers[HEIGHT], numbers[BEFORE]
+    at = numbers[STARTS:]
+    return Parts(
+        numbers,
+        block[at[0] : at[1]],
+        block[at[1] : at[2]],
+        block[at[2] : at[3]].reshape((n, n)),
+        block[at[3] : at[4]],
+        block[at[4] : at[5]].reshape((height, n + gain.META_WIDTH)),
+        block[at[5] : at[6]].reshape((before, before)),
+        block[at[6] : at[7]].view(np.int64),
+        block[at[7] : at[8]].view(np.int64),
+        block[at[8] : at[9]].view(np.int64),
+        block[at[9] : at[10]].view(np.int64).reshape((gain.LEDGER_HEIGHT, -1)),
+    )
 
-    def _observe(
-        self, given: PoseReading, mean: Array, covariance: Array
-    ) -> ObservedMap:
-        once = self.rules.iterations == 1
-        return given.correct(mean, covariance, frame=self.frame, once=once)
 
+parts_jit = njit_internal(parts_of)
+
+
+@jit
+def update_map(block: Array, readings: Array, ids: IntArray) -> int:
+    """Update the belief of a filter with one scan, in place.
+
+    Parameters
+    ----------
+    block : ndarray
+        The memory of the filter, see :class:`Parts`.  On return it also
+        holds the record of the scan.
+    readings : ndarray, shape (m, 2)
+        Rows (β, r) [rad, m].
+    ids : ndarray of int64, shape (m,)
+        The landmark of each reading.
+
+    Returns
+    -------
+    int
+        DONE; REPEATED, if a landmark has two readings; NO_ROOM, if the new landmarks
+        or the readings may not fit; or as of :func:`update_belief`.  Unless DONE, the
+        belief has not changed.
+    """
+    parts, count = parts_jit(block), len(ids)
+    numbers, slots = parts.numbers, parts.ledger[gain.SLOT]
+    for k in range(count):
+        for j in range(k):
+            if ids[j] == ids[k]:
+                return REPEATED
+    mapped = numbers[LANDMARKS]
+    if count > len(parts.scan_ids):
+        return NO_ROOM
+    if mapped + find_slots(parts, ids) > (numbers[CAPACITY] - 4) // 2:
+        return NO_ROOM
+    status, used, nis = update_belief(
+        parts.mean,
+        parts.covariance,
+        parts.reference,
+        3 + 2 * mapped,
+        readings,
+        count,
+        parts.ledger,
+        parts.rows,
+        parts.before,
+        parts.values,
+    )
+    if status == DONE:
+        for k in range(count):
+            parts.scan_ids[k] = ids[k]
+            if parts.ledger[gain.OUTCOME, k] == gain.ADDED:
+                parts.ids[slots[k]] = ids[k]
+                numbers[LANDMARKS] += 1
+        numbers[SCANNED], numbers[IN_USE], parts.values[NIS] = count, used, nis
+        numbers[STEPS] += 1
+    return int(status)
+
+
+@njit_internal
+def find_slots(parts: Parts, ids: IntArray) -> int:
+    """Write the slots of landmarks to the ledger, -1 for new ones; count these.
+
+    The table holds slots + 1 and is at most half full.  A search begins at the hash of
+    an identity and ends at its slot or at an empty entry.
+    """
+    numbers, table, mask, new = parts.numbers, parts.table, len(parts.table) - 1, 0
+    for slot in range(numbers[TABLED], numbers[LANDMARKS]):  # not in the table yet
+        at = hash_of(parts.ids[slot]) & mask
+        while table[at] > 0:
+            at = (at + 1) & mask
+        table[at] = slot + 1
+    numbers[TABLED] = numbers[LANDMARKS]
+    for k in range(len(ids)):
+        at = hash_of(ids[k]) & mask
+        while table[at] > 0 and parts.ids[table[at] - 1] != ids[k]:
+            at = (at + 1) & mask
+        parts.ledger[gain.SLOT, k] = table[at] - 1
+        new += table[at] == 0
+    return new
+
+
+@njit_internal
+def hash_of(landmark_id: int) -> int:
+    """Mix the bits of an identity (Fibonacci hashing of both halves)."""
+    low, high = landmark_id & 0xFFFFFFFF, (landmark_id >> 32) & 0xFFFFFFFF
+    return (low * 0x278DDE6D + high * 0x1F123BB5) >> 20
+
+
+@jit
+def move_pose(
+    block: Array, forward: float, sideways: float, turn: float, weight: float
+) -> None:
+    """Move the belief of a filter by a displacement in the robot's frame, in place.
+
+    Parameters
+    ----------
+    block : ndarray
+        The memory of the filter.
+    forward, sideways, turn : float
+        (dx, dy, α) [m, m, rad].
+    weight : float
+        Factor of the variances of the motion noise.
+    """
+    parts = parts_jit(block)
+    values, size = parts.values, 3 + 2 * parts.numbers[LANDMARKS]
+    for i in range(3):
+        values[MOVED + i] = weight * values[MOTION + i]
+    predict(
+        parts.mean,
+        parts.covariance,
+        parts.reference,
+        size,
+        forward,
+        sideways,
+        turn,
+        values[MOVED : MOVED + 3],
+        int(values[0]),
+    )
+    parts.numbers[STEPS] += 1
+
+
+# --------------------------------------------------------------------------------------
+# Saved states, and what the last scan has left in the memory.
 
 #: What a saved map must be.
-MAP_STATE: Table = {
-    "landmark_ids": (IDS, "n"),
-    "mean": (NUMBERS, "3+2n"),
-    "covariance": (COVARIANCE, "3+2n", "3+2n"),
-    "reference": (NUMBERS, "3+2n"),
+MAP_STATE: saved.Table = {
+    "landmark_ids": (saved.IDS, "n"),
+    "mean": (saved.NUMBERS, "3+2n"),
+    "covariance": (saved.COVARIANCE, "3+2n", "3+2n"),
+    "reference": (saved.NUMBERS, "3+2n"),
 }
 
 
@@ -464,7 +551,10 @@ def without_landmarks(array: Array, slots: Iterable[int]) -> Array:
 def workspace_for(rules: Rules, readings: int, capacity: int) -> Workspace:
     """Allocate what updates by these rules need, with this many readings at most."""
     return new_workspace(
-        readings, capacity, iterated=rules.iterations > 1, spoilable=readings > BLOCK
+        readings,
+        capacity,
+        iterated=rules.iterations > 1,
+        spoilable=readings > gain.BLOCK,
     )
 
 
@@ -492,13 +582,13 @@ class ScanRecord(NamedTuple):
         """
         count, used = parts.numbers[SCANNED : IN_USE + 1].tolist()
         ids, ledger = parts.scan_ids[:count].copy(), parts.ledger[:, :count].copy()
-        found = parts.rows[FIRST : FIRST + 2 * used]
-        if found.shape[1] <= 4 * (3 + 2 * used + META_WIDTH):
+        found = parts.rows[gain.FIRST : gain.FIRST + 2 * used]
+        if found.shape[1] <= 4 * (3 + 2 * used + gain.META_WIDTH):
             return cls(ids, found.copy(), ledger)
-        columns = ledger[COLUMN, :used]
+        columns = ledger[gain.COLUMN, :used]
         landmarks = np.stack([columns, columns + 1], axis=1).ravel()
-        chosen = np.concatenate([[0, 1, 2], landmarks, np.arange(-META_WIDTH, 0)])
-        ledger[COLUMN, :used] = 3 + 2 * np.arange(used)
+        chosen = np.concatenate([[0, 1, 2], landmarks, np.arange(-gain.META_WIDTH, 0)])
+        ledger[gain.COLUMN, :used] = 3 + 2 * np.arange(used)
         return cls(ids, found[:, chosen], ledger)
 
     def joint_factor(self) -> Array:
@@ -507,15 +597,15 @@ class ScanRecord(NamedTuple):
         Off its diagonal blocks L = H Aᵀ, since Q is diagonal.
         """
         rows, count = self.rows, len(self.rows)
-        H = rows[:, JACOBIAN : JACOBIAN + 5]
-        columns = np.repeat(self.ledger[COLUMN, : count // 2], 2)
+        H = rows[:, gain.JACOBIAN : gain.JACOBIAN + 5]
+        columns = np.repeat(self.ledger[gain.COLUMN, : count // 2], 2)
         every = np.arange(count)
         pose = H[:, :3] @ rows[:, :3].T
         x = H[every, 3, None] * rows[:, columns].T
         y = H[every, 4, None] * rows[:, columns + 1].T
         factor: Array = np.tril(pose + x + y)
         for k in range(0, count, 2):
-            factor[k : k + 2, k : k + 2] = rows[k : k + 2, ROOT : ROOT + 2]
+            factor[k : k + 2, k : k + 2] = rows[k : k + 2, gain.ROOT : gain.ROOT + 2]
         return factor
 
 
@@ -567,42 +657,42 @@ class ScanReport(UpdateReport):
     def degrees_of_freedom(self) -> int:
         """Of the NIS: how many numbers the associated readings have."""
         parts = self._parts
-        return int(parts.numbers[IN_USE]) * int(parts.values[NUMBERS_READ])
+        return int(parts.numbers[IN_USE]) * int(parts.values[gain.NUMBERS_READ])
 
     @cached_property
     def associated_ids(self) -> tuple[int, ...]:
         """Mapped landmarks whose readings corrected the belief."""
-        return self._with_outcome(USED)
+        return self._with_outcome(gain.USED)
 
     @cached_property
     def added_ids(self) -> tuple[int, ...]:
         """Landmarks that entered the map."""
-        return self._with_outcome(ADDED)
+        return self._with_outcome(gain.ADDED)
 
     @cached_property
     def rejected_ids(self) -> tuple[int, ...]:
         """Mapped landmarks whose readings the chi-square gate rejected."""
-        return self._with_outcome(GATED)
+        return self._with_outcome(gain.GATED)
 
     @cached_property
     def skipped_ids(self) -> tuple[int, ...]:
         """Landmarks whose readings are too close to use."""
-        return self._with_outcome(SKIPPED)
+        return self._with_outcome(gain.SKIPPED)
 
     @cached_property
     def near_ids(self) -> tuple[int, ...]:
         """Mapped landmarks within 10 σ of the robot."""
         ids, ledger = self._readings()
-        return tuple(ids[ledger[NEAR] > 0].tolist())
+        return tuple(ids[ledger[gain.NEAR] > 0].tolist())
 
     @cached_property
     def innovation(self) -> Array:
         """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
-        return self._record.rows[:, INNOVATION].reshape(-1, 2)
+        return self._record.rows[:, gain.INNOVATION].reshape(-1, 2)
 
     def _with_outcome(self, outcome: int) -> tuple[int, ...]:
         ids, ledger = self._readings()
-        return tuple(ids[ledger[OUTCOME] == outcome].tolist())
+        return tuple(ids[ledger[gain.OUTCOME] == outcome].tolist())
 
     def _readings(self) -> tuple[IntArray, IntArray]:
         """Return landmarks and ledger without a copy of the rows, which are large."""

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
 from ..interface import Belief, MapView, UpdateReport
-from ..kernels.filter_memory import LANDMARKS, parts_jit, update_map
 from ..kernels.scan_update import DONE
 from ..models.rigid_motion import as_covariance
 from ..models.sensors import only_placing
@@ -19,6 +18,7 @@ from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from .conditioning import ObservedMap, PoseReading, observe
 from .ekf import EkfSlam
+from .gaussian_map import LANDMARKS, parts_jit, update_map
 
 # The state that the kernels see, in the robot's frame at the last scan: the motion
 # since that scan in place of the pose; the world's origin (x, y), its heading and a

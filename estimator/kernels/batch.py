@@ -6,8 +6,8 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
+from ..models.rigid_motion import predict
 from .kalman_gain import ADDED, LEDGER_HEIGHT, OUTCOME, SLOT
-from .prediction import predict
 from .scan_update import DONE, as_rules, update_belief, usable
 
 NEVER = -1

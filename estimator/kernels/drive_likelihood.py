@@ -7,6 +7,7 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
+from ..models.rigid_motion import predict
 from .kalman_gain import (
     ADDED,
     FIRST,
@@ -23,7 +24,6 @@ from .kalman_gain import (
     Rules,
     Workspace,
 )
-from .prediction import predict
 from .scan_update import (
     DONE,
     as_rules,

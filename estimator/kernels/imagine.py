@@ -15,8 +15,8 @@ import numpy as np
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
 from ..models.bearing_range import difference_jit, expected_reading_jit
+from ..models.rigid_motion import predict
 from .kalman_gain import LEDGER_HEIGHT, SLOT, half_log_det, largest_variance
-from .prediction import predict
 from .scan_update import DONE, as_rules, update_belief
 
 

@@ -17,11 +17,10 @@ from ...arrays import Array, IntArray
 from ..filters.conditioning import PoseReading
 from ..filters.ekf import checked_rules
 from ..kernels.kalman_gain import ADDITIVE, AT_ESTIMATE
-from ..kernels.prediction import predict
 from ..models.bearing_range import wrap_angle
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.motions import Motion as DriveMotion
-from ..models.rigid_motion import pose_rotation
+from ..models.rigid_motion import pose_rotation, predict
 from ..support import argument_checks
 
 

@@ -377,7 +377,7 @@ def test_read_only_readings_are_taken_without_compiling_anew():
     ids.flags.writeable = False
     slam.update(readings, ids)
     slam.update(np.array([(0.1, 4.0)]), [0])
-    from slamgym.estimator.kernels.filter_memory import update_map
+    from slamgym.estimator.filters.gaussian_map import update_map
 
     signatures = getattr(update_map, "signatures", [None])  # plain without JIT
     assert len(signatures) == 1

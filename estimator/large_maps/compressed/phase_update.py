@@ -28,7 +28,7 @@ import numpy as np
 
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
-from ...kernels.filter_memory import parts_of
+from ...filters.gaussian_map import parts_of
 from ..multifrontal import pairs, symmetric
 from .deferred_covariance import (
     BLOCK,
