@@ -23,9 +23,9 @@ from typing import NamedTuple, cast
 import numpy as np
 from submaps import MEASUREMENT_STD, MOTION_STD, SIZES, drive, print_table
 
+from slamgym.estimator.interface import marginal_without_joining
 from slamgym.estimator.large_maps.submaps.submap_slam import SubmapSlam
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
-from slamgym.estimator.map_management.map_editor import marginal_without_joining
 
 
 class Row(NamedTuple):

@@ -1,14 +1,16 @@
 """The interface of every estimator, `SlamEstimator`, and what passes through it.
 
 `Belief` is the estimate and `UpdateReport` the result of one scan. The other protocols
-describe what only some estimators can do.
+describe what only some estimators can do. `view_map` and `marginal` read the map of any
+of them.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -447,6 +449,88 @@ def describe_filter(slam: _HasMarginals) -> str:
     pose = slam.belief([])
     found = describe_map(len(slam.landmark_ids), pose.pose, pose.pose_covariance)
     return f"{type(slam).__name__} of {found}"
+
+
+# --------------------------------------------------------------------------------------
+# Read the map of any filter, as fast as the filter allows.
+
+
+def view_map(slam: SlamEstimator) -> MapView:
+    """Return a view of the whole map of a filter, without a copy where possible."""
+    if hasattr(slam, "map_view") and not hides_its_belief(slam):
+        view: MapView = slam.map_view()
+        return view
+    belief = slam.belief()
+    return MapView(belief.mean, belief.covariance, belief.landmark_ids)
+
+
+def mapped_ids(slam: SlamEstimator) -> tuple[int, ...]:
+    """Return the landmarks in the map of a filter, in the order of its belief."""
+    ids = None if hides_its_belief(slam) else getattr(slam, "landmark_ids", None)
+    return slam.belief().landmark_ids if ids is None else tuple(ids)
+
+
+def marginal(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
+    """Return the belief over the pose and some landmarks, in this order.
+
+    Examples
+    --------
+    >>> from slamgym.estimator import EkfSlam
+    >>> slam = EkfSlam((0.1, 0.1, 0.1), (0.1, 0.1))
+    >>> _ = slam.update([(0.0, 2.0), (0.0, 3.0)], [5, 6])
+    >>> marginal(slam, [6]).landmarks
+    array([[3., 0.]])
+    """
+    if _takes_landmark_ids(getattr(slam.belief, "__func__", slam.belief)):
+        belief: Belief = slam.belief(landmark_ids=ids)  # type: ignore[call-arg]
+        return belief
+    whole = slam.belief()
+    return _part(whole, whole.landmark_ids, ids, whole.frame)
+
+
+def marginal_without_joining(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
+    """Return a marginal as the filter has it without joining the parts of its map.
+
+    Of a filter that joins its map it is taken from ``local_view``, where that holds
+    these landmarks; its error is then judged in the invariant frame.
+    """
+    # The first test takes far less time than the second, and mostly decides.
+    if not hasattr(slam, "join") or not isinstance(slam, SupportsJoin):
+        return marginal(slam, ids)
+    view = slam.local_view(0.0)
+    if not set(ids) <= set(view.ids):
+        return marginal(slam, ids)
+    return _part(view, view.ids, ids, "invariant")
+
+
+def hides_its_belief(slam: object) -> bool:
+    """Return whether a subclass keeps its belief elsewhere than the class it extends.
+
+    It then overrides ``belief()``, but not the ``map_view()`` that it inherits.  Only
+    ``belief()`` and the saved state are valid.
+    """
+    kind: Any = type(slam)
+    owner = next((base for base in kind.__mro__ if "map_view" in vars(base)), kind)
+    return owner is not kind and kind.belief is not owner.belief
+
+
+@lru_cache(maxsize=64)
+def _takes_landmark_ids(belief: Callable[..., Belief]) -> bool:
+    return "landmark_ids" in inspect.signature(belief).parameters
+
+
+def _part(
+    whole: Belief | MapView,
+    order: Sequence[int],
+    ids: Sequence[int],
+    frame: rigid_motion.ErrorFrame,
+) -> Belief:
+    slots = {i: slot for slot, i in enumerate(order)}
+    return Belief.marginal(whole.mean, whole.covariance, slots, ids, frame)
+
+
+# --------------------------------------------------------------------------------------
+# What an update returns.
 
 
 class ScanDecisions(NamedTuple):

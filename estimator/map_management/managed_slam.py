@@ -32,9 +32,12 @@ from ..interface import (
     UpdateReport,
     advance,
     bookmark,
+    mapped_ids,
+    marginal,
     optional_members,
     restore,
     taking_poses,
+    view_map,
 )
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.rigid_motion import rotation
@@ -42,7 +45,7 @@ from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
-from .map_editor import MapEditor, is_near, mapped_ids, marginal, view_map
+from .map_editor import MapEditor, is_near
 from .policy import LandmarkPolicy, as_policy
 from .pruning import MapPruner
 from .recent_scans import RecentScan, RecentScans

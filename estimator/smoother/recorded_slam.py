@@ -17,10 +17,13 @@ from ..interface import (
     UpdateReport,
     advance,
     bookmark,
+    mapped_ids,
+    marginal,
     optional_members,
     taking_poses,
+    view_map,
 )
-from ..map_management.map_editor import MapEditor, mapped_ids, marginal, view_map
+from ..map_management.map_editor import MapEditor
 from ..models.motions import UNICYCLE, Motion
 from ..models.sensors import BEARING_RANGE, Sensor, only_bearing_range
 from ..registry import accepted_options, find_estimator, make_estimator, read_label

@@ -14,17 +14,9 @@ from typing import Generic, NamedTuple, TypeVar, overload
 import numpy as np
 
 from ...arrays import Array
-from ...estimator.interface import (
-    Belief,
-    MapView,
-    SlamEstimator,
-    SupportsJoin,
-    SupportsTruth,
-    UpdateReport,
-    taking_poses,
-    with_fix,
-)
-from ...estimator.map_management import hypotheses, managed_slam, map_editor
+from ...estimator import interface
+from ...estimator.interface import Belief, MapView, SlamEstimator, UpdateReport
+from ...estimator.map_management import hypotheses, managed_slam
 from ..logs import ground_truth, recording, slamlog
 from .filter_settings import one_blas_thread, refuse_large_map
 from .trace import DecisionRecorder, MapEstimate, RunDecisions, RunTrace
@@ -133,7 +125,7 @@ def replay(
     steps = list(recording.steps_of(log))
     times = np.array([step.t for step in steps], dtype=np.float64)
     show_truth = _truth_source(estimator, log, times)
-    most = _MOST_JOINED if isinstance(estimator, SupportsJoin) else _MOST_MAPS
+    most = _MOST_JOINED if isinstance(estimator, interface.SupportsJoin) else _MOST_MAPS
     history = MapHistory(None if keep_history else most)
     recorder = RunRecorder(estimator, len(steps), history)
     decisions = DecisionRecorder(estimator)
@@ -145,14 +137,15 @@ def replay(
                 for row in step.motions:
                     for odometry, dt in recording.predictions(row, log.motion):
                         estimator.predict(odometry, dt)
-                predicted = map_editor.marginal_without_joining(estimator, ())
+                predicted = interface.marginal_without_joining(estimator, ())
                 report: UpdateReport | None = None
                 if step.scan is not None:
                     report = estimator.update(step.scan.measurements, _ids(step.scan))
                     decisions.add(report, ground_truth.true_ids_of(step.scan))
                 for fix_row in step.fixes:
-                    fix = taking_poses(estimator).observe_pose(*fix_row.arguments)
-                    report = with_fix(report or UpdateReport(), fix)
+                    taking = interface.taking_poses(estimator)
+                    fix = taking.observe_pose(*fix_row.arguments)
+                    report = interface.with_fix(report or UpdateReport(), fix)
                 recorder.add(predicted, report)
             watch(number, estimator, report)
             progress(number + 1, len(steps))
@@ -191,7 +184,9 @@ def _truth_source(
 
     It does nothing for other estimators, or if the log lacks a part of the truth.
     """
-    if not isinstance(estimator, SupportsTruth) or ground_truth.hides_identities(log):
+    if not isinstance(estimator, interface.SupportsTruth):
+        return _unwatched
+    if ground_truth.hides_identities(log):
         return _unwatched  # with hidden identities, the estimator's ids are its own
     poses = ground_truth.true_poses_of(log, times)
     landmarks = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
@@ -264,21 +259,21 @@ class RunRecorder:
         self._put(_PREDICTED, step, predicted)
         updated = predicted
         if report is not None:
-            updated = map_editor.marginal_without_joining(self._slam, ())
+            updated = interface.marginal_without_joining(self._slam, ())
             self._nis[step] = report.nis
             self._dof[step] = report.degrees_of_freedom
             self._count(report)
             seen = (*report.associated_ids, *report.added_ids)
             self.last_seen |= dict.fromkeys(seen, step)
-            self._keep_new(map_editor.mapped_ids(self._slam))
+            self._keep_new(interface.mapped_ids(self._slam))
         self._put(_UPDATED, step, updated)
         is_last = step == self._steps - 1
         if is_last:
             self.belief = self._slam.belief()
-            if isinstance(self._slam, SupportsJoin):
+            if isinstance(self._slam, interface.SupportsJoin):
                 self._put(_UPDATED, step, self.belief)  # the joined map corrects it
         is_due = is_last or self._history.is_due(step, self._ids)
-        self._history.append(map_editor.view_map(self._slam) if is_due else None)
+        self._history.append(interface.view_map(self._slam) if is_due else None)
 
     def _put(self, track: int, step: int, belief: Belief) -> None:
         self._poses[track, step] = belief.pose
@@ -336,7 +331,7 @@ class RunRecorder:
         if ids == self._ids:
             return
         new = [i for i in ids if i not in self._first]
-        belief = map_editor.marginal_without_joining(self._slam, new)
+        belief = interface.marginal_without_joining(self._slam, new)
         if self._first_covariance is None:
             self._first_covariance = belief.covariance
         pairs = zip(belief.landmarks, belief.landmark_covariances, strict=True)

@@ -20,8 +20,13 @@ from numpy.typing import NDArray
 
 from ...arrays import AnyArray, Array, IntArray
 from ...envs.rendering.render_state import drawn_readings
-from ...estimator.interface import MapView, SlamEstimator, SupportsJoin, UpdateReport
-from ...estimator.map_management.map_editor import view_map
+from ...estimator.interface import (
+    MapView,
+    SlamEstimator,
+    SupportsJoin,
+    UpdateReport,
+    view_map,
+)
 from ...evaluation.hypothesis_tests import chi_square_limits
 from ...sim_configs.atomic_file import replace_when_written
 from ..figures.accuracy import nis_band

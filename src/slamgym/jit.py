@@ -542,7 +542,7 @@ class _Description:
         if value.__name__.partition(".")[0] not in LIBRARIES:
             for name in names:
                 if hasattr(value, name):
-                    yield from self.of(getattr(value, name))
+                    yield from self._global(getattr(value, name), names)
 
 
 def _with_inner(code: CodeType) -> Iterator[CodeType]:

@@ -9,7 +9,8 @@ from scipy.optimize import root
 from slamgym.estimator import EkfSlam, list_estimators, make_estimator
 from slamgym.estimator.filters.conditioning import coincide, separation
 from slamgym.estimator.filters.gaussian_map import without_landmarks
-from slamgym.estimator.map_management.map_editor import MapEditor, marginal
+from slamgym.estimator.interface import marginal
+from slamgym.estimator.map_management.map_editor import MapEditor
 from slamgym.estimator.models.rigid_motion import invariant_covariance, invariant_error
 
 MANAGEABLE = list_estimators()
