@@ -30,8 +30,8 @@ from typing import Any, NamedTuple, TypeVar
 import psutil
 from filelock import FileLock, Timeout
 
-from ..sim_configs.atomic_file import replace_when_written
 from ..sim_configs.field_types import unknown_choice
+from ..sim_configs.scenario_files import replace_when_written
 from .runs.filter_settings import integer, one_blas_thread
 
 Result = TypeVar("Result")

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from ...arrays import ImageArray
-from ...sim_configs.atomic_file import replace_when_written
+from ...sim_configs.scenario_files import replace_when_written
 
 
 def check_video(path: str | Path, fps: float = 30.0) -> None:

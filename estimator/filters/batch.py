@@ -22,6 +22,7 @@ from ..kernels.batch import (
     StepData,
     begin_runs,
     drive_runs,
+    share_out,
     step_runs,
 )
 from ..kernels.kalman_gain import Workspace
@@ -29,7 +30,7 @@ from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import ErrorFrame
 from ..models.sensors import for_sensor, only_placing
 from ..support import argument_checks, saved_states
-from ..support.memory_limit import aligned_zeros, share_out, usable_cores
+from ..support.argument_checks import aligned_zeros, usable_cores
 from .conditioning import FRAMES, ObservedMap, PoseReading, gate_of
 from .ekf import EkfSlam
 from .gaussian_map import GaussianMap, workspace_for

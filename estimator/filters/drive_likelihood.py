@@ -9,11 +9,12 @@ from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST, Array, IntArray
 from ..kernels import drive_likelihood as kernel
+from ..kernels.batch import share_out
 from ..kernels.kalman_gain import SKIPPED
 from ..models.bearing_range import wrap_angle
 from ..models.sensors import only_bearing_range
 from ..support import argument_checks
-from ..support.memory_limit import aligned_zeros, share_out, usable_cores
+from ..support.argument_checks import aligned_zeros, usable_cores
 from .batch import can_batch
 from .ekf import EkfSlam
 from .gaussian_map import GaussianMap, workspace_for

@@ -41,8 +41,7 @@ from ..models.sensors import (
     for_sensor,
 )
 from ..support import argument_checks, saved_states
-from ..support.argument_checks import LandmarkIds, landmark_pairs
-from ..support.memory_limit import covariance_bytes
+from ..support.argument_checks import LandmarkIds, covariance_bytes, landmark_pairs
 from ..support.saved_states import with_prefix
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
 from .conditioning import ObservesPoses, coincide

@@ -22,7 +22,7 @@ from ..kernels.kalman_gain import BeliefArrays, Rules, Workspace, new_workspace
 from ..kernels.scan_update import DONE, update_belief
 from ..models.rigid_motion import ErrorFrame, predict
 from ..support import saved_states as saved
-from ..support.memory_limit import aligned_zeros, landmarks_that_fit
+from ..support.argument_checks import aligned_zeros, landmarks_that_fit
 from ..support.undo import Undo
 
 set_attribute = object.__setattr__  # of frozen dataclasses

@@ -14,7 +14,7 @@ import numpy as np
 from ...arrays import Array, IntArray
 from ...jit import fma, njit_inlined, njit_internal
 from ..models.rigid_motion import turn_coefficients_jit
-from ..support.memory_limit import aligned_zeros
+from ..support.argument_checks import aligned_zeros
 
 # Share of a variance below which the remainder counts as rounding.
 SINGULAR = 1e-14

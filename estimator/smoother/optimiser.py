@@ -23,7 +23,7 @@ from ..models.bearing_range import (
     wrap_angle,
     wrap_angle_jit,
 )
-from ..support.memory_limit import refuse_beyond_memory
+from ..support.argument_checks import refuse_beyond_memory
 from . import elimination
 from .drive import Drive, DriveArrays
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from ...sim_configs import Scenario, list_presets
-from ...sim_configs.atomic_file import naming_file
 from ...sim_configs.field_types import unknown_choice
+from ...sim_configs.scenario_files import naming_file
 from ...suggestions import closest
 from .. import figures
 from . import options, program

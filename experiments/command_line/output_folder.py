@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ...sim_configs.atomic_file import naming_file, unfinished
+from ...sim_configs.scenario_files import naming_file, unfinished
 from ..jobs import (
     MANIFEST,
     OwnFile,

@@ -29,7 +29,7 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from ... import __version__
-from ...sim_configs.atomic_file import unfinished
+from ...sim_configs.scenario_files import unfinished
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 Tick = Callable[[int, int], None]

@@ -21,7 +21,7 @@ from ...arrays import Array
 from ...envs.rendering import BlittedFigure, scene
 from ...estimator.models.rigid_motion import rotation
 from ...evaluation.trajectory_error import PositionAccuracy, poses_at
-from ...sim_configs.atomic_file import replace_when_written
+from ...sim_configs.scenario_files import replace_when_written
 from ..logs.ground_truth import path_accuracy
 from ..runs.log_smoothing import SmoothedLog
 from ..runs.trace import RunTrace

@@ -16,7 +16,7 @@ from matplotlib.text import Text
 
 from ...arrays import Array
 from ...envs.rendering.scene import ELLIPSE_HANDLER, PlainTextFigure
-from ...sim_configs.atomic_file import replace_when_written
+from ...sim_configs.scenario_files import replace_when_written
 
 INK, GREY, PALE = "#1b1f24", "#6b737c", "#e8eaed"
 BLUE, ORANGE, ALARM, TEAL = "#0072b2", "#e69f00", "#d55e00", "#009e73"  # Okabe, Ito

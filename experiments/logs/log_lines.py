@@ -9,7 +9,7 @@ from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
-from ...sim_configs.atomic_file import replace_when_written
+from ...sim_configs.scenario_files import replace_when_written
 
 MAX_ID_DIGITS = 18  # every such number fits int64
 MAX_SHOWN = 60  # characters of a wrong text that an error repeats

@@ -21,7 +21,7 @@ from rich.text import Text
 
 from ...evaluation.consistency_report import FEW_AVERAGES
 from ...evaluation.diagnosis import p_text
-from ...sim_configs.atomic_file import replace_when_written
+from ...sim_configs.scenario_files import replace_when_written
 from ..figures import style
 from ..jobs import replace_own
 from .figures import MOST_DOTS, PURPLE, SKY, grid_steps, report_figures

@@ -27,8 +27,7 @@ from ... import __version__
 from ...arrays import Array
 from ...evaluation.noise_findings import CHANNELS, MOMENTS
 from ...sim_configs import Scenario
-from ...sim_configs.atomic_file import replace_when_written
-from ...sim_configs.scenario_files import scenario_text
+from ...sim_configs.scenario_files import replace_when_written, scenario_text
 from .. import jobs
 from ..runs.filter_settings import EstimatorChoice
 from . import run_measures

@@ -22,7 +22,7 @@ from ...arrays import Array
 from ...envs.spaces import count_rows
 from ...estimator import registry
 from ...estimator.interface import SupportsTruth
-from ...estimator.support.memory_limit import usable_cores
+from ...estimator.support.argument_checks import usable_cores
 from ...evaluation.diagnosis import SMALLEST_NOISE
 from ...sim_configs import Scenario, load_scenario
 from ..jobs import Progress, blocks_of, engage_workers, resume

@@ -21,8 +21,11 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from ...estimator import interface, registry
-from ...estimator.support.argument_checks import refuse_large_belief
-from ...estimator.support.memory_limit import covariance_bytes, refuse_beyond_memory
+from ...estimator.support.argument_checks import (
+    covariance_bytes,
+    refuse_beyond_memory,
+    refuse_large_belief,
+)
 from ...sim_configs import Scenario
 from ...suggestions import closest
 from ..logs.ground_truth import hides_identities

@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ...sim_configs import Scenario
-from ...sim_configs.atomic_file import replace_when_written
 from ...sim_configs.field_types import unknown_choice
-from ...sim_configs.scenario_files import scenario_text
+from ...sim_configs.scenario_files import replace_when_written, scenario_text
 from ..jobs import blocks_of, sha256_of
 from ..runs.filter_settings import integer
 from .formats import trajectory_format

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...envs.rendering.render_state import drawn_readings
-from ...sim_configs.atomic_file import replace_when_written
+from ...sim_configs.scenario_files import replace_when_written
 from ..logs.recording import steps_of
 from ..logs.slamlog import SlamLog
 from ..runs.summary import pose_nees

@@ -28,7 +28,7 @@ from ...estimator.interface import (
     view_map,
 )
 from ...evaluation.hypothesis_tests import chi_square_limits
-from ...sim_configs.atomic_file import replace_when_written
+from ...sim_configs.scenario_files import replace_when_written
 from ..figures.accuracy import nis_band
 from ..figures.style import deviations, page_environment
 from ..logs.ground_truth import true_ids_of

@@ -12,7 +12,7 @@ from slamgym.estimator import EkfSlam, IteratedEkfSlam, SubmapSlam
 from slamgym.estimator.interface import Belief
 from slamgym.estimator.large_maps.compressed.compressed_slam import CompressedEkfSlam
 from slamgym.estimator.models.bearing_range import predict_measurement
-from slamgym.estimator.support import memory_limit
+from slamgym.estimator.support import argument_checks as memory_limit
 from slamgym.experiments.command_line.app import main
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
 from slamgym.experiments.runs.filter_settings import refuse_large_map, refuse_large_maps

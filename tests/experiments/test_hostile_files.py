@@ -31,9 +31,8 @@ from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.trajectories import generate_trajectories
 from slamgym.experiments.trajectories.manifest import MANIFEST, read_manifest
 from slamgym.sim_configs import load_scenario
-from slamgym.sim_configs.atomic_file import replace_when_written
 from slamgym.sim_configs.field_types import ScenarioError
-from slamgym.sim_configs.scenario_files import scenario_text
+from slamgym.sim_configs.scenario_files import replace_when_written, scenario_text
 
 DEEP = 100_000
 NOISE = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}

@@ -17,8 +17,7 @@ from ...filters.ekf import EkfSlam, InvariantEkfSlam
 from ...filters.gaussian_map import MAP_STATE
 from ...interface import Belief
 from ...support import saved_states
-from ...support.argument_checks import LOWEST_ID
-from ...support.memory_limit import covariance_bytes, refuse_beyond_memory
+from ...support.argument_checks import LOWEST_ID, covariance_bytes, refuse_beyond_memory
 from ...support.saved_states import with_prefix, without_prefix
 from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from ..multifrontal import pairs, symmetric

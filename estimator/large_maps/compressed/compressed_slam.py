@@ -20,8 +20,7 @@ from ...filters.ekf import (
 from ...interface import Belief, MapView, UpdateReport, advance, describe_filter
 from ...models.sensors import only_placing
 from ...support import argument_checks, saved_states
-from ...support.argument_checks import LandmarkIds
-from ...support.memory_limit import covariance_bytes
+from ...support.argument_checks import LandmarkIds, covariance_bytes
 from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from .compressed_map import (
     SHORT_PHASE,

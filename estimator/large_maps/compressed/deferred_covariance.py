@@ -12,7 +12,7 @@ import numpy as np
 from ....arrays import Array, IntArray
 from ....jit import jit
 from ...support import saved_states
-from ...support.memory_limit import refuse_beyond_memory
+from ...support.argument_checks import refuse_beyond_memory
 from ...support.undo import Undo, contents
 from ..multifrontal import symmetric
 
