@@ -344,7 +344,7 @@ def _draw_nis(axes: Axes, trace: RunTrace) -> None:
         axes.set_yscale("log")
         axes.set_ylim(bottom=max(0.3 * float(np.nanmin(lower)), 1e-3))
     else:
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(bottom=-0.03 * axes.get_ylim()[1])  # markers at 0 are whole
     _legend_above(axes, columns=3)
 
 

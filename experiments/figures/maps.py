@@ -463,8 +463,16 @@ def smoothed_figure(smoothed: SmoothedLog) -> Figure:
         The smoothed log.
     """
     drive, trace = smoothed.drive, smoothed.filtered.trace
-    paths = np.concatenate([smoothed.poses[:, :2], trace.poses[:, :2], drive.landmarks])
-    limits = box_around(paths, drive.landmarks, drive.landmark_covariances)
+    accuracy = path_accuracy(smoothed.log, trace.t, smoothed.poses)
+    truth, landmarks = _truth_beside(smoothed, accuracy)
+    chosen = np.arange(0, len(drive.poses), -(-len(drive.poses) // _MOST_POSES))
+    poses, covariances = drive.poses[chosen, :2], drive.pose_covariances[chosen, :2, :2]
+    paths = [smoothed.poses[:, :2], trace.poses[:, :2], drive.landmarks]
+    limits = box_around(
+        np.concatenate([*paths, truth, landmarks]),
+        np.concatenate([poses, drive.landmarks]),
+        np.concatenate([covariances, drive.landmark_covariances]),
+    )
     width, height = limits[1] - limits[0]
     figure = style.new_figure(7.2, 6.2 * height / width + 1.6)
     axes = figure.add_subplot()
@@ -478,22 +486,19 @@ def smoothed_figure(smoothed: SmoothedLog) -> Figure:
     (path,) = axes.plot(
         *smoothed.poses[:, :2].T, color=style.BLUE, lw=1.4, label="smoother"
     )
-    chosen = np.arange(0, len(drive.poses), -(-len(drive.poses) // _MOST_POSES))
-    _POSE.draw(axes, drive.poses[chosen, :2], drive.pose_covariances[chosen, :2, :2])
+    _POSE.draw(axes, poses, covariances)
     _LANDMARK.draw(axes, drive.landmarks, drive.landmark_covariances)
     axes.plot(*drive.landmarks.T, ".", color=style.TEAL, ms=3)
     keys: list[Artist] = [path, filtered, _POSE.legend_key(), _LANDMARK.legend_key()]
-    accuracy = path_accuracy(smoothed.log, trace.t, smoothed.poses)
-    truth = _truth_beside(smoothed, accuracy)
-    if truth is not None:
+    if len(truth):
         (line,) = axes.plot(
             *truth.T, "--", color=style.INK, lw=0.9, label="ground truth"
         )
         keys.insert(0, line)
-    if accuracy is not None and len(smoothed.log.landmarks):
-        angle, shift = accuracy.alignment
-        true = (smoothed.log.landmarks - shift) @ rotation(angle)
-        (line,) = axes.plot(*true.T, "+", color=style.INK, ms=8, label="true landmark")
+    if len(landmarks):
+        (line,) = axes.plot(
+            *landmarks.T, "+", color=style.INK, ms=8, label="true landmark"
+        )
         keys.append(line)
     style.write_title(
         axes, f"{smoothed.log.name}, smoothed", _subtitle(smoothed, accuracy)
@@ -504,16 +509,17 @@ def smoothed_figure(smoothed: SmoothedLog) -> Figure:
 
 def _truth_beside(
     smoothed: SmoothedLog, accuracy: PositionAccuracy | None
-) -> Array | None:
-    """Return the true path moved onto the smoothed one, (m, 2), or None."""
+) -> tuple[Array, Array]:
+    """Return true path and landmarks moved onto the smoothed ones, (m, 2), (n, 2)."""
     if accuracy is None:
-        return None
+        return np.empty((0, 2)), np.empty((0, 2))
     truth, times = smoothed.log.ground_truth, smoothed.filtered.trace.t
     inside = np.isfinite(
         poses_at(truth[:, 0], np.column_stack([times, smoothed.poses]))
     ).all(axis=1)
     angle, shift = accuracy.alignment
-    return np.asarray((truth[inside, 1:3] - shift) @ rotation(angle))
+    turn = rotation(angle)
+    return (truth[inside, 1:3] - shift) @ turn, (smoothed.log.landmarks - shift) @ turn
 
 
 def _subtitle(smoothed: SmoothedLog, accuracy: PositionAccuracy | None) -> str:

@@ -149,6 +149,7 @@ def legend(
         handles=list(keys),
         handler_map=ELLIPSE_HANDLER,
         loc=place,
+        borderaxespad=1.5,  # above the signature
         ncols=columns,
         frameon=False,
         fontsize=size,

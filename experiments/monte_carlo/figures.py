@@ -188,7 +188,9 @@ def runs_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
         x, lift = _swarm(np.log10(dots), edges)
         axes.plot(10**x, row + lift, "o", color=look.colour, ms=size, mew=0, alpha=0.75)
         median = np.median(scores.ratios(frame).mean(axis=1))
-        axes.plot([median] * 2, [row - 0.34, row + 0.34], color=INK, lw=1.6)
+        label = "median of the runs" if row == 0 else None
+        ends = [row - 0.34, row + 0.34]
+        axes.plot([median] * 2, ends, color=INK, lw=1.6, label=label)
         axes.annotate(
             plain(scores.label),
             (0.01, row - 0.5),
@@ -200,13 +202,14 @@ def runs_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
     dress(axes)
     axes.set_xlim(10 ** edges[0] / 1.1, 10 ** edges[-1] * 1.1)
     log_ticks(axes, "x")
-    axes.axvline(1, color=GREY, lw=1.0)
-    axes.axvline(3, color=GREY, lw=1.0, ls=(0, (1.4, 1.6)))
+    axes.axvline(1, color=GREY, lw=1.0, label="expected value")
+    axes.axvline(3, color=GREY, lw=1.0, ls=(0, (1.4, 1.6)), label="3 times this value")
     axes.set_yticks([])
     axes.set_ylim(len(shown) - 0.55, -0.7)
     axes.grid(visible=False, axis="y")
     axes.set_xlabel("time average of NEES / 3")
     name_world(axes, study.title)
+    legend_above(figure, axes)
     return figure
 
 
@@ -232,7 +235,7 @@ def heading_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figur
         known = axes.axhline(
             np.degrees(knowable), ls=(0, (1.4, 1.6)), color=GREY, lw=1.2
         )
-        known.set_label("at the start")
+        known.set_label("deviation at the start")
         dress(axes)
         axes.margins(x=0.01)
         axes.set_ylim(bottom=0)
@@ -295,6 +298,8 @@ def _mark_grid(
     steps, ratios = np.array(grid["steps"]), np.array(grid["statistic"], dtype=float)
     rejected = np.array(grid["rejected"])
     for chosen, face in ((rejected, look.colour), (~rejected, "white")):
+        if not chosen.any():
+            continue  # the layout would make room for an empty line in a corner
         (dots,) = axes.plot(steps[chosen], ratios[chosen], look.marker, ms=4.5)
         dots.set(color=look.colour, markerfacecolor=face, markeredgewidth=1.2, zorder=3)
         dots.set_clip_on(False)
@@ -419,7 +424,7 @@ def legend_above(figure: Figure, axes: Axes) -> None:
         frameon=False,
         fontsize=9.5,
         labelcolor=INK,
-        borderaxespad=0.1,
+        borderaxespad=0.4,
         borderpad=0.0,
         handlelength=2.4,
         columnspacing=1.4,

@@ -461,6 +461,8 @@ def test_nis_outside_its_band_is_told_apart_and_idle_steps_are_left_out():
     np.testing.assert_array_equal(line_of(axes, "outside").get_xdata(), [2.0, 3.5])
     assert len(line_of(axes, "inside").get_xdata()) == 10
     assert axes.get_title(loc="left") == "NIS: 83% of the steps in the 95% band"
+    low, high = axes.get_ylim()
+    assert low < -0.02 * high  # the marker near 0 is whole
 
 
 def test_without_true_poses_only_the_nis_is_drawn():

@@ -438,7 +438,9 @@ def test_the_heading_panels_show_claim_truth_and_what_is_knowable():
     std = typical()["heading_std"].sel(estimator="ekf").values[:, 1:]
     claimed = line_of(axes, "claimed deviation").get_ydata()
     np.testing.assert_allclose(claimed, np.degrees(np.sqrt((std**2).mean(axis=0))))
-    assert line_of(axes, "at the start").get_ydata()[0] == pytest.approx(5.7296, 1e-4)
+    assert line_of(axes, "deviation at the start").get_ydata()[0] == pytest.approx(
+        5.7296, 1e-4
+    )
 
 
 @pytest.mark.slow
@@ -535,6 +537,11 @@ def test_a_figure_for_print_is_as_wide_as_asked_and_names_its_world(draw, width)
     box = figure.get_tightbbox()
     assert box.x0 > -0.1
     assert box.x1 * 25.4 < width + 2.0
+
+
+def test_no_line_is_empty_for_which_the_layout_would_make_room():
+    (axes,) = nees_figure(typical().sel(estimator=["invariant"])).axes
+    assert all(len(line.get_xdata()) for line in axes.lines)
 
 
 def test_a_figure_needs_a_run_that_succeeded():

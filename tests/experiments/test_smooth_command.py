@@ -10,6 +10,7 @@ from commands import slamgym
 from drives import MEASUREMENT_STD, MOTION_STD, drive
 
 from slamgym.estimator.smoother import Drive, SmoothedDrive, smooth
+from slamgym.experiments.figures.maps import smoothed_figure
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog, write_slamlog
 from slamgym.experiments.runs.filter_settings import SMOOTHER, settings_for
 from slamgym.experiments.runs.log_smoothing import smooth_log, summarise_smoothing
@@ -51,6 +52,24 @@ def smoothed(log, **options):
 @pytest.fixture(scope="module")
 def example():
     return smoothed(a_log())
+
+
+def test_the_map_shows_all_ellipses_and_true_landmarks():
+    log = a_log()
+    farther = np.array([[3.0, -30.0]])  # a landmark that no reading shows
+    log = replace(
+        log, landmark_ids=np.arange(7), landmarks=np.concatenate([SIX, farther])
+    )
+    found = smoothed(log)
+    (axes,) = smoothed_figure(found).axes
+    low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+    drive = found.drive
+    reach = 3 * np.sqrt(np.diagonal(drive.pose_covariances, axis1=1, axis2=2)[:, :2])
+    assert (drive.poses[:, :2] - reach > low).all()
+    assert (drive.poses[:, :2] + reach < high).all()
+    (marks,) = [line for line in axes.lines if line.get_label() == "true landmark"]
+    assert (marks.get_xydata() > low).all()
+    assert (marks.get_xydata() < high).all()
 
 
 def test_the_smoother_is_closer_to_the_truth_than_the_filter(example):
