@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import LARGEST, Array, BoolArray, IntArray
+from ...arrays import LARGEST, AnyArray, Array, BoolArray, IntArray
 from ...restorable import Restorable, State
 from ..interface import Belief
 from ..kernels.batch import (
@@ -447,11 +447,11 @@ def step_data(
         raise ValueError(
             f"dt must be one number or {steps}, got shape {durations.shape}"
         )
-    durations = np.ascontiguousarray(np.broadcast_to(durations, (steps,)))
+    durations = np.broadcast_to(durations, (steps,))
     if not (np.isfinite(durations) & (durations >= 0)).all():
         raise ValueError(f"dt must be finite numbers >= 0, got {dt!r}")
     argument_checks.refuse_beyond("dt", durations, dt)
-    return StepData(u, z, seen), durations
+    return StepData(*map(_writeable, (u, z, seen))), _writeable(durations)
 
 
 def step_scans(
@@ -481,7 +481,12 @@ def step_scans(
         raise ValueError(
             f"dt must be finite numbers >= 0 and at most {LARGEST:g}, got {dt!r}"
         )
-    return u, z, seen, durations
+    return _writeable(u), _writeable(z), _writeable(seen), _writeable(durations)
+
+
+def _writeable(array: AnyArray) -> AnyArray:
+    """Return an array of the kind that the kernels are compiled for."""
+    return np.require(array, requirements=["C", "W"])
 
 
 def chosen_runs(runs: ArrayLike | None, count: int) -> BoolArray:

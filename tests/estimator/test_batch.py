@@ -12,6 +12,7 @@ from slamgym.estimator import (
     make_batch,
     make_estimator,
 )
+from slamgym.estimator.kernels.batch import drive_runs, step_runs
 
 RUNS, STEPS, LANDMARKS = 5, 40, 13
 NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
@@ -167,6 +168,17 @@ def test_a_run_that_has_stopped_stays_so(data):
     joined = np.concatenate([part.poses for part in parts], axis=1)
     np.testing.assert_array_equal(at_once.poses, joined)
     assert pieces.failed_at.tolist() == [-1, 0, -1, -1, -1]
+
+
+def test_arrays_that_cannot_be_written_to_need_no_kernels_of_their_own(data):
+    batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
+    batch.run(*data, np.ones(STEPS))
+    batch.step(*(array[:, 0] for array in data), np.ones(RUNS))
+    kernels = len(drive_runs.signatures), len(step_runs.signatures)
+    data = [np.broadcast_to(array, array.shape) for array in data]
+    batch.run(*data, np.broadcast_to(1.0, STEPS))
+    batch.step(*(array[:, 0] for array in data), np.broadcast_to(1.0, RUNS))
+    assert (len(drive_runs.signatures), len(step_runs.signatures)) == kernels
 
 
 @pytest.mark.parametrize("landmarks", [20, 130])
