@@ -94,6 +94,21 @@ print(*sys.modules)
 
 
 @pytest.mark.slow
+def test_the_program_hardly_looks_for_cyclic_garbage_and_not_at_its_exit():
+    code = """
+import atexit, gc
+from slamgym.experiments.command_line.app import main
+collections = []
+gc.callbacks.append(lambda phase, _: collections.append(phase))
+atexit.register(lambda: print(len(collections), gc.get_freeze_count()))
+main(["estimators", "--json"])
+"""
+    found, kept = map(int, run_python(code).splitlines()[-1].split())
+    assert found < 50
+    assert kept > 10_000
+
+
+@pytest.mark.slow
 def test_the_tests_of_the_filter_pass_in_plain_python():
     """By the command of CONTRIBUTING, but for what takes many thousand steps."""
     text = (ROOT / "CONTRIBUTING.md").read_text()
