@@ -96,7 +96,7 @@ def choose_estimator(
             settings["management"] = _bounded(settings.get("management", True), rows)
     elif isinstance(estimator, type) or not _has_a_method(estimator):
         factory = estimator
-        known = noise_options(factory, scenario)
+        known = registry.with_sensor(factory, noise_options(factory, scenario))
     elif options:
         raise ValueError(
             "estimator_options must be empty with an estimator already made, "

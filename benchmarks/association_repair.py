@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from association import LOST, Scan, drive, follow, make, worlds
 
+from slamgym.estimator.models.sensors import BEARING_RANGE, Sensor
 from slamgym.estimator.smoother import Drive, reassociate, smooth
 from slamgym.estimator.smoother.batch_smoother import smooth_repaired
 from slamgym.evaluation import oracle_errors
@@ -27,12 +28,17 @@ from slamgym.sim_configs import Scenario, load_scenario
 OWN = 10**6  # identities from here on are of readings without a landmark
 
 
+def sensor_of(world: Scenario) -> Sensor:
+    growth = world.sensor.range_std_per_metre
+    return BEARING_RANGE.with_noise(range_std_per_metre=growth)
+
+
 def recorded(world: Scenario, scans: list[Scan], ids: list[Any]) -> Drive:
     """Record a drive; readings of None get an identity of their own."""
     made = Drive(
         world.motion.std,
         world.sensor.std,
-        range_std_per_metre=world.sensor.range_std_per_metre,
+        sensor=sensor_of(world),
         initial_pose=world.start.pose,
         initial_pose_std=world.start.std,
     )
@@ -80,7 +86,7 @@ def row_of(world: Scenario, seed: int, hypotheses: int) -> list[float]:
         np.arange(len(points)),
         points,
         world.sensor.std,
-        range_std_per_metre=world.sensor.range_std_per_metre,
+        sensor=sensor_of(world),
     )
     sizes = len(slam.landmark_ids), len(found.drive.landmark_ids), len(landmarks)
     scores = found.first_score, found.score

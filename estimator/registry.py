@@ -20,6 +20,7 @@ from .filters.ideal import IdealEkfSlam
 from .filters.robocentric import RobocentricEkfSlam
 from .filters.unscented import UnscentedSlam
 from .interface import SlamEstimator
+from .models.sensors import NUMBERS, sensor_in
 from .peers.catalogue import PEERS
 
 if TYPE_CHECKING:
@@ -130,7 +131,8 @@ def make_estimator(
         How to associate readings without identity, and which landmarks to confirm, to
         remove, to merge.
     **options
-        What the estimator's own constructor takes beside these.
+        What the estimator's own constructor takes beside these; where it takes
+        ``sensor``, also the numbers of its noise, such as ``range_std_per_metre``.
 
     Raises
     ------
@@ -154,6 +156,7 @@ def make_estimator(
     options |= own
     management = options.pop("management", management)
     own_factory = factory = find_estimator(name)
+    options = with_sensor(factory, options)
     if management is not None and management is not False:
         from .map_management import manage  # noqa: PLC0415 (heavy)
 
@@ -171,6 +174,19 @@ def make_estimator(
         if message is None:
             raise
         raise UnknownOptionError(message) from error
+
+
+def with_sensor(
+    factory: EstimatorFactory, options: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return options with the numbers of the sensor's noise as part of the sensor."""
+    named = inspect.signature(factory).parameters
+    numbers = {name for name in NUMBERS if name in options and name not in named}
+    if not (numbers and accepted_options(factory, {"sensor": None})):
+        return dict(options)
+    others = {name: value for name, value in options.items() if name not in numbers}
+    read = {name: options[name] for name in ("sensor", *numbers) if name in options}
+    return others | {"sensor": sensor_in(read)}
 
 
 def make_batch(
@@ -241,6 +257,7 @@ def _known_options(factory: EstimatorFactory) -> list[str]:
     names: list[str] = []
     for maker in (*factory.__mro__[:-1], ekf.EkfSlam):  # the base filter of a large map
         own, passes_others = _keywords(maker)
+        own += NUMBERS if "sensor" in own else ()
         names += [name for name in own if name not in names]
         if not passes_others:
             break
@@ -258,7 +275,7 @@ def _keywords(factory: Callable[..., Any]) -> tuple[list[str], bool]:
 def accepted_options(
     factory: EstimatorFactory, options: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return those options that the signature of a factory accepts.
+    """Return those options that `make_estimator` accepts for a factory.
 
     Examples
     --------
@@ -270,6 +287,8 @@ def accepted_options(
     if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
         return dict(options)
     known = {parameter.name for parameter in parameters}
+    if "sensor" in known:
+        known.update(NUMBERS)
     return {key: value for key, value in options.items() if key in known}
 
 

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array
 from ..estimator.interface import ScanDecisions
-from ..estimator.models.bearing_range import wrap_angle
+from ..estimator.models.sensors import Sensor, find_sensor, former_noise
 from ..estimator.support.argument_checks import as_floats
 
 CLUTTER = -1  # the true landmark of a reading that has none
@@ -128,6 +128,7 @@ def score_association(
     return AssociationScores(**counts)
 
 
+@former_noise
 def oracle_errors(
     poses: Array,
     scans: Sequence[Array],
@@ -136,7 +137,7 @@ def oracle_errors(
     landmarks: ArrayLike,
     measurement_std: Sequence[float],
     *,
-    range_std_per_metre: float = 0.0,
+    sensor: str | Sensor = "bearing_range",
     places: Mapping[int, int] | None = None,
 ) -> float:
     """Return the share of readings that the true pose and map would assign wrongly.
@@ -149,15 +150,15 @@ def oracle_errors(
     poses : ndarray, shape (K, 3)
         True pose of each scan; readings at an unknown one, nan, do not count.
     scans : sequence of ndarray, shape (m, 2)
-        Rows (β, r) [rad, m].
+        Rows (β, r) [rad, m], or those of the sensor.
     true_ids, places
         As in :func:`score_association`.
     landmark_ids, landmarks : array_like, shapes (n,) and (n, 2)
         The true landmarks.
     measurement_std : (float, float)
         (σβ, σr) [rad, m].
-    range_std_per_metre : float
-        Added to σr for each metre of range.
+    sensor : str or Sensor
+        What a reading is, with its noise.
 
     Returns
     -------
@@ -171,6 +172,7 @@ def oracle_errors(
     >>> oracle_errors(np.zeros((1, 3)), [readings], [[4, 4]], *world, (0.1, 0.1))
     0.5
     """
+    read = find_sensor(sensor)
     names, true = np.asarray(landmark_ids, np.int64), as_floats("landmarks", landmarks)
     groups = np.array([_place(places, i) for i in names.tolist()])
     wrong = count = 0
@@ -179,12 +181,10 @@ def oracle_errors(
         z, of = readings[np.isin(of, names)], of[np.isin(of, names)]
         if not len(z) or not np.isfinite(pose).all():
             continue
-        dx, dy = (true - pose[:2]).T
-        distance = np.hypot(dx, dy)
-        turn = wrap_angle(np.arctan2(dy, dx) - pose[2] - z[:, :1])
-        along = np.maximum(measurement_std[1] + range_std_per_metre * distance, 1e-12)
-        squared = (turn / max(measurement_std[0], 1e-12)) ** 2
-        squared = squared + ((z[:, 1:] - distance) / along) ** 2
+        distance = np.hypot(*(true - pose[:2]).T)
+        stds = np.maximum(read.stds(measurement_std, distance), 1e-12)
+        apart = read.difference(z[:, None], read.predict(pose, true).measurement)
+        squared = ((apart / stds) ** 2).sum(axis=2)
         right = [_place(places, i) for i in of.tolist()]
         wrong += int((groups[squared.argmin(axis=1)] != right).sum())
         count += len(z)

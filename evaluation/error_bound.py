@@ -26,6 +26,13 @@ from scipy.special import stdtrit
 
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.models.bearing_range import reading_slopes_jit
+from ..estimator.models.sensors import (
+    BEARING_RANGE,
+    POSITION,
+    Sensor,
+    find_sensor,
+    former_noise,
+)
 from ..estimator.support import argument_checks
 from ..jit import jit, njit_internal
 
@@ -54,6 +61,7 @@ class Efficiency(NamedTuple):
     interval: tuple[float, float]
 
 
+@former_noise
 def posterior_bound(
     true_poses: ArrayLike,
     landmarks: ArrayLike,
@@ -63,9 +71,8 @@ def posterior_bound(
     motion_std: ArrayLike,
     measurement_std: ArrayLike,
     start_std: ArrayLike,
-    range_std_per_metre: float = 0.0,
     pose_std: ArrayLike = (np.inf, np.inf, np.inf),
-    sensor: str = "bearing_range",
+    sensor: str | Sensor = "bearing_range",
 ) -> PosteriorBound:
     """Return the bound of many runs, each along its own true path.
 
@@ -83,12 +90,10 @@ def posterior_bound(
         Of the motion noise in the robot's frame per step, and of the first pose.
     measurement_std : array_like, shape (2,)
         (σβ, σr) [rad, m].
-    range_std_per_metre : float
-        Part of σr that grows with the range.
     pose_std : array_like, shape (3,), (T, 3) or (B, T, 3)
         Of readings of (x, y, θ) after each scan [m, m, rad]; infinite where there is
         none.
-    sensor : str
+    sensor : str or Sensor
         ``"bearing_range"``, or ``"position"`` with `measurement_std` (σx, σy) [m].  The
         bound of other sensors is nan: their first reading of a landmark is no bound.
 
@@ -111,14 +116,14 @@ def posterior_bound(
             raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
     check = argument_checks.standard_deviations
     stds = check("measurement_std", measurement_std, 2)
-    reads_positions = float(sensor == "position")
-    noise = np.array([*stds, float(range_std_per_metre), reads_positions])
+    read = find_sensor(sensor)
+    noise = np.array([*stds, read.range_std_per_metre, float(read == POSITION)])
     motion = check("motion_std", motion_std, 3) ** 2
     start = check("start_std", start_std, 3)
     durations = np.broadcast_to(np.asarray(dt, dtype=np.float64), (count, steps)).copy()
     fixes = np.broadcast_to(np.square(pose_std), (count, steps, 3)).astype(np.float64)
     position, heading, raw = (np.full((count, steps), np.nan) for _ in range(3))
-    if sensor not in ("bearing_range", "position"):
+    if read not in (BEARING_RANGE, POSITION):
         return PosteriorBound(position, heading, raw, np.full(count, np.nan), ())
     starts = _invariant_start(poses[:, :1], start)
     runs = zip(poses, places, seen, durations, fixes, strict=True)

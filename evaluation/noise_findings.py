@@ -19,6 +19,7 @@ from scipy.special import chdtr, chdtrc, ndtr, stdtr
 
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.models.bearing_range import wrap_angle
+from ..estimator.models.sensors import Sensor, former_noise, only_bearing_range
 from ..estimator.support import argument_checks
 
 _NOISE = {
@@ -236,6 +237,7 @@ class _Noise(NamedTuple):
     follows: BoolArray
 
 
+@former_noise
 def noise_sums(
     true_poses: ArrayLike,
     landmarks: ArrayLike,
@@ -245,7 +247,7 @@ def noise_sums(
     *,
     motion_std: ArrayLike,
     measurement_std: ArrayLike,
-    range_std_per_metre: float = 0.0,
+    sensor: str | Sensor = "bearing_range",
     noise_in: Literal["motion", "odometry"] = "motion",
     noisy_steps: ArrayLike | None = None,
 ) -> Array:
@@ -268,7 +270,7 @@ def noise_sums(
         Rows (β, r) [rad, m].
     visible : array_like of bool, shape (B, T, L)
         Which of them are readings.
-    motion_std, measurement_std, range_std_per_metre
+    motion_std, measurement_std, sensor
         What the filter assumes, as in :func:`~slamgym.estimator.make_estimator`.
     noise_in : {"motion", "odometry"}
         Whether the robot slips, or its encoders err: the other one is exact.
@@ -303,11 +305,12 @@ def noise_sums(
         )
     readings = argument_checks.shaped("measurements", measurements, (*seen.shape, 2))
     motion = argument_checks.standard_deviations("motion_std", motion_std, 3)
-    sensor = argument_checks.standard_deviations("measurement_std", measurement_std, 2)
+    stds = argument_checks.standard_deviations("measurement_std", measurement_std, 2)
+    read = only_bearing_range(sensor, "noise_sums")
     steps = np.ones(shape, bool) if noisy_steps is None else np.asarray(noisy_steps)
     channels = [
         *_motion_noise(poses, moved, steps, motion, noise_in == "motion"),
-        *_sensor_noise(poses, points, readings, seen, sensor, range_std_per_metre),
+        *_sensor_noise(poses, points, readings, seen, read, stds),
     ]
     return np.stack([_summed(noise, len(poses)) for noise in channels], axis=1)
 
@@ -335,17 +338,22 @@ def _motion_noise(
 
 
 def _sensor_noise(
-    poses: Array, points: Array, read: Array, seen: BoolArray, std: Array, growth: float
+    poses: Array,
+    points: Array,
+    readings: Array,
+    seen: BoolArray,
+    sensor: Sensor,
+    std: Array,
 ) -> list[_Noise]:
     run, landmark, step = np.nonzero(seen.transpose(0, 2, 1))
     follows = (np.diff(run) == 0) & (np.diff(landmark) == 0) & (np.diff(step) == 1)
     dx, dy = (points[run, landmark] - poses[run, step, :2]).T
-    bearing, distance = read[run, step, landmark].T
+    bearing, distance = readings[run, step, landmark].T
     expected = np.arctan2(dy, dx) - poses[run, step, 2], np.hypot(dx, dy)
     bearing_error = wrap_angle(bearing - expected[0])
-    range_std = std[1] + growth * expected[1]
+    bearing_std, range_std = sensor.stds(std, expected[1]).T
     return [
-        _Noise(bearing_error, float(std[0]), 1.0, run, follows),
+        _Noise(bearing_error, bearing_std, 1.0, run, follows),
         _Noise(distance - expected[1], range_std, 1.0, run, follows),
     ]
 

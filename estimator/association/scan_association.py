@@ -23,7 +23,7 @@ from ..models.bearing_range import (
     reading_slopes_jit,
     wrap_angle_jit,
 )
-from ..models.sensors import only_bearing_range
+from ..models.sensors import only_bearing_range, sensor_in
 from ..support import saved_states
 from .scan_assignments import (
     AMBIGUOUS,
@@ -536,10 +536,6 @@ class Sensor(NamedTuple):
     @classmethod
     def checked(cls, measurement_std: ArrayLike, options: Mapping[str, Any]) -> Sensor:
         """Read a sensor from the arguments of a filter, which has checked them."""
-        only_bearing_range(options.get("sensor", "bearing_range"), "data association")
-        bearing_std, range_std = np.asarray(measurement_std, dtype=np.float64).tolist()
-        names = "range_std_per_metre", "bearing_std_metres"
-        noise = Noise(
-            bearing_std, range_std, *(float(options.get(n, 0.0)) for n in names)
-        )
+        sensor = only_bearing_range(sensor_in(options), "data association")
+        noise = Noise(*sensor.noise(measurement_std))
         return cls(noise, options.get("min_range", 1e-3))

@@ -44,14 +44,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import LARGEST, Array, BoolArray, IntArray
-from ..kernels.kalman_gain import (
-    AFTER_STDS,
-    AT_ESTIMATE,
-    FIRST_STD,
-    INVARIANT,
-    BeliefArrays,
-    Rules,
-)
+from ..kernels.kalman_gain import AT_ESTIMATE, INVARIANT, BeliefArrays, Rules
 from ..models.sensors import Sensor
 from ..support import saved_states
 from ..support.argument_checks import LOWEST_ID, RESERVED_IDS
@@ -212,7 +205,7 @@ class SeenLandmark(NamedTuple):
     """Readings of one landmark from k past poses."""
 
     sensor: Sensor
-    noise: tuple[float, ...]
+    measurement_std: tuple[float, float]
     readings: Array  # (k, 2)
     columns: IntArray  # (k, 4) of the two points of each pose in the state
 
@@ -278,8 +271,7 @@ class SeenLandmark(NamedTuple):
 
     def stds(self, distances: Array) -> Array:
         """Return the standard deviations of the readings, shape (..., 2)."""
-        std = self.sensor.std(self.noise, distances)
-        return np.stack(np.broadcast_arrays(distances, *std)[1:], axis=-1)
+        return self.sensor.stds(self.measurement_std, distances)
 
     def fit(
         self, mean: Array, P: Array, reference: Array | None, point: Array, turns: bool
@@ -368,9 +360,8 @@ def _place(
     mean, P, reference = gaussian.used
     firsts = [3 + 2 * gaussian.slots[_names(k)[0]] for k in mine.ids[:, 1].tolist()]
     columns = np.array(firsts)[:, None] + np.arange(4)
-    seen = SeenLandmark(
-        sensor, tuple(rules[FIRST_STD:AFTER_STDS]), mine.readings, columns
-    )
+    std = rules.first_std, rules.second_std
+    seen = SeenLandmark(sensor, std, mine.readings, columns)
     at = mean if rules.linearisation == AT_ESTIMATE else reference
     try:
         best = _best_fit(seen, mean, P, at, rules)

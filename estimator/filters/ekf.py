@@ -19,10 +19,8 @@ from ...arrays import Array, IntArray
 from ..interface import Belief, MapView, UpdateReport, describe_filter
 from ..kernels.kalman_gain import (
     ADDITIVE,
-    AFTER_STDS,
     AT_ESTIMATE,
     AT_REFERENCE,
-    FIRST_STD,
     INVARIANT,
     OUTCOME,
     PROJECTED,
@@ -36,9 +34,9 @@ from ..models.motions import UNICYCLE, Motion, MotionNoise
 from ..models.sensors import (
     BEARING_RANGE,
     Sensor,
-    constant_std,
     find_sensor,
     for_sensor,
+    former_noise,
 )
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds, covariance_bytes, landmark_pairs
@@ -243,7 +241,8 @@ class EkfSlam(MapFilter):
         units; one number suffices for a sensor that reads one.
     sensor : str or Sensor
         What a reading is: "bearing_range", "position", "bearing", "range", or a
-        :class:`~slamgym.estimator.Sensor` of your own.
+        :class:`~slamgym.estimator.Sensor` of your own; with its noise, where that
+        depends on the distance.
     initial_pose : array_like, shape (3,)
         Mean of the first pose (x, y, θ) [m, m, rad].
     initial_pose_std : array_like, shape (3,)
@@ -252,15 +251,6 @@ class EkfSlam(MapFilter):
         "full" correlates a new landmark with the pose from which it was seen.
         "independent" omits this correlation, which makes the filter overconfident;
         it serves to reproduce published results.
-    range_std_per_metre : float
-        Part of σr that grows with the range: σr(r) = σr + k r.
-    bearing_std_metres : float
-        Part of σβ that shrinks with the range: σβ(r) = σβ + b / r. A sensor that
-        reads positions with the noise σ has σβ = 0, σr = b = σ.
-    range_noise_at : {"expected", "reading"}
-        The range r in these formulas: the expected one, or the measured one.  The
-        latter is common, but gives more weight to readings that are too short.  For
-        a new landmark, it is always the measured one.
     gate_probability : float or None
         Readings of mapped landmarks outside this chi-square region of their own
         innovation are rejected; None accepts all.
@@ -303,6 +293,7 @@ class EkfSlam(MapFilter):
     #: The kernel: screen, correct, add new landmarks.
     _update_map: ClassVar[UpdateKernel] = staticmethod(update_map)
 
+    @former_noise
     def __init__(
         self,
         motion_std: ArrayLike,
@@ -312,9 +303,6 @@ class EkfSlam(MapFilter):
         initial_pose: ArrayLike = (0.0, 0.0, 0.0),
         initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
         landmark_init: str = "full",
-        range_std_per_metre: float = 0.0,
-        range_noise_at: str = "expected",
-        bearing_std_metres: float = 0.0,
         gate_probability: float | None = None,
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
@@ -322,6 +310,7 @@ class EkfSlam(MapFilter):
     ) -> None:
         self._motion_noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
         self.sensor = find_sensor(sensor)
+        self._is_default = self.sensor == BEARING_RANGE
         self.waiting = None if self.sensor.places else Waiting()
         self.rules = checked_rules(
             measurement_std,
@@ -329,9 +318,6 @@ class EkfSlam(MapFilter):
             linearisation=self._linearisation,
             frame=self._frame,
             landmark_init=landmark_init,
-            range_std_per_metre=range_std_per_metre,
-            bearing_std_metres=bearing_std_metres,
-            range_noise_at=range_noise_at,
             gate_probability=gate_probability,
             min_range=min_range,
         )
@@ -391,7 +377,7 @@ class EkfSlam(MapFilter):
         sensor, kernel = self.sensor, self._update_map
         readings = argument_checks.scan(measurements, sensor.columns)
         ids = argument_checks.identity_array(landmark_ids, len(readings), self)
-        if sensor is not BEARING_RANGE:
+        if not self._is_default:
             kernel = for_sensor(kernel, sensor)
             if self.waiting is not None:
                 return self._update_and_collect(kernel, readings, ids, self.waiting)
@@ -603,13 +589,10 @@ class IteratedEkfSlam(EkfSlam):
 def checked_rules(
     measurement_std: ArrayLike,
     *,
-    sensor: Sensor = BEARING_RANGE,
+    sensor: Sensor,
     linearisation: int,
     frame: int,
     landmark_init: str,
-    range_std_per_metre: float,
-    bearing_std_metres: float = 0.0,
-    range_noise_at: str,
     gate_probability: float | None,
     min_range: float,
 ) -> Rules:
@@ -619,42 +602,25 @@ def checked_rules(
         measurement_std = float(given.ravel()[0]), 1.0
     std = argument_checks.standard_deviations("measurement_std", measurement_std, 2)
     argument_checks.one_of("landmark_init", landmark_init, ("full", "independent"))
-    argument_checks.one_of("range_noise_at", range_noise_at, ("expected", "reading"))
-    as_read = range_noise_at == "reading"
-    if as_read and not sensor.places:
-        raise ValueError(
-            f"range_noise_at must be 'expected': one reading of sensor "
-            f"'{sensor.name}' does not locate a landmark"
-        )
-    if sensor.std is constant_std and (range_std_per_metre or bearing_std_metres):
-        raise ValueError(
-            "range_std_per_metre and bearing_std_metres must be 0: the noise of sensor "
-            f"'{sensor.name}' is the same at every distance"
-        )
     return Rules(
         linearisation=linearisation,
         frame=frame,
         correlated=landmark_init == "full",
-        bearing_std=float(std[0]),
-        range_std=float(std[1]) if sensor.size == 2 else 1.0,
-        range_std_per_metre=argument_checks.range_growth(range_std_per_metre),
+        first_std=float(std[0]),
+        second_std=float(std[1]) if sensor.size == 2 else 1.0,
+        std_per_metre=float(sensor.range_std_per_metre),
+        std_metres=float(sensor.bearing_std_metres),
         min_range=argument_checks.positive("min_range", min_range),
         gate=_gate(gate_probability, sensor.size),
-        noise_as_read=as_read,
-        bearing_std_metres=argument_checks.at_least(
-            "bearing_std_metres", bearing_std_metres, 0.0
-        ),
+        noise_as_read=sensor.range_noise_at == "reading",
         numbers=sensor.size,
     )
 
 
-def reading_variances(
-    rules: Rules, ranges: Array, sensor: Sensor = BEARING_RANGE
-) -> Array:
+def reading_variances(rules: Rules, ranges: Array, sensor: Sensor) -> Array:
     """Return the variances of readings at these ranges [m], shape (m, 2)."""
-    noise = rules[FIRST_STD:AFTER_STDS]
-    std = sensor.std(noise, np.maximum(ranges, rules.min_range))
-    return np.stack(np.broadcast_arrays(*std), axis=1) ** 2
+    std = rules.first_std, rules.second_std
+    return sensor.stds(std, np.maximum(ranges, rules.min_range)) ** 2
 
 
 def _gate(probability: float | None, numbers: int) -> float:

@@ -440,10 +440,10 @@ class Rules(NamedTuple):
     iterations: int = 1  # most linearisations of a reading
     adaptive: bool = False  # linearise again only where a reading asks for it
     correlated: bool = True  # a new landmark with the pose it was seen from
-    bearing_std: float = 0.0  # [rad]
-    range_std: float = 0.0  # [m]
-    range_std_per_metre: float = 0.0
-    bearing_std_metres: float = 0.0  # [m]
+    first_std: float = 0.0  # and the next: the four numbers of the sensor's `std`
+    second_std: float = 0.0
+    std_per_metre: float = 0.0
+    std_metres: float = 0.0
     min_range: float = 1e-3  # [m]
     gate: float = np.inf  # largest NIS of one reading
     noise_as_read: bool = False  # take noise at the range as read, not as expected
@@ -452,7 +452,7 @@ class Rules(NamedTuple):
 
 ITERATIONS = Rules._fields.index("iterations")
 #: Column of the first of the four standard deviations of a reading in the rules.
-FIRST_STD = Rules._fields.index("bearing_std")
+FIRST_STD = Rules._fields.index("first_std")
 AFTER_STDS = Rules._fields.index("min_range")
 NUMBERS_READ = Rules._fields.index("numbers")
 

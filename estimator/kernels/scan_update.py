@@ -229,13 +229,8 @@ def set_noise(system: Array, row: int, rules: Rules, distance: float) -> None:
 @njit_internal
 def variances(rules: Rules, distance: float) -> tuple[float, float]:
     """Return the two variances of a reading at that distance [m], above 0."""
-    return reading_variances_jit(
-        rules.bearing_std,
-        rules.range_std,
-        rules.range_std_per_metre,
-        rules.bearing_std_metres,
-        distance,
-    )
+    noise = rules.first_std, rules.second_std, rules.std_per_metre, rules.std_metres
+    return reading_variances_jit(noise, distance)
 
 
 @njit_internal

@@ -232,16 +232,13 @@ def read_distance(bearing: float, distance: float) -> float:
 
 
 def reading_variances(
-    bearing_std: float,
-    range_std: float,
-    range_std_per_metre: float,
-    bearing_std_metres: float,
-    distance: float,
+    noise: tuple[float, float, float, float], distance: float
 ) -> tuple[float, float]:
-    """Return (σβ², σr²) of a reading at that distance [m], which is above 0."""
+    """Return (σβ + b / r)² and (σr + k r)² at r > 0 [m], of a noise (σβ, σr, k, b)."""
+    bearing_std, range_std, per_metre, metres = noise
     return (
-        (bearing_std + bearing_std_metres / distance) ** 2,
-        (range_std + range_std_per_metre * distance) ** 2,
+        (bearing_std + metres / distance) ** 2,
+        (range_std + per_metre * distance) ** 2,
     )
 
 

@@ -19,17 +19,19 @@ Since the robot's frame moves with the pose::
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cache
-from typing import Any
+from dataclasses import dataclass, field, replace
+from functools import cache, wraps
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array
+from ...arrays import LARGEST_RANGE_GROWTH, Array
 from ...jit import njit_inlined, njit_internal, specialised
 from ...suggestions import closest, imported
+from ..support import argument_checks
 from . import bearing_range
 from .bearing_range import LandmarkLocation, MeasurementPrediction, wrap_angle_jit
 
@@ -44,7 +46,7 @@ def constant_std(noise: Noise, distance: Real) -> Numbers:
     return noise[0] + 0.0 * distance, noise[1] + 0.0 * distance
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Sensor:
     """A sensor that reads one or two numbers of each landmark.
 
@@ -69,9 +71,29 @@ class Sensor:
         Which numbers are angles, whose differences filters wrap; by default none.
     std : callable
         ``std(noise, distance)`` returns the two standard deviations of the reading of a
-        landmark at a distance [m].  ``noise`` holds the numbers of the filter:
-        ``measurement_std`` (two), ``range_std_per_metre`` and ``bearing_std_metres``.
-        By default, ``measurement_std`` at every distance.
+        landmark at a distance [m].  ``noise`` holds the two numbers of the filter's
+        ``measurement_std``, and the next two numbers of this sensor.  By default,
+        ``measurement_std`` at every distance.
+    range_std_per_metre : float
+        k, the third number of `std`.  In the shipped sensors, the part of σr that
+        grows with the range: σr(r) = σr + k r.
+    bearing_std_metres : float
+        b, the fourth number of `std`.  In the shipped sensors, the part of σβ that
+        shrinks with the range: σβ(r) = σβ + b / r.  A bearing-range sensor that reads
+        positions with the noise σ has σβ = 0, σr = b = σ.
+    range_noise_at : {"expected", "reading"}
+        The distance that `std` gets: the expected one, or the measured one.  The latter
+        is common, but gives more weight to readings that are too short.  For a new
+        landmark, it is always the measured one.
+
+    Raises
+    ------
+    ValueError
+        If the parts do not fit together.
+
+    Notes
+    -----
+    Sensors that differ only in the last three parameters are equal: they share kernels.
 
     Examples
     --------
@@ -86,6 +108,87 @@ class Sensor:
     inverse: Callable[[Real, Real], Numbers] | None = None
     angles: tuple[bool, ...] = ()
     std: Callable[[Noise, Real], Numbers] = constant_std
+    range_std_per_metre: float = field(default=0.0, compare=False)
+    bearing_std_metres: float = field(default=0.0, compare=False)
+    range_noise_at: str = field(default="expected", compare=False)
+
+    def __post_init__(self) -> None:
+        for name in ("h", "inverse", "std"):
+            part = getattr(self, name)
+            if not (callable(part) or (name == "inverse" and part is None)):
+                raise self._refused(f"{name} must be a function, got {part!r}")
+        if self.size not in (1, 2) or len(self.units) != self.size:
+            raise self._refused(
+                "columns and units must name the same one or two numbers, got "
+                f"{self.columns!r} and {self.units!r}"
+            )
+        if len(self.angles) not in (0, self.size):
+            raise self._refused(
+                f"angles must have one entry for each column, got {self.angles!r}"
+            )
+        if self.places and self.size == 1:
+            raise self._refused(
+                "one number cannot determine a landmark: inverse must be None"
+            )
+        self._check_noise()
+        self._check_returns()
+
+    def _check_noise(self) -> None:
+        """Refuse numbers of the noise that no reading can have."""
+        k, b = self.range_std_per_metre, self.bearing_std_metres
+        check = argument_checks.at_least
+        check("range_std_per_metre", k, 0.0, LARGEST_RANGE_GROWTH)
+        check("bearing_std_metres", b, 0.0)
+        if self.std is constant_std and (k or b):
+            raise self._refused(
+                "range_std_per_metre and bearing_std_metres must be 0: its noise is "
+                "the same at every distance"
+            )
+        places = ("expected", "reading")
+        argument_checks.one_of("range_noise_at", self.range_noise_at, places)
+        if self.range_noise_at == "reading" and not self.places:
+            raise self._refused(
+                "range_noise_at must be 'expected': one reading does not locate a "
+                "landmark"
+            )
+
+    def _check_returns(self) -> None:
+        """Refuse functions that return something else, at a place 1 m ahead."""
+        try:
+            (_, _), (_, _, _, _) = self.h(1.0, 0.1)
+        except (TypeError, ValueError) as error:
+            raise self._refused(
+                f"h must return ((z0, z1), (∂z0/∂x, ∂z0/∂y, ∂z1/∂x, ∂z1/∂y)): {error}"
+            ) from None
+        std = np.asarray(self.std(self.noise((0.1, 0.1)), 1.0), dtype=np.float64)
+        if std.shape != (2,) or not (np.isfinite(std) & (std > 0)).all():
+            raise self._refused(
+                "std must return two finite numbers > 0, got "
+                f"{std.tolist()} at 1 m for measurement_std (0.1, 0.1)"
+            )
+
+    def _refused(self, what: str) -> ValueError:
+        return ValueError(f"sensor '{self.name}': {what}")
+
+    def with_noise(self, **numbers: Any) -> Sensor:
+        """Return the sensor with other numbers of its noise, by their names.
+
+        Examples
+        --------
+        >>> BEARING_RANGE.with_noise(range_std_per_metre=0.05).stds((0.02, 0.1), 4.0)
+        array([0.02, 0.3 ])
+        """
+        return replace(self, **numbers)
+
+    def noise(self, measurement_std: ArrayLike) -> Noise:
+        """Return the four numbers of `std` for a filter's measurement_std (2,)."""
+        first, second = np.asarray(measurement_std, dtype=np.float64).tolist()
+        return first, second, self.range_std_per_metre, self.bearing_std_metres
+
+    def stds(self, measurement_std: ArrayLike, distances: ArrayLike) -> Array:
+        """Return the standard deviations of readings at distances (...), (..., 2)."""
+        std = self.std(self.noise(measurement_std), distances)
+        return np.stack(np.broadcast_arrays(distances, *std)[1:], axis=-1)
 
     @property
     def size(self) -> int:
@@ -135,8 +238,8 @@ class Sensor:
     def difference(self, readings: Array, expected: Array) -> Array:
         """Return readings − expected, shape (..., 2), wrapped where an angle."""
         apart = np.subtract(readings, expected, dtype=np.float64)
-        for column, wraps in enumerate(self.wraps):
-            if wraps:
+        for column, is_angle in enumerate(self.wraps):
+            if is_angle:
                 apart[..., column] = bearing_range.wrap_angle(apart[..., column])
         if self.size == 1:
             apart[..., 1] = 0.0
@@ -153,9 +256,9 @@ class Sensor:
 
     def __reduce__(self) -> Any:
         """Return the registered sensor itself in another process."""
-        if SENSORS.get(self.name) is self:
-            return find_sensor, (self.name,)
-        return super().__reduce__()
+        if SENSORS.get(self.name) != self:
+            return super().__reduce__()
+        return _shipped, (self.name, *(getattr(self, name) for name in NUMBERS))
 
 
 def _rotation(angle: float) -> Array:
@@ -228,10 +331,17 @@ BEARING = Sensor(
 )
 RANGE = Sensor("range", ("range",), ("m",), read_range, std=range_std)
 
+#: The numbers of a sensor's noise that a filter's ``measurement_std`` does not hold.
+NUMBERS = ("range_std_per_metre", "bearing_std_metres", "range_noise_at")
+
 #: The known sensors by name.
 SENSORS: dict[str, Sensor] = {
     sensor.name: sensor for sensor in (BEARING_RANGE, POSITION, BEARING, RANGE)
 }
+
+
+def _shipped(name: str, *numbers: Any) -> Sensor:
+    return SENSORS[name].with_noise(**dict(zip(NUMBERS, numbers, strict=True)))
 
 
 def find_sensor(sensor: str | Sensor) -> Sensor:
@@ -254,13 +364,45 @@ def find_sensor(sensor: str | Sensor) -> Sensor:
     return found
 
 
-def only_bearing_range(sensor: str | Sensor, part: str) -> None:
-    """Refuse other sensors, for a part of the library that does not take them."""
+def sensor_in(options: Mapping[str, Any]) -> Sensor:
+    """Return the sensor that options name, with the numbers of its noise among them."""
+    sensor = find_sensor(options.get("sensor", BEARING_RANGE))
+    numbers = {name: options[name] for name in NUMBERS if name in options}
+    return sensor.with_noise(**numbers) if numbers else sensor
+
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def former_noise(function: Function) -> Function:
+    """Accept the numbers of a sensor's noise as keywords too, with a warning."""
+
+    @wraps(function)
+    def door(*args: Any, **keywords: Any) -> Any:
+        if former := keywords.keys() & set(NUMBERS):
+            given = ", ".join(f"{name}={keywords[name]!r}" for name in sorted(former))
+            warnings.warn(
+                f"the noise is part of the sensor: give sensor=find_sensor("
+                f"'bearing_range').with_noise({given})",
+                DeprecationWarning,
+                stacklevel=2,
+            )
+            keywords["sensor"] = sensor_in(keywords)
+            for name in former:
+                del keywords[name]
+        return function(*args, **keywords)
+
+    return cast("Function", door)
+
+
+def only_bearing_range(sensor: str | Sensor, part: str) -> Sensor:
+    """Return the sensor; refuse others, for a part that does not take them."""
     found = find_sensor(sensor)
-    if found is not BEARING_RANGE:
+    if found != BEARING_RANGE:
         raise ValueError(
             f"{part} accepts only sensor 'bearing_range', got '{found.name}'"
         )
+    return found
 
 
 def only_placing(sensor: Sensor, part: str) -> None:
@@ -293,7 +435,7 @@ def for_sensor(kernel: Any, sensor: Sensor) -> Any:
     sensor : Sensor
         The sensor of its readings.
     """
-    if sensor is BEARING_RANGE:
+    if sensor == BEARING_RANGE:
         return kernel
     return specialised(kernel, kernel_parts(sensor), sensor.name)
 
@@ -331,10 +473,8 @@ def kernel_parts(sensor: Sensor) -> Mapping[Kernel, Kernel]:
         x, y = inverse(z0, z1)
         return float(np.sqrt(x * x + y * y))
 
-    def variances(
-        std0: float, std1: float, per_metre: float, metres: float, distance: float
-    ) -> Numbers:
-        s0, s1 = std((std0, std1, per_metre, metres), distance)
+    def variances(noise: Noise, distance: float) -> Numbers:
+        s0, s1 = std(noise, distance)
         return s0 * s0, 1.0 if is_single else s1 * s1
 
     def placed(
@@ -406,7 +546,6 @@ def check_sensor(
     rng = np.random.default_rng(0)
     r, turn = 10 ** rng.uniform(-1, 2, trials), rng.uniform(-np.pi, np.pi, trials)
     x, y = r * np.cos(turn), r * np.sin(turn)
-    _check_shape(checked)
     _check_slopes(checked, x, y)
     _check_angles(checked)
     _check_inverse(checked, x, y)
@@ -416,13 +555,6 @@ def check_sensor(
 
 def _refuse(sensor: Sensor, what: str) -> None:
     raise SensorContractError(f"sensor '{sensor.name}': {what}")
-
-
-def _check_shape(sensor: Sensor) -> None:
-    if sensor.size not in (1, 2) or len(sensor.units) != sensor.size:
-        _refuse(sensor, "columns and units must name the same one or two numbers")
-    if len(sensor.angles) not in (0, sensor.size):
-        _refuse(sensor, "angles must have one entry for each column")
 
 
 def _name(sensor: Sensor, column: int) -> str:
@@ -465,8 +597,6 @@ def _check_angles(sensor: Sensor) -> None:
 def _check_inverse(sensor: Sensor, x: Array, y: Array) -> None:
     if sensor.inverse is None:
         return
-    if sensor.size == 1:
-        _refuse(sensor, "one number cannot determine a landmark: inverse must be None")
     found = np.stack(sensor.inverse(*sensor.read(x, y).T), axis=-1)
     off = np.hypot(found[:, 0] - x, found[:, 1] - y) / np.hypot(x, y)
     if not (off <= 1e-6).all():
@@ -480,7 +610,7 @@ def _check_inverse(sensor: Sensor, x: Array, y: Array) -> None:
 
 def _check_std(sensor: Sensor, noise: Array, distances: Array) -> None:
     for distance in distances.tolist():
-        std = sensor.std((float(noise[0]), float(noise[1]), 0.0, 0.0), distance)
+        std = sensor.std(sensor.noise(noise), distance)
         if len(std) != 2 or not all(np.isfinite(std)) or not min(std) > 0:
             _refuse(
                 sensor,

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
-from ..association.scan_assignments import Noise
 from ..interface import Belief, UpdateReport
 from ..models.bearing_range import locate_landmark, predict_measurement, wrap_angle
 from ..models.motions import UNICYCLE, Motion, MotionNoise, predict_pose
+from ..models.sensors import Sensor, former_noise, only_bearing_range
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 
@@ -47,9 +47,9 @@ class PeerSlam(ABC):
     motion_std, measurement_std, initial_pose, initial_pose_std
         As in :func:`~slamgym.estimator.make_estimator`; a first pose that is certain
         has the deviation `START_FLOOR`.
-    range_std_per_metre, noise_at_rest, min_range, motion
-        As in :class:`~slamgym.estimator.EkfSlam`; the range that counts is the one
-        that the estimate expects.
+    sensor, noise_at_rest, min_range, motion
+        As in :class:`~slamgym.estimator.EkfSlam`; bearing-range only, and its noise is
+        that at the range that the estimate expects.
 
     Raises
     ------
@@ -57,22 +57,23 @@ class PeerSlam(ABC):
         If an argument has the wrong shape or is not finite or negative.
     """
 
+    @former_noise
     def __init__(
         self,
         motion_std: ArrayLike,
         measurement_std: ArrayLike,
         *,
+        sensor: str | Sensor = "bearing_range",
         initial_pose: ArrayLike = (0.0, 0.0, 0.0),
         initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
-        range_std_per_metre: float = 0.0,
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
         motion: str | Motion = UNICYCLE,
     ) -> None:
         self._noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
+        self._sensor = only_bearing_range(sensor, "an adapter")
         std = argument_checks.standard_deviations("measurement_std", measurement_std, 2)
-        growth = argument_checks.range_growth(range_std_per_metre)
-        self._sensor = Noise(float(std[0]), float(std[1]), growth)
+        self._std = std
         self._min_range = argument_checks.above("min_range", min_range, 0)
         self._slots: dict[int, int] = {}
         self.reset(initial_pose, initial_pose_std)
@@ -113,7 +114,8 @@ class PeerSlam(ABC):
         usable = np.minimum(readings[:, 1], ranges) >= self._min_range
         known, new = np.flatnonzero(mapped & usable), np.flatnonzero(~mapped & usable)
         slots[new] = len(self._slots) + np.arange(len(new))
-        variances = self._sensor.variances(ranges)
+        stds = self._sensor.stds(self._std, np.maximum(ranges, self._min_range))
+        variances = stds**2
         innovation = self._take_in(
             Readings(readings[known], slots[known], variances[known]),
             Readings(readings[new], slots[new], variances[new]),

@@ -21,6 +21,7 @@ from ..models.bearing_range import wrap_angle
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.motions import Motion as DriveMotion
 from ..models.rigid_motion import pose_rotation, predict
+from ..models.sensors import Sensor, former_noise, only_bearing_range
 from ..support import argument_checks
 
 
@@ -58,7 +59,7 @@ class Drive:
         (σβ, σr) of the measurement noise [rad, m].
     initial_pose, initial_pose_std : array_like, shape (3,)
         Mean and standard deviation of the first pose [m, m, rad].
-    range_std_per_metre, bearing_std_metres, range_noise_at, noise_at_rest, min_range
+    sensor, noise_at_rest, min_range
         As in :class:`~slamgym.estimator.EkfSlam`.
     motion : str or DriveMotion
         The drive.
@@ -79,37 +80,34 @@ class Drive:
     (2, (7,))
     """
 
+    @former_noise
     def __init__(
         self,
         motion_std: ArrayLike,
         measurement_std: ArrayLike,
         *,
+        sensor: str | Sensor = "bearing_range",
         initial_pose: ArrayLike = (0.0, 0.0, 0.0),
         initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
-        range_std_per_metre: float = 0.0,
-        bearing_std_metres: float = 0.0,
-        range_noise_at: str = "expected",
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
         motion: str | DriveMotion = UNICYCLE,
     ) -> None:
         self.motion_noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
+        self.sensor = only_bearing_range(sensor, "the smoother")
         self.rules = rules = checked_rules(
             measurement_std,
+            sensor=self.sensor,
             linearisation=AT_ESTIMATE,
             frame=ADDITIVE,
             landmark_init="full",
-            range_std_per_metre=range_std_per_metre,
-            bearing_std_metres=bearing_std_metres,
-            range_noise_at=range_noise_at,
             gate_probability=None,
             min_range=min_range,
         )
-        bearing_noise = rules.bearing_std or rules.bearing_std_metres
-        if not (bearing_noise and (rules.range_std or rules.range_std_per_metre)):
+        std = rules.first_std, rules.second_std
+        if not (self.sensor.stds(std, 1.0) > 0).all():
             raise ValueError(
-                "measurement_std must be > 0 to smooth, got "
-                f"({rules.bearing_std:g}, {rules.range_std:g})"
+                f"measurement_std must be > 0 to smooth, got ({std[0]:g}, {std[1]:g})"
             )
         self.initial_pose = argument_checks.finite_vector(
             "initial_pose", initial_pose, 3

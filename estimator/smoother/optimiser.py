@@ -117,7 +117,7 @@ class Optimiser:
         rules = noise.rules
         self._rule_values = np.array(rules)
         self._robust = noise.kind, noise.scale
-        varies = max(rules.range_std_per_metre, rules.bearing_std_metres) > 0
+        varies = max(rules.std_per_metre, rules.std_metres) > 0
         self._varies = varies and not rules.noise_as_read
         self._owners = np.repeat(np.arange(poses), np.diff(drive.firsts))
         self._by_landmark = np.argsort(drive.columns, kind="stable")
@@ -391,12 +391,10 @@ def filter_drive(
     rules, noise = drive.rules, drive.motion_noise
     slam = InvariantEkfSlam(
         np.sqrt(noise.variance),
-        (rules.bearing_std, rules.range_std),
+        (rules.first_std, rules.second_std),
         initial_pose=drive.initial_pose,
         initial_pose_std=drive.initial_pose_std,
-        range_std_per_metre=rules.range_std_per_metre,
-        bearing_std_metres=rules.bearing_std_metres,
-        range_noise_at="reading" if rules.noise_as_read else "expected",
+        sensor=drive.sensor,
         noise_at_rest=noise.at_rest,
         min_range=rules.min_range,
         motion=noise.motion,

@@ -25,7 +25,7 @@ from ..interface import (
 )
 from ..map_management.map_editor import MapEditor
 from ..models.motions import UNICYCLE, Motion
-from ..models.sensors import BEARING_RANGE, Sensor, only_bearing_range
+from ..models.sensors import Sensor, former_noise
 from ..registry import accepted_options, find_estimator, make_estimator, read_label
 from ..support import argument_checks, saved_states
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
@@ -255,12 +255,8 @@ class SmoothingSlam(RecordedSlam):
         Options in brackets override the keywords.
     robust, robust_scale
         As in `batch_smoother.smooth`.
-    range_std_per_metre, bearing_std_metres, range_noise_at, noise_at_rest, min_range
-        As in :class:`~slamgym.estimator.EkfSlam`; the filter gets those that it takes.
-    motion : str or Motion
-        The drive; the filter gets it too.
-    sensor : str or Sensor
-        Bearing-range; others are refused.
+    sensor, motion, noise_at_rest, min_range
+        As in :class:`Drive`; the filter gets those that it takes.
     **options
         Further options of the filter.
 
@@ -272,6 +268,7 @@ class SmoothingSlam(RecordedSlam):
         If the filter does not take an option.
     """
 
+    @former_noise
     def __init__(
         self,
         motion_std: ArrayLike,
@@ -282,16 +279,12 @@ class SmoothingSlam(RecordedSlam):
         robust_scale: float | None = None,
         initial_pose: ArrayLike = (0.0, 0.0, 0.0),
         initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
-        range_std_per_metre: float = 0.0,
-        bearing_std_metres: float = 0.0,
-        range_noise_at: str = "expected",
+        sensor: str | Sensor = "bearing_range",
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
         motion: str | Motion = UNICYCLE,
-        sensor: str | Sensor = BEARING_RANGE,
         **options: Any,
     ) -> None:
-        only_bearing_range(sensor, "the smoother")
         noise: dict[str, Any] = {
             "motion_std": motion_std,
             "measurement_std": measurement_std,
@@ -300,9 +293,7 @@ class SmoothingSlam(RecordedSlam):
         }
         name, own = read_label(follow)
         settings: dict[str, Any] = {
-            "range_std_per_metre": range_std_per_metre,
-            "bearing_std_metres": bearing_std_metres,
-            "range_noise_at": range_noise_at,
+            "sensor": sensor,
             "noise_at_rest": noise_at_rest,
             "min_range": min_range,
             "motion": motion,

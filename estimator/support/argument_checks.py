@@ -16,7 +16,7 @@ import numpy as np
 import psutil
 from numpy.typing import ArrayLike, NDArray
 
-from ...arrays import LARGEST, LARGEST_RANGE_GROWTH, SMALLEST, AnyArray, Array, IntArray
+from ...arrays import LARGEST, SMALLEST, AnyArray, Array, IntArray
 
 LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]
 
@@ -273,11 +273,6 @@ def at_least(name: str, value: float, least: float, largest: float = LARGEST) ->
     if value > largest:
         raise ValueError(f"{name} must not exceed {largest:g}, got {value!r}")
     return float(value)
-
-
-def range_growth(value: float) -> float:
-    """Return ``range_std_per_metre``, or refuse it."""
-    return at_least("range_std_per_metre", value, 0.0, LARGEST_RANGE_GROWTH)
 
 
 def above(name: str, value: float, least: float) -> float:

@@ -24,6 +24,7 @@ from ...estimator.interface import (
 )
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.motions import find_motion
+from ...estimator.models.sensors import Sensor, find_sensor
 from ...estimator.smoother.batch_smoother import smoother_in
 from ...evaluation.error_bound import PosteriorBound, posterior_bound
 from ...evaluation.noise_findings import noise_sums
@@ -286,11 +287,15 @@ def bound_runs(scenario: Scenario, runs: SimulatedRuns) -> PosteriorBound:
         motion_std=scenario.motion.std,
         measurement_std=scenario.sensor.std,
         start_std=scenario.start.std,
-        range_std_per_metre=scenario.sensor.range_std_per_metre,
         pose_std=runs.fix_std,
-        sensor=scenario.sensor.kind,
+        sensor=_with_noise(scenario.sensor.kind, scenario),
     )
     return bound._replace(covariances=())
+
+
+def _with_noise(kind: str, scenario: Scenario) -> Sensor:
+    growth = scenario.sensor.range_std_per_metre
+    return find_sensor(kind).with_noise(range_std_per_metre=growth)
 
 
 def noise_of_runs(scenario: Scenario, assumed: Scenario, runs: SimulatedRuns) -> Array:
@@ -313,7 +318,7 @@ def noise_of_runs(scenario: Scenario, assumed: Scenario, runs: SimulatedRuns) ->
         identified.visible & (scenario.sensor.kind == "bearing_range"),
         motion_std=assumed.motion.std,
         measurement_std=assumed.sensor.std,
-        range_std_per_metre=assumed.sensor.range_std_per_metre,
+        sensor=_with_noise("bearing_range", assumed),
         noise_in=assumed.motion.noise_in,
         noisy_steps=noisy,
     )

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from ...estimator import interface, registry
+from ...estimator.models.sensors import Sensor, sensor_in
 from ...estimator.support.argument_checks import (
     covariance_bytes,
     refuse_beyond_memory,
@@ -85,6 +86,11 @@ class FilterSettings:
     initial_pose_std: tuple[float, ...] = (0.0, 0.0, 0.0)
     #: Further arguments of the estimator's constructor.
     options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor with its noise."""
+        return sensor_in(self.options)
 
     def make(self, initial_pose: ArrayLike) -> interface.SlamEstimator:
         """Make the estimator at an initial pose (3,) [m, m, rad].

@@ -127,7 +127,7 @@ def _oracle_errors(
         log.landmark_ids,
         log.landmarks,
         settings.measurement_std,
-        range_std_per_metre=float(settings.options.get("range_std_per_metre", 0.0)),
+        sensor=settings.sensor,
         places=places_of(log.landmark_ids, log.landmarks, resolution),
     )
     return finite(share)

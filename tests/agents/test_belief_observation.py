@@ -26,6 +26,7 @@ from slamgym.agents.belief_features import (
 )
 from slamgym.agents.belief_features import on_log_scale as log_scale_of_one
 from slamgym.estimator import EkfSlam, InvariantEkfSlam, make_batch
+from slamgym.estimator.models.sensors import BEARING_RANGE
 from slamgym.sim_configs import load_scenario
 
 ID = "slamgym/LandmarkWorld-v0"
@@ -259,7 +260,7 @@ def test_the_noise_of_the_world_is_told_to_the_filter():
     slam = EkfSlam(
         scenario.motion.std,
         scenario.sensor.std,
-        range_std_per_metre=0.1,
+        sensor=BEARING_RANGE.with_noise(range_std_per_metre=0.1),
         noise_at_rest=scenario.motion.noise_at_rest,
     )
     observation, _ = env.reset(seed=0)

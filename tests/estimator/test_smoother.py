@@ -8,6 +8,7 @@ from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
 from slamgym.estimator import make_estimator
 from slamgym.estimator.map_management import ManagedSlam
 from slamgym.estimator.models.bearing_range import wrap_angle
+from slamgym.estimator.models.sensors import BEARING_RANGE
 from slamgym.estimator.smoother import Drive, SmoothingSlam, smooth
 from slamgym.estimator.smoother.optimiser import start_of
 
@@ -309,32 +310,36 @@ def spoiled(moves, scans):
 
 
 def test_noise_that_grows_with_the_range_is_that_of_the_expected_range():
-    made, *_ = recorded(measurement_std=(0.02, 0.0), range_std_per_metre=0.02)
+    sensor = BEARING_RANGE.with_noise(range_std_per_metre=0.02)
+    made, *_ = recorded(measurement_std=(0.02, 0.0), sensor=sensor)
     smoothed = smooth(made)
     fixed, *_ = recorded(measurement_std=(0.02, 0.1))
     assert smoothed.cost != pytest.approx(smooth(fixed).cost, rel=1e-2)
-    read, *_ = recorded(
-        measurement_std=(0.02, 0.0), range_std_per_metre=0.02, range_noise_at="reading"
-    )
+    sensor = sensor.with_noise(range_noise_at="reading")
+    read, *_ = recorded(measurement_std=(0.02, 0.0), sensor=sensor)
     assert not np.allclose(smooth(read).poses, smoothed.poses, atol=1e-4)
 
 
 def test_a_sensor_of_positions_is_smoothed_as_dense_least_squares():
-    noise = {"measurement_std": (0.005, 0.1), "bearing_std_metres": 0.1}
-    drive_, moves, scans = recorded(range_noise_at="reading", **noise)
+    std, sensor = (0.005, 0.1), BEARING_RANGE.with_noise(bearing_std_metres=0.1)
+    as_read = sensor.with_noise(range_noise_at="reading")
+    drive_, moves, scans = recorded(measurement_std=std, sensor=as_read)
     made = smooth(drive_)
-    twin, state, order = dense_twin(made, moves, scans, **noise)
+    twin, state, order = dense_twin(
+        made, moves, scans, measurement_std=std, bearing_std_metres=0.1
+    )
     assert made.cost == pytest.approx((twin.residual(state) ** 2).sum() / 2)
     found, expected = twin.solve(state + 0.001)
     assert found == pytest.approx(state, abs=1e-7)
     joint = made.covariance(range(len(made.poses)), order)
     assert joint == pytest.approx(expected, rel=1e-6, abs=1e-9)
-    of_expected, *_ = recorded(**noise)
+    of_expected, *_ = recorded(measurement_std=std, sensor=sensor)
     assert not np.allclose(smooth(of_expected).poses, made.poses, atol=1e-5)
 
 
 def test_the_smoother_takes_the_noise_of_its_filter():
-    noise = {"measurement_std": (0.0, 0.1), "bearing_std_metres": 0.1}
+    sensor = BEARING_RANGE.with_noise(bearing_std_metres=0.1)
+    noise = {"measurement_std": (0.0, 0.1), "sensor": sensor}
     slam = SmoothingSlam(MOTION_STD, initial_pose_std=START_STD, **noise)
     made, moves, scans = recorded(**noise)
     for move, (readings, seen) in zip(moves, scans[1:], strict=True):

@@ -39,6 +39,7 @@ from slamgym.estimator.large_maps.sparse_information.sparse_information_slam imp
 )
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.motions import predict_pose
+from slamgym.estimator.models.sensors import BEARING_RANGE
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
@@ -188,8 +189,9 @@ def test_without_a_bound_it_is_the_ekf_with_local_maps_that_change():
 def test_gate_and_range_settings_are_those_of_the_ekf():
     settings = {
         "gate_probability": 0.9,
-        "range_std_per_metre": 0.02,
-        "bearing_std_metres": 0.01,
+        "sensor": BEARING_RANGE.with_noise(
+            range_std_per_metre=0.02, bearing_std_metres=0.01
+        ),
         "min_range": 4.0,
         "noise_at_rest": False,
     }

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from slamgym.estimator.interface import ScanDecisions
+from slamgym.estimator.models.sensors import BEARING_RANGE
 from slamgym.evaluation import (
     landmark_identities,
     oracle_errors,
@@ -189,7 +190,7 @@ def test_the_oracle_takes_the_landmark_of_the_least_mahalanobis_distance():
             ids,
             world,
             std,
-            range_std_per_metre=slope,
+            sensor=BEARING_RANGE.with_noise(range_std_per_metre=slope),
             places=places,
         )
         assert 0 < found < 1

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from slamgym.estimator.models.sensors import BEARING_RANGE
 from slamgym.evaluation import CAUSES, SmallNoise, diagnose
 from slamgym.evaluation.diagnosis import errors_of
 from slamgym.evaluation.hypothesis_tests import time_average_test
@@ -53,7 +54,8 @@ def drive(rng, *, runs=3, steps=6, landmarks=4, noise_in="motion"):
 def summed(poses, points, odometry, readings, visible, **options):
     return noise_sums(
         poses, points, odometry, readings, visible, motion_std=MOTION_STD,
-        measurement_std=SENSOR_STD, range_std_per_metre=PER_METRE, **options,
+        measurement_std=SENSOR_STD,
+        sensor=BEARING_RANGE.with_noise(range_std_per_metre=PER_METRE), **options,
     )  # fmt: skip
 
 

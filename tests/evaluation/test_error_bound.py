@@ -8,6 +8,7 @@ import pytest
 from slamgym.estimator import make_estimator
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.motions import predict_pose
+from slamgym.estimator.models.sensors import BEARING_RANGE
 from slamgym.evaluation.error_bound import (
     efficiency,
     invariant_squares,
@@ -17,7 +18,7 @@ from slamgym.evaluation.error_bound import (
 NOISE = {
     "motion_std": (0.1, 0.05, 0.03),
     "measurement_std": (0.02, 0.1),
-    "range_std_per_metre": 0.01,
+    "sensor": BEARING_RANGE.with_noise(range_std_per_metre=0.01),
 }
 START_STD = (0.1, 0.2, 0.05)
 PLACES = np.array([[3.0, 2.0], [-1.0, 4.0], [2.0, -5.0], [6.0, 1.0]])

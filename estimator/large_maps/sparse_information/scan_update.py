@@ -20,6 +20,7 @@ from ...filters.gaussian_map import not_positive_definite
 from ...interface import UpdateReport
 from ...models.bearing_range import locate_landmark, predict_measurement, wrap_angle
 from ...models.motions import UNICYCLE, MotionNoise
+from ...models.sensors import only_bearing_range
 from ...support import argument_checks
 from .local_information import (
     ConditionalPose,
@@ -91,7 +92,7 @@ def process_scan(
     local, pose = state
     seen, added = screened.scan.landmarks, free_slots[: len(new)]
     if len(new):
-        variance = ekf.reading_variances(rules.rules, readings[new, 1])
+        variance = ekf.reading_variances(rules.rules, readings[new, 1], rules.sensor)
         local, pose = add_landmarks(rules.base, state, added, readings[new], variance)
         count = len(local.slots)
         seen = np.append(seen, np.arange(count - len(new), count))
@@ -172,9 +173,7 @@ class ScanRules:
     ) -> None:
         self.base = argument_checks.one_of("base", base, tuple(BASES))
         unknown = set(settings) - {
-            "range_std_per_metre",
-            "range_noise_at",
-            "bearing_std_metres",
+            "sensor",
             "gate_probability",
             "noise_at_rest",
             "min_range",
@@ -185,12 +184,13 @@ class ScanRules:
         noise = np.array(motion_std), np.array(measurement_std)
         #: Makes the filter of the same belief in dense form.
         self.dense = partial(BASES[base], *noise, **settings)
-        self.rules = self.dense().rules
+        dense = self.dense()
+        self.rules, self.sensor = dense.rules, dense.sensor
         at_rest = settings.get("noise_at_rest", True)
         motion = settings.get("motion", UNICYCLE)
         self.motion_noise = MotionNoise.checked(motion_std, at_rest, motion)
-        bearing_std = self.rules.bearing_std + self.rules.bearing_std_metres
-        if min(bearing_std, self.rules.range_std) <= 0:
+        std = only_bearing_range(dense.sensor, "sparse_information").stds(noise[1], 1.0)
+        if min(std) <= 0:
             raise ValueError(
                 "measurement_std must be 2 finite numbers > 0, because an exact "
                 f"measurement has infinite information, got {measurement_std!r}"
@@ -213,7 +213,7 @@ class ScanRules:
         kept = ~skipped
         places, readings = places[kept], readings[kept]
         at = readings[:, 1] if self.rules.noise_as_read else expected[kept]
-        variance = ekf.reading_variances(self.rules, at)
+        variance = ekf.reading_variances(self.rules, at, self.sensor)
         scan = linearise_scan(self.base, local, pose, places, readings, variance)
         S = _innovation_covariance(pose, local, scan)
         blocks = np.array(

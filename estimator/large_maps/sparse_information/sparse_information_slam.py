@@ -17,6 +17,7 @@ from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
 from ...interface import Belief, MapView, UpdateReport, describe_filter
 from ...models.bearing_range import wrap_angle
+from ...models.sensors import former_noise
 from ...support import argument_checks, saved_states
 from ...support.argument_checks import LandmarkIds
 from ...support.saved_states import with_prefix, without_prefix
@@ -58,8 +59,8 @@ class SparseInformationSlam:
 
     Parameters
     ----------
-    motion_std, measurement_std, initial_pose, initial_pose_std, range_std_per_metre, \
-range_noise_at, gate_probability, noise_at_rest, min_range
+    motion_std, measurement_std, initial_pose, initial_pose_std, sensor, \
+gate_probability, noise_at_rest, min_range
         As in :class:`EkfSlam`; ``measurement_std`` must be positive.
     base : {"ekf", "first_estimates", "observability_constrained"}
         The filter whose Jacobians are used.  Those of "ekf" make it overconfident on
@@ -104,6 +105,7 @@ range_noise_at, gate_probability, noise_at_rest, min_range
 
     __repr__ = describe_filter
 
+    @former_noise
     def __init__(
         self,
         motion_std: ArrayLike,
