@@ -279,9 +279,7 @@ def test_a_landmark_is_too_near_within_ten_standard_deviations(seed, share):
 def test_a_reading_is_screened_at_the_expected_distance(monkeypatch):
     for name in ("is_too_near", "set_noise", "variances"):
         monkeypatch.setattr(screening, name, plain(getattr(screening, name)))
-    rules = Rules(
-        bearing_std=0.1, range_std=0.2, range_std_per_metre=0.1, bearing_std_metres=0.3
-    )
+    rules = Rules(first_std=0.1, second_std=0.2, std_per_metre=0.1, std_metres=0.3)
     mean = np.array([1.0, 2.0, 0.5, 9.0, 9.0, 4.0, 6.0])  # 5 m from the second landmark
     belief = BeliefArrays(mean, 1e-4 * np.eye(7), np.zeros(7))
     rows = np.zeros((FIRST + 4, 7 + META_WIDTH))

@@ -234,7 +234,7 @@ def test_a_batch_does_not_follow_later_changes_of_the_filter_it_was_made_from(da
     filters = [EkfSlam(MOTION_STD, MEASUREMENT_STD) for _ in range(2)]
     batches = [BatchSlam(each, RUNS, LANDMARKS) for each in filters]
     filters[0]._motion_noise.variance[:] *= 4
-    filters[0]._adopt(filters[0].rules._replace(range_std=1.0))
+    filters[0]._adopt(filters[0].rules._replace(second_std=1.0))
     changed, kept = (batch.run(*data) for batch in batches)
     np.testing.assert_array_equal(changed.poses, kept.poses)
 
