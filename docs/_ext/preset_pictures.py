@@ -8,17 +8,18 @@ import numpy as np
 from PIL import Image
 from sphinx.util.display import status_iterator
 
-from slamgym.agents import make_baseline
+from slamgym.agents import BeliefObservation, make_baseline
 from slamgym.envs import OpenLoop
 from slamgym.sim_configs import Scenario, action_sequence, list_presets, load_scenario
 
 FRAMES = 40
 SIZE = (480, 480)
+LARGEST = 500  # landmarks of a world whose picture shows the belief of a filter
 
 INTRODUCTION = """# Presets
 
-The worlds that come with the package, each after half of its drive. A preset is used by
-its name: `slamgym run corridor`, or
+The worlds that come with the package, each after half of its drive, with the belief of
+`ekf` in worlds of up to 500 landmarks. A preset is used by its name: `slamgym run corridor`, or
 `gymnasium.make("slamgym/LandmarkWorld-v0", scenario="corridor")`.
 
 ::::{grid} 1 2 3 3
@@ -41,10 +42,13 @@ def page(folder: Path) -> str:
 
 
 def draw(scenario: Scenario, path: Path) -> None:
-    """Save a picture of a world after half of its drive."""
+    """Save a picture of a world after half of its drive, with a belief if small."""
     env = gymnasium.make(
         "slamgym/LandmarkWorld-v0", scenario=scenario, render_mode="rgb_array"
     )
+    if scenario.landmarks.count <= LARGEST:
+        options = {} if scenario.sensor.identities else {"management": True}
+        env = BeliefObservation(env, "ekf", estimator_options=options)
     steps = min(scenario.steps // 2, 400)
     _frames(env, _open_loop(env), {steps})[-1].save(path)
 

@@ -142,15 +142,16 @@ class Scene:
         if self._legend_has_belief:
             keys.append(EllipseKind("pose belief, 3σ", POSE, fill=0.14).legend_key())
             keys.append(EllipseKind("landmark belief, 3σ", MAP, fill=0.14).legend_key())
+        columns = max(4, -(-len(keys) // 2))  # two rows fit below the axes
         self._figure.legend(
             handles=keys,
             handler_map=ELLIPSE_HANDLER,
             loc="lower center",
             bbox_to_anchor=(0.52, 0.0),
-            ncols=4,
+            ncols=columns,
             fontsize=8.5,
             frameon=False,
-            columnspacing=1.4,
+            columnspacing=1.4 if columns == 4 else 0.8,
             handletextpad=0.5,
         )
 

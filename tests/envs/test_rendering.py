@@ -233,7 +233,9 @@ def test_the_clock_looks_like_text_of_matplotlib():
         assert abs(ends[0] - usual[0]) <= 0.05 * (usual[-1] - usual[0]) + 1
 
 
-@pytest.mark.parametrize("sensor", [{}, {"max_range": 5.0}])
+@pytest.mark.parametrize(
+    "sensor", [{}, {"max_range": 5.0}, {"max_range": 5.0, "clutter": 1.0}]
+)
 @pytest.mark.parametrize("walls", [(), ((0.0, 0.0, 5.0, 0.0),)])
 def test_texts_stay_inside_the_figure_and_apart(sensor, walls):
     scenario = SIX.with_changes(sensor=sensor, walls=walls)
