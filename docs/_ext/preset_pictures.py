@@ -19,7 +19,8 @@ LARGEST = 500  # landmarks of a world whose picture shows the belief of a filter
 INTRODUCTION = """# Presets
 
 The worlds that come with the package, each after half of its drive, with the belief of
-`ekf` in worlds of up to 500 landmarks. A preset is used by its name: `slamgym run corridor`, or
+`ekf` in worlds of up to 500 landmarks. A preset is used by its name: `slamgym run
+corridor`, or
 `gymnasium.make("slamgym/LandmarkWorld-v0", scenario="corridor")`.
 
 ::::{grid} 1 2 3 3

@@ -235,7 +235,11 @@ def test_the_clock_looks_like_text_of_matplotlib():
 
 @pytest.mark.parametrize(
     "sensor",
-    [{}, {"max_range": 5.0}, {"max_range": 5.0, "identities": False, "clutter": 1.0}],
+    [
+        {},
+        {"max_range": 5.0},
+        {"max_range": 5.0, "identities": False, "clutter": 1.0, "max_clutter": 5},
+    ],
 )
 @pytest.mark.parametrize("walls", [(), ((0.0, 0.0, 5.0, 0.0),)])
 def test_texts_stay_inside_the_figure_and_apart(sensor, walls):
