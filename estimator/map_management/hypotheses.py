@@ -86,6 +86,8 @@ def distinct(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
     overlapping poses, which are variants of one decision, the most probable are
     returned only, so that they leave room for another decision.
     """
+    if len(hypotheses) == 1:
+        return [*hypotheses]
     chosen: list[int] = []
     near = _overlaps([h.slam.map_view() for h in hypotheses])
     for k, hypothesis in enumerate(hypotheses):

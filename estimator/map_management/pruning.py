@@ -91,7 +91,7 @@ class MapPruner:
         self.note_sightings(readings[rows], ids)
         removed = self.remove_missing(missed)
         merged = self.merger.merge(seen)
-        merged += self.close_loops(plan.confirmed, self._policy.reach(readings))
+        merged += self.close_loops(plan.confirmed, readings)
         return removed + self.keep_capacity(seen), merged
 
     def remove_missing(self, missed: set[int]) -> list[int]:
@@ -106,18 +106,19 @@ class MapPruner:
         overdue = np.flatnonzero(records.misses >= most)
         return self.remove([records.ids[k] for k in overdue.tolist()])
 
-    def close_loops(self, added: Collection[int], within: float) -> Pairs:
+    def close_loops(self, added: Collection[int], readings: Array) -> Pairs:
         """Merge landmarks around the robot with an older part of the map.
 
         Parameters
         ----------
         added : collection of int
             Landmarks, seen without identity, that the last scan has added.
-        within : float
-            Reach of the readings [m].
+        readings : ndarray, shape (m, 2)
+            This scan.
         """
         if not self._closer.is_waiting(added):
             return []
+        within = self._policy.reach(readings)
         pairs = self._closer.pairs(self._editor.map_view(within), added, within)
         try:
             if pairs:

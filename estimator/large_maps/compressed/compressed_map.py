@@ -19,7 +19,6 @@ from ...interface import Belief
 from ...support import saved_states
 from ...support.argument_checks import LOWEST_ID, covariance_bytes, refuse_beyond_memory
 from ...support.saved_states import with_prefix, without_prefix
-from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from ..multifrontal import pairs, symmetric
 from . import phase_update
 from .deferred_covariance import BLOCK, DeferredCovariance, subtract
@@ -68,9 +67,8 @@ class CompressedMap:
 
     def remove(self, ids: Sequence[int]) -> None:
         """Marginalise landmarks."""
-        with undone_on_error(self.bookmark()):
-            self.filter.remove([i for i in ids if i in self.local])
-            self._drop(ids)
+        self.filter.remove([i for i in ids if i in self.local])
+        self._drop(ids)
 
     def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
         """Condition on local landmarks being the same; drop the second of each pair."""
@@ -193,14 +191,6 @@ class CompressedMap:
         if self._handover is not None:
             self._handover.advance(self.deferred, self.deferred.width // BLOCK)
             self._handover = None
-
-    def bookmark(self) -> Undo:
-        """Return what takes back later changes, but for those made by kernels.
-
-        A handover may be further than before: its results do not depend on the time.
-        """
-        undo_filter = self.filter.bookmark()
-        return undo_all(undo_filter, self.deferred.checkpoint(), attributes(self))
 
     @property
     def is_small(self) -> bool:

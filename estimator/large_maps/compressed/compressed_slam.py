@@ -143,10 +143,12 @@ class CompressedEkfSlam:
             If memory cannot hold the landmarks; the belief is then unchanged.
         """
         readings = argument_checks.scan(measurements)
-        ids = argument_checks.given_identities(landmark_ids, len(readings), self)
+        named = argument_checks.identity_array(landmark_ids, len(readings), self)
+        ids, slots = named.tolist(), self._map.slots
+        argument_checks.refuse_repeated(ids)
         argument_checks.refuse_reserved(ids)
 
-        required = [i for i in ids if i in self._map.slots]
+        required = [i for i in ids if i in slots]
         changes = not self._is_adequate(required)
         if changes:
             changes = bool((np.abs(readings) <= LARGEST).all())  # otherwise refused
@@ -154,10 +156,10 @@ class CompressedEkfSlam:
         def correct() -> UpdateReport:
             if changes:
                 self._choose_local_map(required)
-            return self._map.filter.update(readings, ids)
+            return self._map.filter.update(readings, named)
 
         undo = self.bookmark() if changes else undo_all()
-        return advance(self._map.filter, correct, self._follow, undo, self.bookmark)
+        return advance(self._map.filter, correct, self._follow, undo, self._around)
 
     def observe_pose(
         self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
@@ -182,9 +184,9 @@ class CompressedEkfSlam:
         ValueError
             If one is not in the map; no landmark is then removed.
         """
-        self._map.remove(
-            argument_checks.mapped_identities(landmark_ids, self._map.slots)
-        )
+        ids = argument_checks.mapped_identities(landmark_ids, self._map.slots)
+        with undone_on_error(self.bookmark()):
+            self._map.remove(ids)
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two landmarks being the same, and remove the second.
@@ -286,7 +288,14 @@ class CompressedEkfSlam:
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
-        return undo_all(self._map.bookmark(), attributes(self))
+        return undo_all(self._map.filter.bookmark(), self._around())
+
+    def _around(self) -> Undo:
+        """Return what takes back later changes of all but the local filter.
+
+        A handover may be further than before: its results do not depend on the time.
+        """
+        return undo_all(self._map.deferred.checkpoint(), attributes(self._map, self))
 
     @property
     def steps(self) -> int:
