@@ -307,13 +307,8 @@ class GaussianMap:
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the used part of the arrays."""
-        n = self.size
-        return {
-            "mean": self.mean[:n].copy(),
-            "covariance": self.covariance[:n, :n].copy(),
-            "reference": self.reference[:n].copy(),
-            "landmark_ids": np.array(list(self.slots), dtype=np.int64),
-        }
+        found = {name: part.copy() for name, part in self.used._asdict().items()}
+        return {**found, "landmark_ids": np.array(list(self.slots), dtype=np.int64)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned, without checks."""
