@@ -27,9 +27,8 @@ def drives():
     return [record_episode(world, driver, seed) for seed in range(RUNS)]
 
 
-def final_nees(drives, doubt=1.0):
-    """Pose NEES at the end of each drive, of a filter that scales all noise."""
-    nees = []
+def replays(drives, doubt=1.0):
+    """Yield the trace of each drive, of a filter that scales all noise."""
     for log in drives:
         told = settings_for(log)
         settings = settings_for(
@@ -37,34 +36,29 @@ def final_nees(drives, doubt=1.0):
             motion_std=doubt * np.array(told.motion_std),
             measurement_std=doubt * np.array(told.measurement_std),
         )
-        nees.append(pose_nees(replay(log, settings.make(log.start)).trace)[-1])
-    return np.array(nees)
+        yield replay(log, settings.make(log.start)).trace
 
 
 @pytest.mark.slow
-def test_final_nees_is_chi_square_in_a_world_anchored_at_the_start(drives):
-    nees = final_nees(drives)
+def test_nees_at_the_end_and_nis_are_chi_square_in_a_world_anchored_at_the_start(
+    drives,
+):
+    """The innovations of a filter are white, so those of one run add up too."""
+    traces = list(replays(drives))
+    nees = np.array([pose_nees(trace)[-1] for trace in traces])
     low, high = ACCEPTED
     assert low < nees.sum() < high
     inside = np.mean(nees < chi2.ppf(0.95, 3))
     assert inside == pytest.approx(0.95, abs=3 * np.sqrt(0.95 * 0.05 / RUNS))
+    dof = sum(trace.nis_dof.sum() for trace in traces)
+    low, high = chi2.ppf([0.005, 0.995], dof)
+    assert low < sum(trace.nis.sum() for trace in traces) < high
+    assert dof == RUNS * 29 * 12
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("doubt", [0.9, 1.1])
 def test_a_filter_that_errs_by_a_tenth_about_the_noise_is_refused(drives, doubt):
     low, high = ACCEPTED
-    assert not low < final_nees(drives, doubt).sum() < high
-
-
-@pytest.mark.slow
-def test_the_nis_of_all_scans_is_chi_square_too(drives):
-    """The innovations of a filter are white, so those of one run add up too."""
-    total, dof = 0.0, 0
-    for log in drives:
-        trace = replay(log, settings_for(log).make(log.start)).trace
-        total += trace.nis.sum()
-        dof += trace.nis_dof.sum()
-    low, high = chi2.ppf([0.005, 0.995], dof)
-    assert low < total < high
-    assert dof == RUNS * 29 * 12
+    nees = sum(pose_nees(trace)[-1] for trace in replays(drives, doubt))
+    assert not low < nees < high
