@@ -229,10 +229,13 @@ class Drive:
         Readings of the landmark -1 are dropped.
         """
         made = copy(self)
-        made._motions, made._pending = list(self._motions), list(self._pending)
-        made._observed = {pose: list(z) for pose, z in self._observed.items()}
         kept = iter([Sightings(z[ids >= 0], ids[ids >= 0]) for z, ids in scans])
-        made._sightings = [[next(kept) for _ in own] for own in self._sightings]
+        vars(made).update(
+            _motions=list(self._motions),
+            _pending=list(self._pending),
+            _observed={pose: list(z) for pose, z in self._observed.items()},
+            _sightings=[[next(kept) for _ in own] for own in self._sightings],
+        )
         return made
 
     def sightings(self, pose: int) -> Sightings:
