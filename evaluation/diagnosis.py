@@ -24,15 +24,8 @@ from scipy.special import bdtrc, chdtri, stdtr
 
 from ..arrays import Array, BoolArray
 from ..estimator.support import argument_checks
+from . import noise_findings
 from .hypothesis_tests import time_average_test
-from .noise_findings import (
-    CHANNELS,
-    CORRELATED,
-    HEAVY_TAILS,
-    MOMENTS,
-    Finding,
-    significant_findings,
-)
 
 HONEST, CANNOT_TELL = "honest", "cannot tell"
 LINEARISATION, ASSOCIATION = "linearisation", "association"
@@ -49,8 +42,8 @@ CAUSES = (
     "odometry turn",
     "bearing bias",
     "range bias",
-    HEAVY_TAILS,
-    CORRELATED,
+    noise_findings.HEAVY_TAILS,
+    noise_findings.CORRELATED,
     LINEARISATION,
     WRONG_COVARIANCE,
     WRONG_MODEL,
@@ -162,7 +155,8 @@ def diagnose(
         text = f"cannot tell: {runs} runs succeeded, and {FEWEST_RUNS} are needed."
         return Diagnosis(CANNOT_TELL, 1.0, text)
     errors = errors_of(pose, heading)
-    guilty = [] if sums is None else significant_findings(sums, NOISE_RATE)
+    findings = noise_findings.significant_findings
+    guilty = [] if sums is None else findings(sums, NOISE_RATE)
     if guilty:
         return _of_the_noise(guilty, errors)
     before = "" if sums is None else "the noise is as assumed, but "
@@ -222,7 +216,7 @@ def _also(
 
 
 def _checked_sums(noise: ArrayLike, runs: int) -> Array:
-    shape = runs, len(CHANNELS), len(MOMENTS)
+    shape = runs, len(noise_findings.CHANNELS), len(noise_findings.MOMENTS)
     sums = argument_checks.shaped("noise", noise, shape)
     if not np.isfinite(sums).all():
         raise ValueError("noise must be finite: leave out runs that failed")
@@ -242,7 +236,7 @@ def _checked(nees: ArrayLike, heading_nees: ArrayLike) -> tuple[Array, Array]:
     return pose[:, first:], heading[:, np.isfinite(heading).all(axis=0)]
 
 
-def _of_the_noise(guilty: list[Finding], errors: Errors) -> Diagnosis:
+def _of_the_noise(guilty: list[noise_findings.Finding], errors: Errors) -> Diagnosis:
     """Answer by the finding with the largest effect."""
     first = guilty[0]
     others = dict.fromkeys(f.cause for f in guilty[1:] if f.cause != first.cause)

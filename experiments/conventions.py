@@ -13,12 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import Array
+from ..estimator.models import rigid_motion
 from ..estimator.models.bearing_range import wrap_angle
-from ..estimator.models.rigid_motion import (
-    additive_error,
-    invariant_covariance,
-    invariant_error,
-)
 from ..evaluation.nees import pose_nees
 
 #: Drives from which on covariances are read in other conventions.
@@ -228,10 +224,10 @@ def _nearer(truth: Array, readings: Sequence[Reading], before: _Fit) -> str:
 
 def _fit(truth: Array, reading: Reading) -> _Fit:
     """Compare a reading with the truth, by the invariant error of the pose."""
-    covariances = invariant_covariance(reading.poses, reading.covariances)
-    errors = invariant_error(truth, reading.poses)
+    covariances = rigid_motion.invariant_covariance(reading.poses, reading.covariances)
+    errors = rigid_motion.invariant_error(truth, reading.poses)
     order = [2, 0, 1]  # the heading first: no frame changes it
-    plain = additive_error(truth, reading.poses)
+    plain = rigid_motion.additive_error(truth, reading.poses)
     middle = (
         float(np.sqrt(np.nanmedian((plain[..., :2] ** 2).sum(axis=-1)))),
         float(np.sqrt(np.nanmedian(plain[..., 2] ** 2))),

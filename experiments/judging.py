@@ -25,13 +25,7 @@ from ..evaluation.nees import normalised_squared_error
 from ..evaluation.noise_findings import CHANNELS, MOMENTS
 from ..evaluation.trajectory_error import Alignment, align_positions, poses_at
 from ..sim_configs.scenario_files import scenario_text
-from .conventions import (
-    MOST_DRIVES,
-    additive_covariances,
-    mistake_in,
-    stray_poses,
-    swapped_drives,
-)
+from . import conventions
 from .estimate_files import (
     Estimate,
     beliefs_of,
@@ -392,7 +386,7 @@ def _measured(
             failures[run] = Failure(-1, reason)
         else:
             poses[run], claims[run] = each.poses, each.covariances
-    additive = additive_covariances(poses, claims, frame)
+    additive = conventions.additive_covariances(poses, claims, frame)
     moved = poses
     if align is not None:
         moved, additive = _aligned(poses, additive, truth, align)
@@ -508,15 +502,15 @@ def _mistakes(parts: Sequence[_Part], task: _Task, frame: str) -> str:
         np.concatenate([part.arrays[place][:, steps] for part in parts])
         for place in range(3)
     )
-    additive = additive_covariances(poses, claims, frame)
+    additive = conventions.additive_covariances(poses, claims, frame)
     counts = np.cumsum([len(part.arrays[0]) for part in parts])
-    few = parts[: int(np.searchsorted(counts, MOST_DRIVES)) + 1]
+    few = parts[: int(np.searchsorted(counts, conventions.MOST_DRIVES)) + 1]
     first = [np.concatenate([part.arrays[place] for part in few]) for place in range(4)]
     ratios = np.concatenate([p.block["pose_nees_invariant"] for p in parts]) / 3
     return (
-        swapped_drives(truth, poses, additive, task.names)
-        or mistake_in(first[0], first[1], first[2], first[3], frame)
-        or stray_poses(ratios, task.names)
+        conventions.swapped_drives(truth, poses, additive, task.names)
+        or conventions.mistake_in(first[0], first[1], first[2], first[3], frame)
+        or conventions.stray_poses(ratios, task.names)
     )
 
 

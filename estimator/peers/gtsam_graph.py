@@ -25,15 +25,7 @@ from ...arrays import Array
 from ..models.bearing_range import locate_landmark
 from ..models.rigid_motion import pose_rotation
 from ..support import argument_checks, saved_states
-from .peer_slam import (
-    Innovation,
-    PeerSlam,
-    Readings,
-    expected_readings,
-    motion_covariance,
-    moved_state,
-    wrapped,
-)
+from . import peer_slam
 
 X, L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
 
@@ -42,7 +34,7 @@ PoseAndPlaces = tuple[Any, list[Array]]
 MOVE, READING, SOLVE = 0.0, 1.0, 2.0  # kinds of the events of a drive
 
 
-class GtsamSlam(PeerSlam):
+class GtsamSlam(peer_slam.PeerSlam):
     """A smoother of GTSAM, its graph solved after every scan.
 
     Its factors are GTSAM's own: ``PriorFactorPose2``, ``BetweenFactorPose2`` and
@@ -93,10 +85,12 @@ class GtsamSlam(PeerSlam):
         before, now = X(self._k), X(self._k + 1)
         self._graph.add(gtsam.BetweenFactorPose2(before, now, between, noise))
         self._k += 1
-        self._estimate = moved_state(self._estimate, odometry)[0]
+        self._estimate = peer_slam.moved_state(self._estimate, odometry)[0]
         self._guess.insert(now, gtsam.Pose2(*self._estimate[:3]))
 
-    def _take_in(self, known: Readings, new: Readings) -> Innovation | None:
+    def _take_in(
+        self, known: peer_slam.Readings, new: peer_slam.Readings
+    ) -> peer_slam.Innovation | None:
         if not len(known.slots) + len(new.slots):
             return None
         innovation = None
@@ -111,7 +105,7 @@ class GtsamSlam(PeerSlam):
         self._solve()
         return innovation
 
-    def _add_readings(self, readings: Readings) -> None:
+    def _add_readings(self, readings: peer_slam.Readings) -> None:
         for (bearing, distance), slot, variance in zip(*readings, strict=True):
             self._events.append((READING, bearing, distance, *variance, slot, 0.0))
             noise = gtsam.noiseModel.Diagonal.Variances(variance)
@@ -132,16 +126,20 @@ class GtsamSlam(PeerSlam):
         self._solved, self._solved_k = self._estimate, self._k
         self._moves, self._covariance = [], None
 
-    def _innovation(self, readings: Readings) -> Innovation:
+    def _innovation(self, readings: peer_slam.Readings) -> peer_slam.Innovation:
         """Return ν and S at the last marginal, moved as an EKF moves it."""
         mean, P = self._solved, self._solved_covariance()
         for odometry, variance in self._moves:
-            moved, G = moved_state(mean, odometry)
-            P = G @ P @ G.T + motion_covariance(mean, variance)
+            moved, G = peer_slam.moved_state(mean, odometry)
+            P = G @ P @ G.T + peer_slam.motion_covariance(mean, variance)
             mean = moved
-        expected, H = expected_readings(mean, readings.slots)
-        nu = wrapped((readings.measurements - expected).ravel()).reshape(-1, 2)
-        return Innovation(nu, H @ P @ H.T + np.diag(readings.variances.ravel()))
+        expected, H = peer_slam.expected_readings(mean, readings.slots)
+        nu = peer_slam.wrapped((readings.measurements - expected).ravel()).reshape(
+            -1, 2
+        )
+        return peer_slam.Innovation(
+            nu, H @ P @ H.T + np.diag(readings.variances.ravel())
+        )
 
     def _mean(self) -> Array:
         return self._estimate
@@ -198,7 +196,7 @@ class GtsamSlam(PeerSlam):
         slots = rows[:, 5].astype(np.int64)
         is_new = slots >= len(self._estimate[3:]) // 2
         known, new = (
-            Readings(rows[which, 1:3], slots[which], rows[which, 3:5])
+            peer_slam.Readings(rows[which, 1:3], slots[which], rows[which, 3:5])
             for which in (~is_new, is_new)
         )
         self._take_in(known, new)

@@ -34,13 +34,8 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit
-from ..association.constellations import (
-    DISTANCE_GATE,
-    LARGEST_GRAPH,
-    TwoPlaces,
-    largest_clique,
-    tables,
-)
+from ..association import constellations
+from ..association.constellations import TwoPlaces, largest_clique, tables
 from ..kernels.assignment_search import compare_pairs
 from ..kernels.scan_update import as_rules, variances
 from ..models.bearing_range import wrap_angle, wrap_angle_jit
@@ -376,11 +371,13 @@ class _Search:
         squared[self.together(state.labels, len(state.places))[np.ix_(late, early)]] = (
             np.inf
         )
-        nearest = np.argsort(squared, axis=None)[:LARGEST_GRAPH]
+        nearest = np.argsort(squared, axis=None)[: constellations.LARGEST_GRAPH]
         nearest = np.sort(nearest[np.isfinite(squared.ravel()[nearest])])
         pairs = np.column_stack(np.unravel_index(nearest, squared.shape))
         agree = np.zeros((len(pairs),) * 2, dtype=np.bool_)
-        compare_pairs(pairs, *tables(places), DISTANCE_GATE, LARGEST_TURN, agree)
+        compare_pairs(
+            pairs, *tables(places), constellations.DISTANCE_GATE, LARGEST_TURN, agree
+        )
         for _ in range(MATCHES):
             clique = largest_clique(pairs, agree, SMALLEST_CLIQUE - 1, NODES)
             if not len(clique):

@@ -9,20 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .. import interface
 from ..filters.conditioning import PoseReading
-from ..interface import (
-    Belief,
-    MapView,
-    SlamEstimator,
-    UpdateReport,
-    advance,
-    bookmark,
-    mapped_ids,
-    marginal,
-    optional_members,
-    taking_poses,
-    view_map,
-)
+from ..interface import bookmark
 from ..map_management.map_editor import MapEditor
 from ..models.motions import UNICYCLE, Motion
 from ..models.sensors import Sensor, former_noise
@@ -70,15 +59,15 @@ class RecordedSlam:
     array([[5.067, 0.   ]])
     """
 
-    def __init__(self, slam: SlamEstimator, **noise: Any) -> None:
+    def __init__(self, slam: interface.SlamEstimator, **noise: Any) -> None:
         Drive(**noise)  # refuses what it cannot smooth
         self._slam, self._noise = slam, noise
         self._editor = MapEditor(slam)
         self._last: Event | None = None
         #: Number of steps taken.
         self.steps = 0
-        self._report: UpdateReport | None = None
-        for name, member in optional_members(slam).items():
+        self._report: interface.UpdateReport | None = None
+        for name, member in interface.optional_members(slam).items():
             setattr(self, name, member)
 
     def recorded(self) -> Drive:
@@ -107,38 +96,38 @@ class RecordedSlam:
             self._record("predict", motion, dt)
             self.steps += 1
 
-        advance(self._slam, step, record, undo_all(), self.bookmark)
+        interface.advance(self._slam, step, record, undo_all(), self.bookmark)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
-    ) -> UpdateReport:
+    ) -> interface.UpdateReport:
         """Update the filter with one scan, and record the readings that it used."""
         step = partial(self._slam.update, measurements, landmark_ids)
         then = partial(self._record_scan, measurements, landmark_ids)
-        return advance(self._slam, step, then, undo_all(), self.bookmark)
+        return interface.advance(self._slam, step, then, undo_all(), self.bookmark)
 
     def observe_pose(
         self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
-    ) -> UpdateReport:
+    ) -> interface.UpdateReport:
         """Update the filter with a reading of the pose, and record it if it is used."""
         given = PoseReading.checked(reading, matrix, covariance)
 
-        def record(report: UpdateReport) -> UpdateReport:
+        def record(report: interface.UpdateReport) -> interface.UpdateReport:
             if report.degrees_of_freedom:
                 self._record("observe_pose", *given)
             self._report = report
             self.steps += 1
             return report
 
-        step = partial(taking_poses(self._slam).observe_pose, *given)
-        return advance(self._slam, step, record, undo_all(), self.bookmark)
+        step = partial(interface.taking_poses(self._slam).observe_pose, *given)
+        return interface.advance(self._slam, step, record, undo_all(), self.bookmark)
 
     def _record_scan(
         self,
         measurements: ArrayLike,
         landmark_ids: Sequence[int] | None,
-        report: UpdateReport,
-    ) -> UpdateReport:
+        report: interface.UpdateReport,
+    ) -> interface.UpdateReport:
         decided = report.row_ids or (() if landmark_ids is None else landmark_ids)
         unused = {*report.rejected_ids, *report.skipped_ids}
         used = {
@@ -171,20 +160,20 @@ class RecordedSlam:
             for kept, gone in pairs:
                 self._record("merge", kept, gone)
 
-    def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
+    def belief(self, landmark_ids: Sequence[int] | None = None) -> interface.Belief:
         """Return the filter's belief."""
         if landmark_ids is None:
             return self._slam.belief()
-        return marginal(self._slam, landmark_ids)
+        return interface.marginal(self._slam, landmark_ids)
 
-    def map_view(self) -> MapView:
+    def map_view(self) -> interface.MapView:
         """Return pose and map of the filter, until the next step."""
-        return view_map(self._slam)
+        return interface.view_map(self._slam)
 
     @property
     def landmark_ids(self) -> tuple[int, ...]:
         """The filter's landmarks, in the order of its belief."""
-        return mapped_ids(self._slam)
+        return interface.mapped_ids(self._slam)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the filter's state, and the events until now as one object."""
@@ -214,7 +203,7 @@ class RecordedSlam:
         """Return what takes back later calls, as far as no kernel has run."""
         return undo_all(bookmark(self._slam), attributes(self))
 
-    def report(self) -> UpdateReport | None:
+    def report(self) -> interface.UpdateReport | None:
         """Return the report of the last update once more."""
         return self._report
 

@@ -11,17 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ...sim_configs.scenario_files import naming_file, unfinished
-from ..jobs import (
-    MANIFEST,
-    OwnFile,
-    files_below,
-    locked_folder,
-    measured,
-    naming,
-    own_entry,
-    own_files,
-    write_own_files,
-)
+from .. import jobs
 from ..logs.slamlog import LogError
 from .program import BadInputError
 
@@ -63,15 +53,16 @@ def output_folder(path: Path) -> Iterator[Path]:
     if folder.exists() and not folder.is_dir():
         raise BadInputError(f"--out must be a folder, got the file {path}")
     staging = folder / STAGING
-    with _made(folder), locked_folder(folder), _naming_in_place(staging, folder):
+    with _made(folder), jobs.locked_folder(folder), _naming_in_place(staging, folder):
         _publish(folder)  # what a killed command left
-        with naming(f"the folder {folder}"):
+        with jobs.naming(f"the folder {folder}"):
             staging.mkdir()
         unfinished.add(staging)
         try:
             yield staging
-            new = {measured(staging / name, name) for name in files_below(staging)}
-            write_own_files(staging, new)  # from here on the new files are complete
+            names = jobs.files_below(staging)
+            new = {jobs.measured(staging / name, name) for name in names}
+            jobs.write_own_files(staging, new)  # from here on they are complete
         except BaseException:
             shutil.rmtree(staging, ignore_errors=True)
             raise
@@ -85,7 +76,7 @@ def _made(folder: Path) -> Iterator[None]:
     """Make a folder and those above it; after an error, remove those that are empty."""
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        with naming(f"the folder {folder}"):
+        with jobs.naming(f"the folder {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
         yield
     except BaseException:
@@ -120,31 +111,32 @@ def _publish(folder: Path) -> None:
     new files do not prove to be slamgym's.
     """
     staging = folder / STAGING
-    old, new = own_files(folder), own_files(staging)
+    old, new = jobs.own_files(folder), jobs.own_files(staging)
     present = set()
-    for name in files_below(folder):
+    for name in jobs.files_below(folder):
         if name.startswith(f"{STAGING}/") and not staging.is_symlink():
             continue
-        if own_entry(folder, name, old | new) is None:
+        if jobs.own_entry(folder, name, old | new) is None:
             raise BadInputError(_in_the_way(folder, name, old | new))
         present.add(name)
-    if (staging / MANIFEST).exists():
+    if (staging / jobs.MANIFEST).exists():
         names = {entry.name for entry in new}
-        for name in names.intersection(files_below(staging)):
+        for name in names.intersection(jobs.files_below(staging)):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (staging / name).replace(folder / name)
         for name in present - names:
             _remove(folder, name)
-        (staging / MANIFEST).replace(folder / MANIFEST)
+        (staging / jobs.MANIFEST).replace(folder / jobs.MANIFEST)
     shutil.rmtree(staging, ignore_errors=True)
 
 
-def _in_the_way(folder: Path, name: str, own: set[OwnFile]) -> str:
+def _in_the_way(folder: Path, name: str, own: set[jobs.OwnFile]) -> str:
     """Describe a file that keeps a folder from being written, and the way out."""
     known = any(name == entry.name for entry in own)
     what = "was changed since" if known else "slamgym did not write there"
     kept = folder / STAGING
-    waiting = f"; the new files stay in {kept}" if (kept / MANIFEST).exists() else ""
+    complete = (kept / jobs.MANIFEST).exists()
+    waiting = f"; the new files stay in {kept}" if complete else ""
     return (
         f"{folder} holds {name}, which {what}: move it away, or choose another --out"
         f"{waiting}"
@@ -178,7 +170,7 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
     dict
         The summary with ``files``.
     """
-    complete = {**summary, "files": sorted([*files_below(folder), SUMMARY])}
+    complete = {**summary, "files": sorted([*jobs.files_below(folder), SUMMARY])}
     with naming_file(folder / SUMMARY):
         (folder / SUMMARY).write_text(as_json_text(complete), encoding="utf-8")
     return complete

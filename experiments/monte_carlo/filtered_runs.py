@@ -12,16 +12,9 @@ import numpy as np
 
 from ...arrays import Array, BoolArray
 from ...envs.robot import wall_distances
+from ...estimator import interface
 from ...estimator.filters.batch import BatchSlam, BatchTrace, can_batch
 from ...estimator.filters.ekf import EkfSlam
-from ...estimator.interface import (
-    Belief,
-    SlamEstimator,
-    SmoothedPath,
-    SupportsTruth,
-    taking_poses,
-    with_fix,
-)
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.motions import find_motion
 from ...estimator.models.sensors import Sensor, find_sensor
@@ -51,7 +44,7 @@ class FilteredRuns(NamedTuple):
     #: The belief after every step; nan from the step on at which a run failed.
     trace: BatchTrace
     #: Final beliefs; None for a run that failed.
-    beliefs: list[Belief | None]
+    beliefs: list[interface.Belief | None]
     #: By the index of the run.
     failures: Mapping[int, Failure]
     #: About readings without identity, by the index of the run.
@@ -83,7 +76,7 @@ def filter_runs(
         return _in_a_batch(cast(EkfSlam, first), settings, runs, threads)
     count, steps, _ = runs.visible.shape
     trace = _empty_trace(count, steps)
-    beliefs: list[Belief | None] = []
+    beliefs: list[interface.Belief | None] = []
     failures: dict[int, Failure] = {}
     decisions: dict[int, RunDecisions] = {}
     for run in range(count):
@@ -109,7 +102,7 @@ def _in_a_batch(
     )
     trace = _run(batch, runs)
     finite = _finite(trace)
-    beliefs: list[Belief | None] = [
+    beliefs: list[interface.Belief | None] = [
         _renamed(batch.belief(run), runs) for run in range(count)
     ]
     finite[:, -1] &= [belief is None or _is_finite_map(belief) for belief in beliefs]
@@ -151,7 +144,7 @@ def _run(batch: BatchSlam, runs: SimulatedRuns) -> BatchTrace:
     )
 
 
-def _renamed(belief: Belief, runs: SimulatedRuns) -> Belief:
+def _renamed(belief: interface.Belief, runs: SimulatedRuns) -> interface.Belief:
     """Return a belief of a batch, which names landmarks by their rows, by their ids."""
     if runs.ids is None:
         return belief
@@ -171,7 +164,7 @@ def _one_by_one(
     runs: SimulatedRuns,
     run: int,
     trace: BatchTrace,
-    beliefs: list[Belief | None],
+    beliefs: list[interface.Belief | None],
     decisions: dict[int, RunDecisions],
 ) -> Failure | None:
     """Filter one run into its row of the trace; keep final belief and decisions."""
@@ -179,7 +172,7 @@ def _one_by_one(
     try:
         slam = settings.make(runs.initial_poses[run])
         recorder = DecisionRecorder(slam)
-        observer = slam if isinstance(slam, SupportsTruth) else None
+        observer = slam if isinstance(slam, interface.SupportsTruth) else None
         landmarks = dict(enumerate(runs.landmarks[run]))
         for step in range(runs.visible.shape[1]):
             if observer is not None:
@@ -200,13 +193,13 @@ def _one_by_one(
 
 
 def _step(
-    slam: SlamEstimator,
+    slam: interface.SlamEstimator,
     runs: SimulatedRuns,
     run: int,
     step: int,
     trace: BatchTrace,
     recorder: DecisionRecorder,
-) -> Belief:
+) -> interface.Belief:
     if step > 0:  # the first scan is before any motion
         slam.predict(runs.odometry[run, step], runs.dt[step])
     seen = np.flatnonzero(runs.visible[run, step])
@@ -218,8 +211,8 @@ def _step(
         recorder.add(report, runs.true_ids[run, step, seen])
     if (given := runs.pose_reading(step)) is not None:
         z, H, R = given
-        fix = taking_poses(slam).observe_pose(z[run], H, R)
-        report = with_fix(report, fix)
+        fix = interface.taking_poses(slam).observe_pose(z[run], H, R)
+        report = interface.with_fix(report, fix)
     belief = slam.belief()
     trace.poses[run, step] = belief.pose
     trace.pose_covariances[run, step] = belief.pose_covariance
@@ -228,7 +221,9 @@ def _step(
     return belief
 
 
-def _take_smoothed(path: SmoothedPath, trace: BatchTrace, run: int) -> Belief:
+def _take_smoothed(
+    path: interface.SmoothedPath, trace: BatchTrace, run: int
+) -> interface.Belief:
     """Put the poses given the whole drive in place of the filter's; return the belief.
 
     They have no innovations, and so no NIS.
@@ -245,7 +240,7 @@ def _finite(trace: BatchTrace, where: Any = ...) -> BoolArray:
     return np.asarray(known & np.isfinite(covariances).all(axis=(-2, -1)))
 
 
-def _is_finite_map(belief: Belief) -> bool:
+def _is_finite_map(belief: interface.Belief) -> bool:
     return bool(np.isfinite(belief.mean).all() and np.isfinite(belief.covariance).all())
 
 

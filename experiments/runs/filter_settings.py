@@ -22,11 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from ...estimator import interface, registry
 from ...estimator.models.sensors import Sensor, sensor_in
-from ...estimator.support.argument_checks import (
-    covariance_bytes,
-    refuse_beyond_memory,
-    refuse_large_belief,
-)
+from ...estimator.support import argument_checks
 from ...sim_configs import Scenario
 from ...suggestions import closest
 from ..logs.ground_truth import hides_identities
@@ -498,12 +494,12 @@ def _refuse_maps(
     """Refuse runs with so many landmarks each, if belief or memory cannot hold them."""
     if isinstance(estimator, interface.SupportsBeliefLimit):
         most = estimator.belief_limit
-        refuse_large_belief(max(landmarks), most, "take fewer steps")
+        argument_checks.refuse_large_belief(max(landmarks), most, "take fewer steps")
     if isinstance(estimator, interface.SupportsMemoryEstimate):
         maps = [estimator.memory_for(count) for count in landmarks]
-        beliefs = sum(covariance_bytes(count) for count in landmarks)
+        beliefs = sum(argument_checks.covariance_bytes(count) for count in landmarks)
         need = beliefs + (sum(maps) if at_once else max(maps))
-        refuse_beyond_memory(what, need, way_out)
+        argument_checks.refuse_beyond_memory(what, need, way_out)
 
 
 _LARGEST = 2**63 - 1  # of int64

@@ -17,12 +17,7 @@ from ...evaluation import nees
 from ...evaluation.association_scores import oracle_errors, places_of
 from ...evaluation.hypothesis_tests import chi_square_quantile
 from ...evaluation.trajectory_error import PositionAccuracy, position_accuracy
-from ..logs.ground_truth import (
-    hides_identities,
-    path_accuracy,
-    true_ids_of,
-    true_poses_of,
-)
+from ..logs import ground_truth
 from ..logs.slamlog import Scan, SlamLog
 from .filter_settings import FilterSettings
 from .log_replay import Replay
@@ -75,7 +70,7 @@ def summarise(
         "landmarks": landmark_table(trace),
         "nis": nis_summary(trace),
         "nees": nees_summary(trace),
-        "ate": rmse_table(path_accuracy(log, trace.t, trace.poses)),
+        "ate": rmse_table(ground_truth.path_accuracy(log, trace.t, trace.poses)),
         "landmark_rmse": rmse_table(map_accuracy(trace)),
         "association": association_summary(replay, resolution, settings),
         "warnings": run_warnings(replay),
@@ -102,7 +97,7 @@ def association_summary(
         unknown.
     """
     log, trace = replay.log, replay.trace
-    if not hides_identities(log) or not len(log.landmarks):
+    if not ground_truth.hides_identities(log) or not len(log.landmarks):
         return None
     truth = TrueLandmarks(log.landmark_ids, log.landmarks)
     ids = trace.landmark_ids.tolist()
@@ -116,8 +111,10 @@ def _oracle_errors(
     log: SlamLog, resolution: float, settings: FilterSettings | None
 ) -> float | None:
     """Return :func:`~slamgym.evaluation.oracle_errors`; None without noise or truth."""
-    poses = true_poses_of(log, np.array([scan.t for scan in log.scans]))
-    true_ids = [ids for scan in log.scans if (ids := true_ids_of(scan)) is not None]
+    poses = ground_truth.true_poses_of(log, np.array([scan.t for scan in log.scans]))
+    true_ids = [
+        ids for scan in log.scans if (ids := ground_truth.true_ids_of(scan)) is not None
+    ]
     if settings is None or poses is None or len(true_ids) < len(log.scans):
         return None
     share = oracle_errors(
@@ -334,7 +331,8 @@ def _nis(replay: Replay) -> str:
     low, high = NIS_RANGE
     if low <= ratio <= high:
         return ""
-    return f"The {nis_suspicion(ratio, associates=hides_identities(replay.log))}"
+    associates = ground_truth.hides_identities(replay.log)
+    return f"The {nis_suspicion(ratio, associates=associates)}"
 
 
 def nis_suspicion(ratio: float, *, associates: bool) -> str:
@@ -380,7 +378,7 @@ def abandoned_landmarks(replay: Replay) -> int:
     """
     log, trace = replay.log, replay.trace
     scans = [event for event in log.events if isinstance(event, Scan)]
-    if not scans or not hides_identities(log) or "sensor" in log.header:
+    if not scans or not ground_truth.hides_identities(log) or "sensor" in log.header:
         return 0
     bearings, ranges = np.concatenate([scan.measurements for scan in scans]).T
     reach = np.quantile(ranges, 0.75)

@@ -24,15 +24,8 @@ from ...support.saved_states import with_prefix, without_prefix
 from ...support.undo import Undo, attributes, undo_all
 from ..elimination import RestFactor
 from ..multifrontal import PLACES, ROWS, Factor, SchurComplement, SubsetFactor
-from .local_information import (
-    SMALLEST_LOCAL_MAP,
-    ConditionalPose,
-    FixedLandmarks,
-    LocalInformation,
-    SparseMap,
-    link_count,
-    move,
-)
+from . import local_information
+from .local_information import link_count
 from .scan_update import ESTIMATE, ScanResult, ScanRules, Sparsity, process_scan
 from .sparse_belief import SparseBelief
 
@@ -126,7 +119,7 @@ gate_probability, noise_at_rest, min_range
             bound = argument_checks.whole("active_bound", active_bound, 2)
         kind = argument_checks.one_of("sparsify", sparsify, ("relocate", "prune"))
         self._sparsity = Sparsity(bound, kind == "prune")
-        self._largest_dense = min(bound, SMALLEST_LOCAL_MAP)
+        self._largest_dense = min(bound, local_information.SMALLEST_LOCAL_MAP)
         self._tolerance = argument_checks.at_least("tolerance", tolerance, 0.0)
         self.belief_limit = argument_checks.whole("belief_limit", belief_limit, 1)
         self.reset(initial_pose, initial_pose_std)
@@ -144,7 +137,7 @@ gate_probability, noise_at_rest, min_range
             return
         noise = self._scan_rules.motion_noise
         moved = noise.motion.moved(odometry)
-        pose = move(
+        pose = local_information.move(
             self._held.pose,
             np.array(moved),
             noise.over(moved, dt),
@@ -471,7 +464,7 @@ def checked_state(state: Mapping[str, Any], name: str, base: str) -> SparseBelie
         without_prefix(saved, part, "_")
         for part in ("matrix", "local", "around", "outer", "pose")
     )
-    map_ = SparseMap()
+    map_ = local_information.SparseMap()
     map_.information.load_state_dict(matrix)
     count = len(map_.information)
     slots, free = _slots(saved, count)
@@ -499,12 +492,12 @@ def checked_state(state: Mapping[str, Any], name: str, base: str) -> SparseBelie
         slots,
         free,
         map_,
-        LocalInformation(
+        local_information.LocalInformation(
             **local,
             eliminated=_eliminated(map_, local["slots"], around),
-            fixed=FixedLandmarks(**outer),
+            fixed=local_information.FixedLandmarks(**outer),
         ),
-        ConditionalPose(**pose),
+        local_information.ConditionalPose(**pose),
         saved["origin"],
         saved["reach"],
         saved["widened"],
@@ -537,7 +530,7 @@ def _slots(saved: Mapping[str, Any], count: int) -> tuple[dict[int, int], list[i
 
 
 def _eliminated(
-    map_: SparseMap, local: IntArray, around: dict[str, Any]
+    map_: local_information.SparseMap, local: IntArray, around: dict[str, Any]
 ) -> SchurComplement:
     """Return the saved complement; its factor is made when it is first used."""
     slots, response = around["slots"], around["response"]
@@ -547,7 +540,9 @@ def _eliminated(
     return SchurComplement(**around, factor=factor)
 
 
-def _load_order(saved: Mapping[str, Any], map_: SparseMap, local: IntArray) -> None:
+def _load_order(
+    saved: Mapping[str, Any], map_: local_information.SparseMap, local: IntArray
+) -> None:
     """Load the elimination order; insert landmarks that it does not contain."""
     matrix, nodes = map_.information, saved["nodes"]
     if (nodes >= 2**50).any():

@@ -23,14 +23,8 @@ from ...models.rigid_motion import ErrorFrame
 from ...support import argument_checks, saved_states
 from ...support.argument_checks import LandmarkIds
 from ...support.undo import Undo, attributes, undo_all
+from . import joining
 from .factor import Gaussian, retract
-from .joining import (
-    FrameInitialisation,
-    JoinedMap,
-    SubmapSummary,
-    points_seen,
-    summarise,
-)
 from .store import LostSubmapError, Submap, SubmapStore
 
 ROUGHLY_CONVERGED = 0.1  # decrement at which to stop while computing initial frames
@@ -57,16 +51,16 @@ class ClosedSubmaps:
         store: SubmapStore,
         frame: ErrorFrame,
         renamed: Mapping[int, int] | None = None,
-        summaries: Sequence[SubmapSummary] = (),
-        initialisation: FrameInitialisation | None = None,
+        summaries: Sequence[joining.SubmapSummary] = (),
+        initialisation: joining.FrameInitialisation | None = None,
     ) -> None:
         self.store, self._frame = store, frame
         self.renamed = dict(renamed or {})
         self.summaries = list(summaries)
         #: Slots of the landmarks in the submaps, including links.
         self.slots: set[int] = set().union(*(s.slots.tolist() for s in summaries))
-        self._initialisation = initialisation or FrameInitialisation()
-        self._joined: JoinedMap | None = None
+        self._initialisation = initialisation or joining.FrameInitialisation()
+        self._joined: joining.JoinedMap | None = None
         self._whole: tuple[IntArray, Gaussian] | None = None
 
     def __len__(self) -> int:
@@ -88,8 +82,8 @@ class ClosedSubmaps:
     def with_appended(self, submap: Submap) -> ClosedSubmaps:
         """Return the same submaps with one more, which is stored."""
         self.store.append(submap)
-        summaries = [*self.summaries, summarise(submap)]
-        frames = FrameInitialisation(self._initialisation.blocks)
+        summaries = [*self.summaries, joining.summarise(submap)]
+        frames = joining.FrameInitialisation(self._initialisation.blocks)
         return ClosedSubmaps(self.store, self._frame, self.renamed, summaries, frames)
 
     def checkpoint(self) -> Undo:
@@ -109,14 +103,14 @@ class ClosedSubmaps:
         earlier = {old: kept for old, new in self.renamed.items() if new == gone}
         renamed = self.renamed | earlier | {gone: kept}
         summaries = [
-            summarise(merged(self.store.load(k), renamed, self._frame))
+            joining.summarise(merged(self.store.load(k), renamed, self._frame))
             if gone in summary.slots
             else summary
             for k, summary in enumerate(self.summaries)
         ]
         return ClosedSubmaps(self.store, self._frame, renamed, summaries)
 
-    def join(self, known: Array) -> JoinedMap:
+    def join(self, known: Array) -> joining.JoinedMap:
         """Return the joined map; it is cached until a submap is appended.
 
         Parameters
@@ -126,7 +120,9 @@ class ClosedSubmaps:
         """
         if self._joined is None:
             frames = self._initialisation.frames(self.summaries, known, self._refined)
-            self._joined = JoinedMap(self.load, self.summaries, self._frame, frames)
+            self._joined = joining.JoinedMap(
+                self.load, self.summaries, self._frame, frames
+            )
         return self._joined
 
     def marginal(
@@ -168,18 +164,20 @@ class ClosedSubmaps:
         """
         if not len(slots):
             return slots, region
-        points = points_seen(self.summaries, self.join(known).frames, count)[slots]
+        points = joining.points_seen(self.summaries, self.join(known).frames, count)[
+            slots
+        ]
         chosen, region = region.chosen(points)
         return slots[chosen], region
 
     def discard_frames(self) -> None:
         """Discard the cached frames and the joined map."""
-        self._initialisation = FrameInitialisation()
+        self._initialisation = joining.FrameInitialisation()
         self._joined = self._whole = None
 
     def _refined(self, first: int, last: int, frames: Array) -> Array:
         """Return the frames of some submaps, joined with a coarse tolerance."""
-        return JoinedMap(
+        return joining.JoinedMap(
             lambda index: self.load(first + index),
             self.summaries[first:last],
             self._frame,

@@ -15,23 +15,15 @@ from typing import cast
 import numpy as np
 
 from ....arrays import Array, IntArray
+from .. import slamlog
 from ..log_lines import LogLine, read_lines, shown
-from ..slamlog import (
-    EventRecorder,
-    LogError,
-    OdometryRow,
-    Reading,
-    Scan,
-    SlamLog,
-    wrap_bearing,
-)
 
 #: Ground truth that the homework prints for the six landmarks of its log [m].
 PUBLISHED_LANDMARKS = np.array([[3, 6], [3, 12], [7, 8], [7, 14], [11, 6], [11, 12.0]])
 MATCH_DISTANCE = 1.0  # [m]
 
 
-def read_course(path: str | PathLike[str]) -> SlamLog:
+def read_course(path: str | PathLike[str]) -> slamlog.SlamLog:
     """Read a course log; readings carry the landmark ids 0, 1, … in their order.
 
     The format holds no truth. The truth comes from a ``world.dat`` in the same folder.
@@ -60,15 +52,15 @@ def read_course(path: str | PathLike[str]) -> SlamLog:
     count = len(lines[0].text.split())
     if count % 2:
         raise lines[0].error("pairs of bearing and range", f"{count} numbers")
-    recorder = EventRecorder()
+    recorder = slamlog.EventRecorder()
     for k, line in enumerate(lines):
         if k % 2:
             _take_odometry(recorder, line, (k + 1) // 2)
         else:
             _take_scan(recorder, line, k // 2, count)
     events = recorder.finish()
-    ids, landmarks, origin = _truth(path, cast(Scan, events[0]))
-    return SlamLog(
+    ids, landmarks, origin = _truth(path, cast(slamlog.Scan, events[0]))
+    return slamlog.SlamLog(
         name=Path(path).stem,
         header={"source": "course data.txt", "truth": origin},
         landmark_ids=ids,
@@ -77,14 +69,16 @@ def read_course(path: str | PathLike[str]) -> SlamLog:
     )
 
 
-def _truth(path: str | PathLike[str], first_scan: Scan) -> tuple[IntArray, Array, str]:
+def _truth(
+    path: str | PathLike[str], first_scan: slamlog.Scan
+) -> tuple[IntArray, Array, str]:
     """Return the ids, the true positions, and their source."""
     ids = np.arange(len(first_scan.measurements))
     world = world_beside(path)
     if world is not None:
         world_ids, positions = read_world(world)
         if not set(ids) <= set(world_ids):
-            raise LogError(
+            raise slamlog.LogError(
                 f"{world}: expected landmarks 0 to {ids[-1]} as {path} counts them, "
                 f"got {', '.join(map(str, world_ids))}"
             )
@@ -95,7 +89,7 @@ def _truth(path: str | PathLike[str], first_scan: Scan) -> tuple[IntArray, Array
     return ids[:0], np.empty((0, 2)), "none"
 
 
-def _is_published_world(scan: Scan) -> bool:
+def _is_published_world(scan: slamlog.Scan) -> bool:
     """Whether a scan from the origin shows each published landmark at its position."""
     if len(scan.measurements) != len(PUBLISHED_LANDMARKS):
         return False
@@ -105,26 +99,30 @@ def _is_published_world(scan: Scan) -> bool:
     return bool((apart <= MATCH_DISTANCE).all())
 
 
-def _take_odometry(recorder: EventRecorder, line: LogLine, step: int) -> None:
+def _take_odometry(recorder: slamlog.EventRecorder, line: LogLine, step: int) -> None:
     fields = line.text.split()
     line.check_count(fields, (2,), "odometry d α")
     d, alpha = map(line.to_real, fields)
-    recorder.add_row(line, OdometryRow(float(step), d, alpha, dt=1.0))
+    recorder.add_row(line, slamlog.OdometryRow(float(step), d, alpha, dt=1.0))
 
 
-def _take_scan(recorder: EventRecorder, line: LogLine, step: int, count: int) -> None:
+def _take_scan(
+    recorder: slamlog.EventRecorder, line: LogLine, step: int, count: int
+) -> None:
     fields = line.text.split()
     line.check_count(fields, (count,), f"{count // 2} pairs of bearing and range")
     pairs = np.array([line.to_real(field) for field in fields]).reshape(-1, 2)
     for k, (bearing, distance) in enumerate(pairs):
-        reading = Reading(float(step), k, wrap_bearing(float(bearing)), float(distance))
+        reading = slamlog.Reading(
+            float(step), k, slamlog.wrap_bearing(float(bearing)), float(distance)
+        )
         recorder.add_reading(line, reading)
 
 
 ROW_FORMS = {"ODOMETRY": "ODOMETRY r1 t r2", "SENSOR": "SENSOR id range bearing"}
 
 
-def read_freiburg(path: str | PathLike[str]) -> SlamLog:
+def read_freiburg(path: str | PathLike[str]) -> slamlog.SlamLog:
     """Read a Freiburg log, and its landmarks if ``world.dat`` is in the same folder.
 
     Each step becomes two turn-last rows, (0, r1) with dt = 0 and (t, r2) with dt = 1,
@@ -147,7 +145,7 @@ def read_freiburg(path: str | PathLike[str]) -> SlamLog:
     OSError
         If the file cannot be opened.
     """
-    recorder, step = EventRecorder(), 0
+    recorder, step = slamlog.EventRecorder(), 0
     for line in read_lines(path):
         kind, *fields = line.text.split()
         if kind not in ROW_FORMS:
@@ -158,15 +156,15 @@ def read_freiburg(path: str | PathLike[str]) -> SlamLog:
             before, d, after = map(line.to_real, fields)
             recorder.add_turn_drive_turn(line, step, before=before, d=d, after=after)
         else:
-            bearing = wrap_bearing(line.to_real(fields[2]))
+            bearing = slamlog.wrap_bearing(line.to_real(fields[2]))
             landmark_id, distance = line.to_id(fields[0]), line.to_real(fields[1])
             recorder.add_reading(
-                line, Reading(float(step), landmark_id, bearing, distance)
+                line, slamlog.Reading(float(step), landmark_id, bearing, distance)
             )
     world = world_beside(path)
     ids, landmarks = read_world(world) if world else (np.arange(0), np.empty((0, 2)))
     truth = world.name if world else "none"
-    return SlamLog(
+    return slamlog.SlamLog(
         name=Path(path).stem,
         header={"source": "Freiburg robot mapping course", "truth": truth},
         landmark_ids=ids,

@@ -18,16 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from ....arrays import Array
+from .. import slamlog
 from ..log_lines import LogLine, read_lines, shown
-from ..slamlog import (
-    Event,
-    EventRecorder,
-    LogError,
-    Reading,
-    SlamLog,
-    numbers,
-    wrap_bearing,
-)
 
 EDGE_TAGS = ("EDGE_SE2", "EDGE2")
 ODOMETRY_TAGS = ("ODOMETRY", *EDGE_TAGS)
@@ -187,7 +179,7 @@ def noise_header(graph: Graph, chain: Sequence[LogLine]) -> dict[str, str]:
     """
     is_toro = any(line.text.split()[0] == "VERTEX2" for line in graph.vertices)
     motion = np.array([_motion_std(line, is_toro=is_toro) for line in chain])
-    header = {"motion_std": numbers(*np.median(motion, axis=0))}
+    header = {"motion_std": slamlog.numbers(*np.median(motion, axis=0))}
     are_alike = _alike(motion)
     lines = [line for at_pose in graph.readings.values() for line in at_pose]
     if lines:
@@ -202,10 +194,10 @@ def _sensor_noise(lines: Sequence[LogLine]) -> tuple[dict[str, str], Array]:
     """Return the entries of the readings, and the deviations that they are from."""
     bearing, across, along = np.array([_reading_std(line) for line in lines]).T
     if _spread(across) < _spread(bearing):
-        sensor = {"bearing_std_metres": numbers(np.median(across))}
-        sensor["measurement_std"] = numbers(0.0, np.median(along))
+        sensor = {"bearing_std_metres": slamlog.numbers(np.median(across))}
+        sensor["measurement_std"] = slamlog.numbers(0.0, np.median(along))
         return sensor, np.column_stack([across, along])
-    stds = numbers(float(np.median(bearing)), np.median(along))
+    stds = slamlog.numbers(float(np.median(bearing)), np.median(along))
     return {"measurement_std": stds}, np.column_stack([bearing, along])
 
 
@@ -266,8 +258,8 @@ Point = tuple[float, ...]
 
 
 def with_truth(
-    log: SlamLog, steps: Mapping[int, int], path: str | PathLike[str]
-) -> SlamLog:
+    log: slamlog.SlamLog, steps: Mapping[int, int], path: str | PathLike[str]
+) -> slamlog.SlamLog:
     """Return the log with the truth of a graph file.
 
     The file holds a line ``VERTEX2`` or ``VERTEX_SE2`` for every pose, and may hold a
@@ -302,12 +294,12 @@ def with_truth(
         poses = _composed(graph)
         places = _seen_places(graph, poses)
     if len(poses) != len(steps):
-        raise LogError(
+        raise slamlog.LogError(
             f"{path}: expected the true poses of the {len(steps)} poses of the log, "
             f"got {len(poses)}"
         )
     if missing := steps.keys() - poses.keys():
-        raise LogError(
+        raise slamlog.LogError(
             f"{path}: expected the poses of the log, found no pose {min(missing)}"
         )
     table = np.array([(step, *poses[i]) for i, step in steps.items()])
@@ -368,7 +360,7 @@ def read_isam(
     *,
     truth: str | PathLike[str] | None = None,
     noise_from_file: bool = False,
-) -> SlamLog:
+) -> slamlog.SlamLog:
     """Read a graph whose odometry lines form one chain of poses.
 
     Poses and landmarks share one sequence of ids in many files: landmarks keep theirs,
@@ -421,7 +413,7 @@ def read_isam(
         header["left_out"] = "; ".join(left_out)
     if noise_from_file:
         header |= noise_header(graph, chain)
-    log = SlamLog(
+    log = slamlog.SlamLog(
         name=Path(path).stem, header=header, events=_events(graph, chain, steps)
     )
     return log if truth is None else with_truth(log, steps, truth)
@@ -429,11 +421,11 @@ def read_isam(
 
 def _events(
     graph: Graph, chain: list[LogLine], steps: dict[int, int]
-) -> tuple[Event, ...]:
+) -> tuple[slamlog.Event, ...]:
     """Follow the chain of poses, and record the readings of each pose."""
     for pose in graph.readings.keys() - steps.keys():
         raise graph.readings[pose][0].error("a pose of the odometry", f"pose {pose}")
-    recorder = EventRecorder()
+    recorder = slamlog.EventRecorder()
     for pose, step in steps.items():
         if step:
             _take_increment(recorder, chain[step - 1], step)
@@ -442,7 +434,7 @@ def _events(
     return recorder.finish()
 
 
-def _take_increment(recorder: EventRecorder, line: LogLine, step: int) -> None:
+def _take_increment(recorder: slamlog.EventRecorder, line: LogLine, step: int) -> None:
     dx, dy, turn = reals_at(line, 3, 6)
     sign = -1.0 if dx < 0 else 1.0
     direction = math.atan2(sign * dy, abs(dx))
@@ -452,9 +444,9 @@ def _take_increment(recorder: EventRecorder, line: LogLine, step: int) -> None:
     )
 
 
-def _take_reading(recorder: EventRecorder, line: LogLine, step: int) -> None:
+def _take_reading(recorder: slamlog.EventRecorder, line: LogLine, step: int) -> None:
     x, y = reals_at(line, 3, 5)
-    bearing = wrap_bearing(math.atan2(y, x))
+    bearing = slamlog.wrap_bearing(math.atan2(y, x))
     recorder.add_reading(
-        line, Reading(float(step), id_at(line, 2), bearing, math.hypot(x, y))
+        line, slamlog.Reading(float(step), id_at(line, 2), bearing, math.hypot(x, y))
     )
