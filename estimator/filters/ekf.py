@@ -50,7 +50,6 @@ from .gaussian_map import (
     GaussianMap,
     UpdateKernel,
     move_pose,
-    not_positive_definite,
     update_map,
 )
 
@@ -432,7 +431,7 @@ class EkfSlam(MapFilter):
         if status == NOT_USABLE:
             argument_checks.refuse_unusable(readings, given)
         used = self.map.parts.ledger[OUTCOME, : len(ids)] == USED
-        raise not_positive_definite(given[np.flatnonzero(used)[status]])
+        raise argument_checks.not_positive_definite(given[np.flatnonzero(used)[status]])
 
 
 class InvariantEkfSlam(EkfSlam):

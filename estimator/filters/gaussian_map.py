@@ -553,14 +553,6 @@ def workspace_for(rules: Rules, readings: int, capacity: int) -> Workspace:
     )
 
 
-def not_positive_definite(landmark_id: int) -> np.linalg.LinAlgError:
-    """Return the error of an innovation covariance that cannot be factored."""
-    return np.linalg.LinAlgError(
-        "the innovation covariance is not positive definite at the reading of "
-        f"landmark {landmark_id}: the belief or measurement_std is degenerate"
-    )
-
-
 class ScanRecord(NamedTuple):
     """What an update has left of one scan, copied."""
 

@@ -17,7 +17,6 @@ from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from ..support.undo import undone_on_error
 from .ekf import EkfSlam, reading_variances
-from .gaussian_map import not_positive_definite
 
 
 class UnscentedSlam(EkfSlam):
@@ -191,7 +190,7 @@ def _factor(S: Array, ids: list[int]) -> Array:
             np.linalg.eigvalsh(S[: 2 * k, : 2 * k])[0] for k in range(1, len(ids))
         ]
         at = next((k for k, value in enumerate(smallest) if value <= 0), len(ids) - 1)
-        raise not_positive_definite(ids[at]) from None
+        raise argument_checks.not_positive_definite(ids[at]) from None
 
 
 def _square_root(covariance: Array) -> Array:

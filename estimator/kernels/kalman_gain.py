@@ -525,11 +525,6 @@ def new_workspace(
     )
 
 
-def new_ledger(readings: int) -> IntArray:
-    """Allocate the ledger of a scan of at most so many readings."""
-    return np.zeros((LEDGER_HEIGHT, readings), dtype=np.int64)
-
-
 @njit_internal
 def second_system(rows: Array) -> Array:
     """Return the system of readings linearised again, where the rules iterate."""

@@ -90,7 +90,7 @@ def update_belief(
     readings : ndarray, shape (at least count, 2)
         Rows (β, r) [rad, m].
     ledger
-        A :func:`.kalman_gain.new_ledger` whose row SLOT holds the place of each
+        Integers (LEDGER_HEIGHT, readings), whose row SLOT holds the place of each
         reading's landmark in the map.  On return its other rows are filled, and SLOT
         holds the places of added landmarks, too.
     rows, before

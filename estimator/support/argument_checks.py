@@ -231,6 +231,14 @@ def refuse_unusable(readings: Array, ids: Sequence[int]) -> None:
             )
 
 
+def not_positive_definite(landmark_id: int) -> np.linalg.LinAlgError:
+    """Return the error of an innovation covariance that cannot be factored."""
+    return np.linalg.LinAlgError(
+        "the innovation covariance is not positive definite at the reading of "
+        f"landmark {landmark_id}: the belief or measurement_std is degenerate"
+    )
+
+
 def refuse_large_belief(landmarks: int, limit: int, instead: str) -> None:
     """Refuse a dense covariance of more landmarks than the limit, with its size."""
     if landmarks > limit:

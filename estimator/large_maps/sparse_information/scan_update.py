@@ -16,7 +16,6 @@ from scipy.linalg import lapack, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
 from ...filters import ekf
-from ...filters.gaussian_map import not_positive_definite
 from ...interface import UpdateReport
 from ...models.bearing_range import locate_landmark, predict_measurement, wrap_angle
 from ...models.motions import UNICYCLE, MotionNoise
@@ -259,7 +258,7 @@ def _is_too_near(scan: LinearScan, blocks: Array, distance: Array) -> BoolArray:
 def _factor(S: Array, ids: list[int]) -> Array:
     factor, failed = lapack.dpotrf(S, lower=1, clean=1)
     if failed:
-        raise not_positive_definite(ids[(failed - 1) // 2])
+        raise argument_checks.not_positive_definite(ids[(failed - 1) // 2])
     return np.asarray(factor)
 
 
