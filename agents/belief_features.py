@@ -74,7 +74,7 @@ def world_bounds(scenario: Scenario) -> Bounds:
     Returns
     -------
     (xmin, ymin, xmax, ymax)
-        Both sides are positive [m].
+        Width and height are positive [m].
 
     Examples
     --------

@@ -3,8 +3,8 @@
 The value of a plan, in the units of the task's reward, is what it is expected to gain:
 
 * the decrease of ½ log det of the map's covariance, per landmark;
-* for every landmark expected to be found, the same of its own uncertainty, which is
-  that of the pose it is seen from, and of the reading;
+* for every landmark that the robot is expected to find, this decrease for the
+  landmark alone: its uncertainty is then that of the pose and of the reading;
 * a bonus for every landmark that becomes known.
 
 The first and the last are means over a quarter, a half and the whole of the plan, so

@@ -82,7 +82,7 @@ def make_controller(
 def make_vector_controller(
     name: str, scenarios: Sequence[Scenario], generators: Sequence[np.random.Generator]
 ) -> VectorController:
-    """Make the controller of a name for the robots of several worlds.
+    """Return the named controller for the robots of several worlds.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ _factories: dict[str, EstimatorFactory | str] = {}  # or where to import it from
 class UnknownOptionError(ValueError, TypeError):
     """Raised for an option that an estimator does not have.
 
-    It is a `TypeError` too, as for any function that gets a keyword it does not have.
+    It is also a `TypeError`, which Python raises for an unknown keyword.
     """
 
 

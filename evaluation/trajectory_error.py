@@ -286,7 +286,7 @@ def _paired(**positions: ArrayLike) -> tuple[Array, Array]:
     first, second = arrays.values()
     if len(first) != len(second):
         raise ValueError(
-            f"{' and '.join(arrays)} must be as many positions, "
+            f"{' and '.join(arrays)} must be equally many positions, "
             f"got {len(first)} and {len(second)}"
         )
     return first, second

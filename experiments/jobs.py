@@ -411,7 +411,7 @@ def replace_own(path: Path) -> Iterator[Path]:
 
 
 def set_aside(path: Path, reason: str) -> None:
-    """Give another name to a file or folder that is in the way, and warn."""
+    """Rename a file or folder that is in the way, and warn."""
     number, aside = 1, path.with_name(f"{path.name}.aside")
     while os.path.lexists(aside):
         number += 1

@@ -460,10 +460,10 @@ def nearest_neighbours(
     match : float
         The gate: largest νᵀ S⁻¹ ν of a pair, χ² of 2 degrees of freedom.
     new : float
-        A reading farther than this from every landmark is of none of them.
+        A reading farther than this from every landmark belongs to none of them.
     ambiguity : float
-        Where the runner-up within the gate is less likely by no more than this in
-        −2 ln of the likelihood, the reading is left out.
+        If −2 ln of the likelihood of the second-best landmark within the gate is larger
+        by no more than this, the reading is left out.
 
     Returns
     -------

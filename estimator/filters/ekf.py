@@ -204,7 +204,7 @@ class MapFilter(ObservesPoses):
 
     @property
     def steps(self) -> int:
-        """Number of steps taken; it changes at once with the belief."""
+        """Number of steps taken; it changes together with the belief."""
         return self.map.steps
 
     def report(self) -> UpdateReport:

@@ -133,7 +133,7 @@ class GaussianMap:
 
     @property
     def steps(self) -> int:
-        """Number of steps taken; it changes at once with the belief."""
+        """Number of steps taken; it changes together with the belief."""
         return int(self.parts.numbers[STEPS])
 
     @property

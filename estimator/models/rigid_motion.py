@@ -43,7 +43,7 @@ def rotation(angle: float) -> Array:
 
 
 def pose_rotation(angle: float) -> Array:
-    """Return R(t) for poses (x, y, θ), shape (3, 3); the heading stays."""
+    """Return the rotation of a pose (x, y, θ), shape (3, 3), that keeps θ."""
     turn = np.eye(3)
     turn[:2, :2] = rotation(angle)
     return turn

@@ -223,7 +223,7 @@ class Sensor:
         return MeasurementPrediction(measurement, by_pose, by_landmark)
 
     def locate(self, pose: Array, readings: Array) -> LandmarkLocation:
-        """Locate landmarks by one reading (m, 2) each, from a pose (3,), in numpy."""
+        """Place each landmark by its reading, a row of (m, 2), from a pose (3,)."""
         if self.inverse is None:
             raise ValueError(f"one reading of {self.name} does not locate a landmark")
         R, z = _rotation(pose[2]), readings.T

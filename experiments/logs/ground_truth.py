@@ -62,7 +62,7 @@ def true_landmarks_of(
     landmarks : ndarray, shape (n, 2)
         Their estimated positions [m].
     identities : mapping of int to int, optional
-        The true landmark of each id that is the filter's own.
+        The true landmark of each id, if the filter has chosen the ids itself.
 
     Returns
     -------
@@ -81,7 +81,7 @@ def true_landmarks_of(
 
 
 def mutual_nearest(truth: Array, landmarks: Array) -> IntArray:
-    """Return the row of the true landmark of each mapped one, shape (n,), else -1.
+    """Return the row of each mapped landmark's true one, shape (n,), or -1.
 
     Two landmarks are paired if each is the nearest of the other.
     """

@@ -170,7 +170,9 @@ def write_slamlog(log: SlamLog, path: str | PathLike[str]) -> None:
     text = "\n".join(_rendered(log)) + "\n"
     copy = _parse(to_lines(text, str(path)), log.name)
     if (copy.name, copy.header) != (log.name, log.header):
-        raise LogError(f"{path}: name and header must be single lines without margins")
+        raise LogError(
+            f"{path}: name and header must be single lines without spaces at the ends"
+        )
     if len(copy.events) != len(log.events):
         raise LogError(f"{path}: consecutive scans must differ in t, got equal times")
     write_whole(path, text)
@@ -467,7 +469,7 @@ class Reading(NamedTuple):
 
 
 def wrap_bearing(angle: float) -> float:
-    """Wrap an angle into [-π, π); an angle inside keeps its bits.
+    """Wrap an angle into [-π, π); an angle inside is unchanged, bit for bit.
 
     Examples
     --------

@@ -167,7 +167,7 @@ def _one_by_one(
     beliefs: list[interface.Belief | None],
     decisions: dict[int, RunDecisions],
 ) -> Failure | None:
-    """Filter one run into its row of the trace; keep final belief and decisions."""
+    """Filter one run, fill its row of the trace, keep final belief and decisions."""
     step = 0
     try:
         slam = settings.make(runs.initial_poses[run])

@@ -418,7 +418,7 @@ def identity_in(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError):
         identity = None
     if not isinstance(identity, dict) or identity.get("format") != FORMAT:
-        raise ValueError(f"{file} is damaged, or not of a Monte Carlo of slamgym")
+        raise ValueError(f"{file} is damaged, or no result of slamgym monte-carlo")
     return identity
 
 

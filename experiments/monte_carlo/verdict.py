@@ -562,7 +562,7 @@ class EstimatorScores(NamedTuple):
 
     @property
     def nis_per_degree(self) -> float | None:
-        """Sum of NIS by the sum of degrees of freedom; None without readings."""
+        """Sum of NIS divided by that of degrees of freedom; None without readings."""
         freedom = self.over_time("nis_dof")
         return quotient(np.where(freedom > 0, self.over_time("nis"), 0.0), freedom)
 

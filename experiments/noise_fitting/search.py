@@ -232,8 +232,8 @@ def _refuse_most(rejected: BoolArray) -> None:
     count = int(np.count_nonzero(rejected))
     if count > 0.5 * len(rejected):
         raise np.linalg.LinAlgError(
-            f"the fit diverges: under the most likely noise {count} of {len(rejected)} "
-            "readings are beyond the gate"
+            f"the fit diverges: under the most likely noise, {count} of "
+            f"{len(rejected)} readings are beyond the gate"
         )
 
 

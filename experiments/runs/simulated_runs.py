@@ -220,7 +220,7 @@ class _Readings:
 def empty_record(
     worlds: WorldBatch, names: Sequence[str], times: int
 ) -> dict[str, AnyArray]:
-    """Return arrays (B, times, …) to record arrays (B, …) of B worlds by their names.
+    """Return arrays (B, times, …) that record named arrays (B, …) of B worlds.
 
     Arrays that the worlds do not have are left out.
     """

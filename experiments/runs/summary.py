@@ -211,7 +211,7 @@ def nees_summary(trace: RunTrace) -> dict[str, Any] | None:
 
 
 def nees_table(values: Array, frame: ErrorFrame) -> dict[str, Any] | None:
-    """Write NEES of the pose (K,), as `nees_summary` does, without the final one."""
+    """Summarise NEES of the pose (K,) as `nees_summary`, without the final step."""
     known = values[np.isfinite(values)]
     if not len(known):
         return None

@@ -269,8 +269,8 @@ def test_what_is_no_log_is_refused(tmp_path, content, message):
         ),
         ({"header": {"name": "twice"}}, "expected each key of the header once"),
         ({"header": {"note": "two\nlines"}}, "expected a row of landmark"),
-        ({"header": {"note": " margin"}}, "single lines without margins"),
-        ({"header": {"a:b": "c"}}, "single lines without margins"),
+        ({"header": {"note": " margin"}}, "single lines without spaces at the ends"),
+        ({"header": {"a:b": "c"}}, "single lines without spaces at the ends"),
         ({"motion": "arc"}, "expected turn-last, midpoint or a drive"),
     ],
 )

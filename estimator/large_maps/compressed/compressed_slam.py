@@ -299,7 +299,7 @@ class CompressedEkfSlam:
 
     @property
     def steps(self) -> int:
-        """Number of steps taken; it changes at once with the belief."""
+        """Number of steps taken; it changes together with the belief."""
         return self._map.filter.steps
 
     def report(self) -> UpdateReport:

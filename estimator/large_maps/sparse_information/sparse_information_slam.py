@@ -345,7 +345,7 @@ gate_probability, noise_at_rest, min_range
 
     @property
     def steps(self) -> int:
-        """Number of steps taken; it changes at once with the belief."""
+        """Number of steps taken; it changes together with the belief."""
         return self._held.steps
 
     def report(self) -> UpdateReport:

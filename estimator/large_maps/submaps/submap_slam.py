@@ -375,7 +375,7 @@ class SubmapSlam(SubmapQueries):
 
     @property
     def steps(self) -> int:
-        """Number of steps taken; it changes at once with the belief."""
+        """Number of steps taken; it changes together with the belief."""
         return self._active.filter.steps
 
     def report(self) -> UpdateReport | None:
