@@ -199,7 +199,7 @@ def test_unknown_headings_stay_unknown_and_spoil_no_others():
         ),
         (np.empty((0, 2)), np.empty((0, 2)), "estimate must have shape"),
         ([[1, 2]], [[1, math.nan]], "truth must be finite"),
-        ([[1, 2]], [[1, 2], [3, 4]], "as many positions, got 1 and 2"),
+        ([[1, 2]], [[1, 2], [3, 4]], "equally many positions, got 1 and 2"),
         ([["a", "b"]], [[1, 2]], "estimate must be numbers"),
     ],
 )
