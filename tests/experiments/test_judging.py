@@ -323,7 +323,11 @@ def test_poses_relative_to_the_start_are_named(tmp_path):
 
 @pytest.mark.parametrize(
     ("preset", "estimator"),
-    [("six_landmarks", "ekf"), ("six_landmarks", "invariant"), ("coarse_loop", "ekf")],
+    [
+        ("six_landmarks", "ekf"),
+        ("six_landmarks", "invariant"),
+        pytest.param("coarse_loop", "ekf", marks=pytest.mark.slow),
+    ],
 )
 def test_no_convention_is_blamed_for_what_a_filter_does(preset, estimator, tmp_path):
     job = {"episodes": RUNS, "seed": 7000, "estimator": estimator}
@@ -668,6 +672,7 @@ def test_worlds_with_ranges_and_hidden_identities_are_judged(tmp_path):
         assert (found["landmark_rmse"]["raw"] is None) == (name == "hidden")
 
 
+@pytest.mark.slow
 def test_the_command_judges_two_estimators(drives, beliefs, written, tmp_path):
     mine = written(*beliefs[1:3])
     yours = tmp_path / "yours"

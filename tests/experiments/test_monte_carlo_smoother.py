@@ -22,6 +22,7 @@ def results():
     return monte_carlo(WORLD, "invariant,smoother", RUNS, seed=70)
 
 
+@pytest.mark.slow
 def test_its_poses_are_those_of_the_whole_drive(results):
     runs = simulate_runs(WORLD, 1, 70)
     drive = Drive(
