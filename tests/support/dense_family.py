@@ -8,6 +8,7 @@ import numpy as np
 from dense_ekf import DenseEkf
 from scipy.linalg import block_diag, expm, sqrtm
 
+from slamgym.estimator.models.bearing_range import wrap_angle
 from slamgym.estimator.models.motions import predict_pose
 
 J = np.array([[0.0, -1.0], [1.0, 0.0]])
@@ -382,3 +383,40 @@ def complex_step(function, point, step=1e-30):
         np.imag(function(point + 1j * step * e)) / step for e in np.eye(len(point))
     ]
     return np.stack(columns, axis=-1)
+
+
+class DenseTwiceInvariant(DenseAdaptiveInvariant):
+    iterations = 2
+
+
+TWINS = {
+    "ekf": DenseEkf,
+    "invariant": DenseAdaptiveInvariant,
+    "invariant[iterations=1]": DenseInvariant,
+    "invariant[iterations=2]": DenseTwiceInvariant,
+    "first_estimates": DenseFirstEstimates,
+    "observability_constrained": DenseConstrained,
+    "iterated": DenseIterated,
+    "unscented": DenseUnscented,
+    "robocentric": DenseRobocentric,
+    "ideal": DenseIdeal,
+    "compressed": DenseEkf,
+    "compressed[base=invariant]": DenseAdaptiveInvariant,
+}
+"""The twins of estimators, by label."""
+
+
+def tell_truth(slam, pose, landmarks):
+    """Give the ground truth to a filter that linearises there."""
+    if hasattr(slam, "observe_truth"):
+        slam.observe_truth(pose, landmarks)
+
+
+def belief_of(twin):
+    """Return mean, the heading wrapped, and covariance."""
+    if isinstance(twin, DenseRobocentric):
+        mean, covariance = twin.belief()
+    else:
+        mean, covariance = twin.mean.copy(), getattr(twin, "covariance", twin.P)
+    mean[2] = wrap_angle(mean[2])
+    return mean, covariance
