@@ -491,7 +491,7 @@ def marginal(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
 def marginal_without_joining(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
     """Return a marginal as the filter has it without joining the parts of its map.
 
-    Of a filter that joins its map it is taken from ``local_view``, where that holds
+    For a filter that joins its map, it is taken from ``local_view``, if that holds
     these landmarks; its error is then judged in the invariant frame.
     """
     # The first test takes far less time than the second, and mostly decides.

@@ -1,6 +1,6 @@
 """Plan in the world itself: try actions, return to the state before, take the best.
 
-``env.state()`` and ``env.restore(state)`` return to the bit, and take microseconds. The
+``env.restore(state)`` returns exactly to ``env.state()``, within microseconds. The
 generator is part of the state, so these plans know the noise to come: the returns show
 what planning can reach at most. An agent that must not know it plans in its belief, as
 in ``slamgym.agents.imagine``.

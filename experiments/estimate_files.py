@@ -74,7 +74,7 @@ def read_estimates(paths: Sequence[Path]) -> dict[Any, Estimate]:
     Raises
     ------
     ValueError
-        If a file is malformed, or two are of one drive.
+        If a file is malformed, or two belong to one drive.
     """
     found: dict[Any, Estimate] = {}
     for path in paths:

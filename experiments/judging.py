@@ -81,7 +81,7 @@ def judge(
     ----------
     estimates : path, sequence of paths, or mapping from labels to them
         Files of estimates, or folders of them. A folder is an estimator, named after
-        it; files that are given by themselves are of one.
+        it; files that are given by themselves belong to one.
     drives : path, optional
         The folder of :func:`generate_trajectories` that holds the truth; by default the
         estimates, if they are such a folder with the beliefs of a filter.

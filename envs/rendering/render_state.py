@@ -58,7 +58,7 @@ class RenderState(NamedTuple):
     time: float
     #: Steps since the start of the episode.
     step: int
-    #: Which measurements are of no landmark, shape (m,); None for none of them.
+    #: Which measurements show no landmark, shape (m,); None for none of them.
     clutter: BoolArray | None = None
 
 

@@ -405,7 +405,7 @@ def _best_fit(
 
 
 def _is_vague(axes: Array, distance: float) -> bool:
-    """Return whether a place is too uncertain for its distance; axes are of one σ."""
+    """Return whether a place is too uncertain for its distance; axes are 1 σ long."""
     return not CERTAIN * np.linalg.norm(axes, axis=1).max() <= distance
 
 

@@ -179,7 +179,7 @@ class MapFilter(ObservesPoses):
         Raises
         ------
         ValueError
-            If the state lacks an entry, is of another estimator, or does not fit
+            If the state lacks an entry, belongs to another estimator, or does not fit
             together; the belief is then as before.
         """
         name = {"estimator": type(self).__name__}

@@ -89,7 +89,7 @@ def imagine(
     Raises
     ------
     TypeError
-        If the filter is of another kind.
+        If the filter has another type.
     ValueError
         If an array has a wrong shape or is not finite, there is no plan or no step, or
         a horizon is not a step of the plans or not after the one before.

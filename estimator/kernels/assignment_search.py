@@ -123,7 +123,7 @@ def search_assignments(
         Infinite and `UNPAIRED`; on return the assignments found, the cheapest first.
     spread, ceiling : float
         Assignments that cost more than the cheapest plus ``spread``, or more than
-        ``ceiling``, are of no interest, except the first one found.
+        ``ceiling``, are ignored, except the first one found.
     nodes : int
         Limit of nodes to visit once an assignment has been found.
 
@@ -403,9 +403,8 @@ def condition_on_all(
 def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
     """Find the least νᵀ S⁻¹ ν of each unpaired reading to a landmark without one.
 
-    A scan shows a landmark once: a reading beside one that is taken is of another.  A
-    landmark whose place in the scan is uncertain says little about a reading beside it,
-    which may well be of another one: only landmarks with det S ≤ `SURE` det Q count.
+    A scan shows a landmark once, so a reading near a paired landmark belongs to another
+    one.  Only landmarks whose place in the scan is certain, det S ≤ `SURE` det Q, count.
 
     Parameters
     ----------

@@ -372,7 +372,7 @@ class HypothesisSlam:
         Raises
         ------
         ValueError
-            If the state lacks an entry, or is of another estimator; all is then as
+            If the state lacks an entry, or belongs to another estimator; all is then as
             before.
         """
         name = {"estimator": type(self).__name__}

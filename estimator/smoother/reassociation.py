@@ -161,7 +161,7 @@ class _Search:
         places /= counts[:, None]
         labels = np.where(counts[labels] >= LEAST, labels, NONE)
         if (labels == NONE).all():
-            raise ValueError(f"no landmark has {LEAST} readings, got {self.drive}")
+            raise ValueError(f"no landmark has {LEAST} readings in {self.drive}")
         sides = np.maximum(np.ptp(located, axis=0), 1.0)
         self.log_area = float(np.log(sides).sum())
         starts = self.smoothed(labels, poses, places), self.begun(labels)

@@ -337,7 +337,7 @@ def _known(value: float) -> str:
 # --------------------------------------------------------------------------------------
 # The events of a log: odometry rows, and scans of simultaneous readings.
 
-#: The true id of a reading that is of no landmark.
+#: The true id of a reading that shows no landmark.
 NO_LANDMARK = -1
 
 

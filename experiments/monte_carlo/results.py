@@ -381,7 +381,7 @@ def problem_with(block: Path, digest: str) -> str:
     Raises
     ------
     ValueError
-        If it is of another job.
+        If it belongs to another job.
     """
     try:
         with zipfile.ZipFile(block) as archive:
@@ -392,7 +392,7 @@ def problem_with(block: Path, digest: str) -> str:
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         return f"is truncated or damaged ({error})"
     if job != digest:
-        raise ValueError(f"{block} is of another job than its folder: move it away")
+        raise ValueError(f"{block} belongs to another job: move it away")
     return ""
 
 

@@ -374,7 +374,7 @@ def measure_association(
 def identified(belief: Belief, identities: Mapping[int, int]) -> Belief:
     """Return a belief about true landmarks by their identity.
 
-    Of several mapped landmarks that are of one true landmark, the first counts; those
+    Of several mapped landmarks that show one true landmark, the first counts; those
     of none are left out.
     """
     chosen: dict[int, int] = {}

@@ -21,7 +21,7 @@ class SimulatedRuns(NamedTuple):
     """B runs of T = steps + 1 scans, the first before any motion, and L landmarks.
 
     A scan has M rows: one for each landmark, or for each that `ids` names; those of a
-    world that hides identities are of no landmark.
+    world that hides identities show no landmark.
     """
 
     #: (d, α) before each scan, shape (B, T, 2) [m, rad]; zeros before the first.

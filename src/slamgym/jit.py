@@ -372,7 +372,7 @@ def _private_path() -> Path:
 
 
 def _private_folder() -> Path | None:
-    """Return this user's temporary folder, if it is there and nobody else's."""
+    """Return this user's temporary folder, if it exists and no one else owns it."""
     path = _private_path()
     try:
         state = path.lstat()

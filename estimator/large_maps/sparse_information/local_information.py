@@ -45,7 +45,7 @@ class SparseMap:
             self.residual = np.append(self.residual, more)
 
     def checkpoint(self) -> Callable[[], None]:
-        """Return what takes back later changes of means, information and order."""
+        """Return a function that undoes later changes of means, information, order."""
         arrays = {k: getattr(self, k).copy() for k in ("points", "first", "residual")}
         undo_information = self.information.checkpoint()
         undo_order = self.elimination.checkpoint()

@@ -455,7 +455,7 @@ def checked_state(state: Mapping[str, Any], name: str, base: str) -> SparseBelie
     Raises
     ------
     ValueError
-        If the state is of another estimator, incomplete or inconsistent.
+        If the state belongs to another estimator, incomplete or inconsistent.
     """
     table = dict(sorted(STATE.items(), key=lambda item: item[1][0].dtype is np.float64))
     # Whole numbers are read first, because the shapes of the others follow from them.

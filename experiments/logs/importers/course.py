@@ -141,7 +141,7 @@ def read_freiburg(path: str | PathLike[str]) -> slamlog.SlamLog:
     Raises
     ------
     LogError
-        If a line is of another kind.
+        If a line has another form.
     OSError
         If the file cannot be opened.
     """

@@ -57,7 +57,7 @@ def sort_lines(lines: list[LogLine]) -> Graph:
     Raises
     ------
     LogError
-        If a line is of no known kind, or has a wrong number of fields.
+        If a line has no known tag, or has a wrong number of fields.
     """
     graph = Graph(lines)
     for line in lines:
@@ -391,7 +391,7 @@ def read_isam(
     Raises
     ------
     LogError
-        If a line is of no known kind, or the odometry is no chain, or a landmark is
+        If a line has no known tag, or the odometry is no chain, or a landmark is
         seen from a pose outside the chain, or a graph with loop closures has no
         landmarks, or the truth is of other poses, or the noise is asked for and a line
         does not specify it.
