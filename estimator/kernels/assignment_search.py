@@ -403,8 +403,8 @@ def condition_on_all(
 def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
     """Find the least νᵀ S⁻¹ ν of each unpaired reading to a landmark without one.
 
-    A scan shows a landmark once, so a reading near a paired landmark belongs to another
-    one.  Only landmarks whose place in the scan is certain, det S ≤ `SURE` det Q, count.
+    A scan shows a landmark once, so a reading near a paired landmark shows another one.
+    Only landmarks whose place in the scan is certain count: det S ≤ `SURE` det Q.
 
     Parameters
     ----------
