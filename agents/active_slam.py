@@ -57,11 +57,11 @@ class ActiveSlamEnv(LandmarkWorldEnv):
     `LandmarkWorldEnv`.
 
     ## Observation Space
-    ``Dict`` of float64 arrays within [-1, 1] and a bool mask; see
-    `ActiveSlamTask` and `belief_features`. All values derive from the belief
-    and the walls. N is the number of landmarks, row i is landmark i. Positions of
-    landmarks are in the robot's frame, ahead along the heading and aside to the left,
-    in diagonals of the floor; zeros where not mapped.
+    ``Dict`` of float64 arrays within [-1, 1] and a bool mask. All values derive from
+    the belief and the walls. A value v of a standard deviation on the log scale means
+    10^(4v - 3) m or rad. N is the number of landmarks, row i is landmark i. Positions
+    of landmarks are in the robot's frame, ahead along the heading and aside to the
+    left, in diagonals of the floor; zeros where not mapped.
 
     | key | shape | content |
     |---|---|---|

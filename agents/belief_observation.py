@@ -63,8 +63,9 @@ class BeliefObservation(
     env : Env
         A `LandmarkWorldEnv`, wrapped or not, whose observation is still its Dict.
     estimator : str, callable or object
-        The filter, see `choose_estimator`. An ``EnvSpec`` written as JSON keeps only a
-        name.
+        The filter: a registered name or "module:Class", a factory with the keywords of
+        `make_estimator`, or an estimator with settings of its own. An ``EnvSpec``
+        written as JSON keeps only a name.
     estimator_options : mapping, optional
         Further options of the filter.
     max_landmarks : int, optional
