@@ -207,7 +207,8 @@ def screen(
         ledger[COLUMN, used] = column
         system[row, READING], system[row + 1, READING] = z0, z1
         # The range as read makes σr small just where its error is negative.
-        set_noise(system, row, rules, distance if rules.noise_as_read else expected)
+        at = distance if rules.noise_as_read else expected
+        system[row, VARIANCE], system[row + 1, VARIANCE] = variances(rules, at)
         ledger[NEAR, k] = is_too_near(mean, belief.covariance, column)
         if rules.gate < np.inf:
             linearise(mean, belief.reference, rules.linearisation, system, row, column)
@@ -218,12 +219,6 @@ def screen(
                 continue
         used += 1
     return used
-
-
-@njit_internal
-def set_noise(system: Array, row: int, rules: Rules, distance: float) -> None:
-    """Fill the variances of the reading in ``row`` and the next, at that range [m]."""
-    system[row, VARIANCE], system[row + 1, VARIANCE] = variances(rules, distance)
 
 
 @njit_internal
@@ -321,7 +316,7 @@ def correct(
     if again:
         failed = relinearise(belief, size, ledger, rules, rows, used)
     else:
-        block = block_of(size, used)
+        block = BLOCK if size <= LARGE else used  # few while P fits the caches
         if used > block:
             copy_covariance(covariance, workspace.before, size)
         failed = absorb(covariance, size, rows, columns, used, block)
@@ -337,12 +332,6 @@ def correct(
         transport(covariance, rows, size)
     mirror(covariance, size)
     return -1
-
-
-@njit_internal
-def block_of(size: int, readings: int) -> int:
-    """Return how many readings to absorb at a time: few while P fits the caches."""
-    return BLOCK if size <= LARGE else max(readings, 1)
 
 
 @njit_internal
@@ -555,8 +544,8 @@ def linearise_again(
     system, prior, delta = second_system(rows), rows[MEAN_BEFORE], rows[CORRECTION]
     linearise(at, belief.reference, rules.linearisation, system, row, c)
     if rules.adaptive and not rules.noise_as_read:
-        distance = np.sqrt(squared_range(at, c))
-        set_noise(system, row, rules, max(distance, rules.min_range))
+        distance = max(np.sqrt(squared_range(at, c)), rules.min_range)
+        system[row, VARIANCE], system[row + 1, VARIANCE] = variances(rules, distance)
     dx, dy = prior[c] - prior[0], prior[c + 1] - prior[1]
     for i in range(row, row + 2):
         h = system[i, JACOBIAN : JACOBIAN + 5]
