@@ -57,13 +57,14 @@ TESTS = {
     "estimator/models/sensors": "sensors",
     "estimator/kernels/assignment_search": "joint_assignment constellations",
     "estimator/kernels/batch": "batch",
-    "estimator/kernels/drive_likelihood": "drive_likelihood",
+    "estimator/filters/drive_likelihood": "drive_likelihood",
     "estimator/kernels/imagine": "imagine association map_management",
     "estimator/kernels/kalman_gain": f"{FILTERS} imagine",
     "estimator/kernels/scan_update": (
         f"{FILTERS} association joint_assignment map_management"
     ),
     "estimator/kernels": FILTERS,
+    "estimator/filters/gaussian_map": f"{FILTERS} filter_memory map_management",
     "estimator/association/constellations": "constellations loop_closing",
     "estimator/association": f"{SCANS} joint_assignment",
     "evaluation/association_scores": "association_scores gospa",
@@ -75,12 +76,14 @@ TESTS = {
     "evaluation/noise_findings": "noise_findings diagnosis",
     "evaluation/trajectory_error": "trajectory_error",
 }
-PLAIN = ("estimator/models", "estimator/kernels", "evaluation/error_bound")
+KERNELS = ("estimator/filters/drive_likelihood.py", "estimator/filters/gaussian_map.py")
+PLAIN = ("estimator/models", "estimator/kernels", "evaluation/error_bound", *KERNELS)
 NOT_PLAIN = (  # too slow as plain Python, or Python raises where numba divides by zero
     "not (nees_and_nis or 1000_steps or order_of_readings or gate_keeps or far_beyond "
     "or a_pass_that_fails)"
 )
-ROOMS = ("estimator/models", "estimator/kernels", "estimator/association", "evaluation")
+FOLDERS = ("models", "kernels", "association")
+ROOMS = (*(f"estimator/{name}" for name in FOLDERS), *KERNELS, "evaluation")
 EXPLAINED = Path(__file__).with_name("mutants_explained.txt")
 RESULTS = ROOT / "results" / "mutants.jsonl"
 
@@ -95,7 +98,7 @@ def tests_of(file: str) -> Tests:
 def sources(wanted: list[str]) -> Iterator[str]:
     """Yield the files to change, as paths from the root."""
     for room in ROOMS:
-        for path in sorted((ROOT / room).glob("*.py")):
+        for path in sorted((ROOT / room).glob("*.py")) or [ROOT / room]:
             file = path.relative_to(ROOT).as_posix()
             if not path.name.startswith("__") and (
                 not wanted or any(w in file for w in wanted)

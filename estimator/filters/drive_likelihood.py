@@ -1,17 +1,33 @@
-"""Likelihood of a drive's readings under given noises, from a filter's innovations."""
+"""Likelihood of a drive's readings under given noises, from a filter's innovations.
+
+`drive_likelihood` filters the drive once for each noise; the kernel below it is
+`follow_drive`.
+"""
 
 from __future__ import annotations
 
+import math
 from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST, Array, IntArray
-from ..kernels import drive_likelihood as kernel
+from ...jit import jit, njit_internal
+from ..kernels import kalman_gain as gain
 from ..kernels.batch import share_out
-from ..kernels.kalman_gain import SKIPPED
+from ..kernels.kalman_gain import BeliefArrays, Rules, Workspace
+from ..kernels.scan_update import (
+    DONE,
+    as_rules,
+    linearise,
+    own_covariance,
+    update_belief,
+    variances,
+)
 from ..models.bearing_range import wrap_angle
+from ..models.rigid_motion import predict
 from ..models.sensors import only_bearing_range
 from ..support import argument_checks
 from ..support.argument_checks import aligned_zeros, usable_cores
@@ -21,17 +37,46 @@ from .gaussian_map import GaussianMap, workspace_for
 
 # NIS beyond which a reading is rejected: a share e⁻¹⁵ of them if the noise is right.
 GATE = 30.0
+LOG_TURN = math.log(2 * math.pi)
+
+# Columns of a noise, all standard deviations.
+MOTION = 0  # σx, σy, σα [m, m, rad]
+SENSOR = 3  # σβ [rad], σr [m], part of σr per metre, part of σβ in metres [m]
+NOISE_WIDTH = 7
+
+
+class DriveEvents(NamedTuple):
+    """S steps, each some motions and the scan at their end; either may be empty."""
+
+    motions: Array  # (K, 3) rows (d, α, dt) [m, rad, -]
+    first_motions: IntArray  # (S + 1,) the motions of step s begin at first_motions[s]
+    readings: Array  # (M, 2) rows (β, r) [rad, m]
+    landmarks: IntArray  # (M,) the landmark of each reading, 0 … n − 1
+    first_readings: IntArray  # (S + 1,)
+
+
+class DriveRecord(NamedTuple):
+    """What is kept of B passes; of the last four nothing where they have length 0."""
+
+    log_likelihoods: Array  # (B, S) of the readings of each step
+    nis: Array  # (B, S)
+    used: IntArray  # (B, S) readings behind the NIS
+    rejected: IntArray  # (B,)
+    poses: Array  # (B, S, 3) [m, m, rad]
+    pose_covariances: Array  # (B, S, 3, 3)
+    innovations: Array  # (B, M, 2) each by its own standard deviation, else nan
+    outcomes: IntArray  # (B, M) USED, ADDED, GATED or SKIPPED
 
 
 def drive_likelihood(
     estimator: EkfSlam,
-    events: kernel.DriveEvents,
+    events: DriveEvents,
     noises: ArrayLike,
     *,
     gate: float = GATE,
     keep_beliefs: bool = False,
     threads: int | None = None,
-) -> kernel.DriveRecord:
+) -> DriveRecord:
     """Filter a drive under several noises; return how likely its readings are [1]_.
 
     ::
@@ -74,7 +119,6 @@ def drive_likelihood(
     Examples
     --------
     >>> from slamgym.estimator import EkfSlam
-    >>> from slamgym.estimator.kernels.drive_likelihood import DriveEvents
     >>> events = DriveEvents(
     ...     motions=np.array([[2.0, 0.0, 1.0]]),
     ...     first_motions=np.array([0, 0, 1]),
@@ -95,10 +139,9 @@ def drive_likelihood(
         )
     only_bearing_range(estimator.sensor, "drive_likelihood")
     values = argument_checks.as_floats("noises", noises)
-    if values.ndim != 2 or values.shape[1] != kernel.NOISE_WIDTH:
+    if values.ndim != 2 or values.shape[1] != NOISE_WIDTH:
         raise ValueError(
-            f"noises must have shape (B, {kernel.NOISE_WIDTH}), got "
-            f"shape {values.shape}"
+            f"noises must have shape (B, {NOISE_WIDTH}), got shape {values.shape}"
         )
     check_events(events)
     record = _new_record(len(values), events, keep_beliefs)
@@ -108,7 +151,7 @@ def drive_likelihood(
     return record
 
 
-def check_events(events: kernel.DriveEvents) -> None:
+def check_events(events: DriveEvents) -> None:
     """Refuse events of a drive that the kernels cannot process.
 
     Raises
@@ -146,12 +189,10 @@ def _refuse_firsts(name: str, firsts: IntArray, rows: int) -> None:
         raise ValueError(f"{name} must rise from 0 to {rows}, got {firsts.tolist()}")
 
 
-def _new_record(
-    count: int, events: kernel.DriveEvents, keep_beliefs: bool
-) -> kernel.DriveRecord:
+def _new_record(count: int, events: DriveEvents, keep_beliefs: bool) -> DriveRecord:
     steps = len(events.first_motions) - 1
     kept, readings = (steps, len(events.readings)) if keep_beliefs else (0, 0)
-    return kernel.DriveRecord(
+    return DriveRecord(
         np.zeros((count, steps)),
         np.zeros((count, steps)),
         np.zeros((count, steps), dtype=np.int64),
@@ -159,16 +200,16 @@ def _new_record(
         np.full((count, kept, 3), np.nan),
         np.full((count, kept, 3, 3), np.nan),
         np.full((count, readings, 2), np.nan),
-        np.full((count, readings), SKIPPED, dtype=np.int64),
+        np.full((count, readings), gain.SKIPPED, dtype=np.int64),
     )
 
 
 def _follow(
     estimator: EkfSlam,
-    events: kernel.DriveEvents,
+    events: DriveEvents,
     noises: Array,
     gate: float,
-    record: kernel.DriveRecord,
+    record: DriveRecord,
     part: slice,
 ) -> None:
     """Fill a part of a record, with room of its own."""
@@ -181,7 +222,7 @@ def _follow(
     *odometry, dt = events.motions.T
     moved = estimator.motion.displacements(np.column_stack(odometry))
     events = events._replace(motions=np.column_stack([moved, dt]))
-    kernel.follow_drive(
+    follow_drive(
         tuple(events),  # numba checks the type of a named one at every call
         noises[part],
         bool(motion[3] > 0),
@@ -192,3 +233,207 @@ def _follow(
         np.empty(landmarks, dtype=np.int64),
         tuple(array[part] for array in record),
     )
+
+
+# --------------------------------------------------------------------------------------
+# The drive of every noise, compiled.
+
+
+@jit
+def follow_drive(
+    events: tuple[Any, ...],
+    noises: Array,
+    noise_at_rest: bool,
+    rule_values: Array,
+    start: tuple[Array, Array],
+    belief_arrays: tuple[Array, Array, Array],
+    workspace_arrays: tuple[Any, ...],
+    slots: IntArray,
+    record_arrays: tuple[Any, ...],
+) -> None:
+    """Filter a drive once under each of B noises, and note how likely its readings are.
+
+    Parameters
+    ----------
+    events
+        The entries of :class:`DriveEvents`.
+    noises : ndarray, shape (B, NOISE_WIDTH)
+        Standard deviations.
+    noise_at_rest : bool
+        Whether odometry of exactly (0, 0) has motion noise.
+    rule_values
+        As :func:`.scan_update.as_rules` reads them; those of the sensor's noise are
+        overwritten.
+    start
+        Mean (3,) and covariance (3, 3) of the first pose.
+    belief_arrays, workspace_arrays
+        Room: the entries of :class:`.kalman_gain.BeliefArrays` and
+        :class:`.kalman_gain.Workspace`.
+    slots : ndarray, shape (n,)
+        Room for the places of the landmarks in the map.
+    record_arrays
+        The entries of :class:`DriveRecord`, zero at first.  Where a pass fails, its log
+        likelihoods are -inf from that step on.
+    """
+    drive, record = DriveEvents(*events), DriveRecord(*record_arrays)
+    belief, workspace = BeliefArrays(*belief_arrays), Workspace(*workspace_arrays)
+    most = len(workspace.rows)
+    ledger = np.zeros((gain.LEDGER_HEIGHT, most), np.int64)
+    readings, own = np.empty((most, 2)), np.empty((most, 3))
+    variance = np.empty(3)
+    for b in range(len(noises)):
+        begin(belief, slots, start)
+        for i in range(NOISE_WIDTH - SENSOR):
+            rule_values[gain.FIRST_STD + i] = noises[b, SENSOR + i]
+        rules = as_rules(rule_values)
+        size = len(start[0])  # a literal would compile all kernels anew
+        for s in range(len(drive.first_motions) - 1):
+            for k in range(drive.first_motions[s], drive.first_motions[s + 1]):
+                dx, dy, turn = (
+                    drive.motions[k, 0],
+                    drive.motions[k, 1],
+                    drive.motions[k, 2],
+                )
+                moves = noise_at_rest or dx != 0 or dy != 0 or turn != 0
+                for i in range(3):
+                    sigma = noises[b, MOTION + i]
+                    variance[i] = sigma * sigma * drive.motions[k, 3] * moves
+                predict(
+                    belief.mean,
+                    belief.covariance,
+                    belief.reference,
+                    size,
+                    dx,
+                    dy,
+                    turn,
+                    variance,
+                    rules.linearisation,
+                )
+            first = drive.first_readings[s]
+            count = drive.first_readings[s + 1] - first
+            for k in range(count):
+                readings[k, 0] = drive.readings[first + k, 0]
+                readings[k, 1] = drive.readings[first + k, 1]
+                ledger[gain.SLOT, k] = slots[drive.landmarks[first + k]]
+            examine(belief, readings, count, ledger, rules, workspace.rows, own)
+            status, used, nis = update_belief(
+                belief.mean,
+                belief.covariance,
+                belief.reference,
+                size,
+                readings,
+                count,
+                ledger,
+                workspace.rows,
+                workspace.before,
+                rule_values,
+            )
+            if status != DONE:
+                for rest in range(s, record.log_likelihoods.shape[1]):
+                    record.log_likelihoods[b, rest] = -math.inf
+                break
+            record.nis[b, s], record.used[b, s] = nis, used
+            record.log_likelihoods[b, s] = log_density(workspace.rows, used, nis)
+            size = settle(drive, record, b, s, size, ledger, own, slots, rules.gate)
+            keep(belief, record, b, s)
+
+
+@njit_internal
+def settle(
+    drive: DriveEvents,
+    record: DriveRecord,
+    b: int,
+    s: int,
+    size: int,
+    ledger: IntArray,
+    own: Array,
+    slots: IntArray,
+    gate: float,
+) -> int:
+    """Count rejected readings as at the gate; return the size with new landmarks."""
+    first = drive.first_readings[s]
+    for k in range(drive.first_readings[s + 1] - first):
+        if ledger[gain.OUTCOME, k] == gain.ADDED:
+            slots[drive.landmarks[first + k]] = (size - 3) // 2
+            size += 2
+        elif ledger[gain.OUTCOME, k] == gain.GATED:
+            record.rejected[b] += 1
+            least = 0.5 * (gate + own[k, 2]) + LOG_TURN
+            record.log_likelihoods[b, s] -= least if math.isfinite(least) else math.inf
+        if record.innovations.shape[1] > 0:
+            record.innovations[b, first + k, 0] = own[k, 0]
+            record.innovations[b, first + k, 1] = own[k, 1]
+            record.outcomes[b, first + k] = ledger[gain.OUTCOME, k]
+    return size
+
+
+@njit_internal
+def keep(belief: BeliefArrays, record: DriveRecord, b: int, s: int) -> None:
+    """Copy the pose and its covariance to the record, where it has room."""
+    if record.poses.shape[1] > 0:
+        for i in range(3):
+            record.poses[b, s, i] = belief.mean[i]
+            for j in range(3):
+                record.pose_covariances[b, s, i, j] = belief.covariance[i, j]
+
+
+@njit_internal
+def begin(belief: BeliefArrays, slots: IntArray, start: tuple[Array, Array]) -> None:
+    """Empty the map, and put the robot at its start."""
+    mean, covariance, reference = belief
+    for i in range(len(mean)):
+        mean[i] = reference[i] = 0.0
+        for j in range(len(mean)):
+            covariance[i, j] = 0.0
+    for i in range(3):
+        mean[i] = reference[i] = start[0][i]
+        for j in range(3):
+            covariance[i, j] = start[1][i, j]
+    for i in range(len(slots)):
+        slots[i] = -1
+
+
+@njit_internal
+def log_density(rows: Array, used: int, nis: float) -> float:
+    """Return log N(ν; 0, S) of the readings of a scan that were used."""
+    half_log_det = 0.0
+    for row in range(gain.FIRST, gain.FIRST + 2 * used, 2):
+        half_log_det += math.log(rows[row, gain.ROOT] * rows[row + 1, gain.ROOT + 1])
+    return -0.5 * nis - half_log_det - used * LOG_TURN
+
+
+@njit_internal
+def examine(
+    belief: BeliefArrays,
+    readings: Array,
+    count: int,
+    ledger: IntArray,
+    rules: Rules,
+    rows: Array,
+    own: Array,
+) -> None:
+    """Note of each reading ν_β/√S_ββ, ν_r/√S_rr and log det S, by itself, as predicted.
+
+    Readings of new landmarks get nan.  The rows of the system are overwritten.
+    """
+    mean, P, system = belief.mean, belief.covariance, rows[gain.FIRST :]
+    for k in range(count):
+        own[k, 0] = own[k, 1] = own[k, 2] = math.nan
+        if ledger[gain.SLOT, k] < 0:
+            continue
+        c = 3 + 2 * ledger[gain.SLOT, k]
+        expected = math.hypot(mean[c] - mean[0], mean[c + 1] - mean[1])
+        if min(expected, readings[k, 1]) < rules.min_range:
+            continue
+        at = readings[k, 1] if rules.noise_as_read else expected
+        row, below = 2 * k, 2 * k + 1
+        system[row, gain.READING], system[below, gain.READING] = (
+            readings[k, 0],
+            readings[k, 1],
+        )
+        system[row, gain.VARIANCE], system[below, gain.VARIANCE] = variances(rules, at)
+        linearise(mean, belief.reference, rules.linearisation, system, row, c)
+        s00, s10, s11 = own_covariance(P, system, row, c)
+        own[k, 0] = system[row, gain.INNOVATION] / math.sqrt(s00)
+        own[k, 1] = system[below, gain.INNOVATION] / math.sqrt(s11)
+        own[k, 2] = math.log(s00 * s11 - s10 * s10)

@@ -16,9 +16,8 @@ from scipy.special import chdtrc
 
 from ...arrays import Array, IntArray
 from ...estimator.filters.batch import can_batch
-from ...estimator.filters.drive_likelihood import GATE
+from ...estimator.filters.drive_likelihood import GATE, DriveEvents, DriveRecord
 from ...estimator.filters.ekf import EkfSlam
-from ...estimator.kernels.drive_likelihood import DriveEvents, DriveRecord
 from ...estimator.kernels.kalman_gain import USED
 from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation.hypothesis_tests import (

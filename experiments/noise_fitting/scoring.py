@@ -21,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
+from ...estimator.filters.drive_likelihood import DriveEvents
 from ...estimator.interface import SlamEstimator
-from ...estimator.kernels.drive_likelihood import DriveEvents
 from ...estimator.map_management.hypotheses import HypothesisSlam
 from ...estimator.map_management.managed_slam import ManagedSlam
 from ...estimator.smoother import Drive, RecordedSlam

@@ -15,9 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array, BoolArray
-from ...estimator.filters.drive_likelihood import GATE, drive_likelihood
+from ...estimator.filters.drive_likelihood import (
+    GATE,
+    DriveEvents,
+    DriveRecord,
+    drive_likelihood,
+)
 from ...estimator.filters.ekf import EkfSlam
-from ...estimator.kernels.drive_likelihood import DriveEvents, DriveRecord
 from ...estimator.kernels.kalman_gain import GATED
 from ..runs.filter_settings import FilterSettings
 from . import scoring

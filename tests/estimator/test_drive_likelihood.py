@@ -5,8 +5,7 @@ import pytest
 from drives import MEASUREMENT_STD, MOTION_STD, drive
 
 from slamgym.estimator import UnscentedSlam, make_estimator
-from slamgym.estimator.filters.drive_likelihood import drive_likelihood
-from slamgym.estimator.kernels.drive_likelihood import DriveEvents
+from slamgym.estimator.filters.drive_likelihood import DriveEvents, drive_likelihood
 from slamgym.estimator.kernels.kalman_gain import ADDED, GATED, SKIPPED
 
 NOISE = np.array([*MOTION_STD, *MEASUREMENT_STD, 0.01, 0.02])
