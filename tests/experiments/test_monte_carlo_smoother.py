@@ -16,13 +16,14 @@ from slamgym.sim_configs import load_scenario
 RUNS = 24
 WORLD = load_scenario("six_landmarks")
 
+pytestmark = pytest.mark.slow  # two processes smooth
+
 
 @pytest.fixture(scope="module")
 def results():
     return monte_carlo(WORLD, "invariant,smoother", RUNS, seed=70)
 
 
-@pytest.mark.slow
 def test_its_poses_are_those_of_the_whole_drive(results):
     runs = simulate_runs(WORLD, 1, 70)
     drive = Drive(
@@ -79,7 +80,6 @@ def test_it_takes_a_robust_kernel_and_refuses_what_is_none():
         monte_carlo(WORLD, "smoother[robust=tukey]", 2)
 
 
-@pytest.mark.slow
 def test_worlds_that_hide_identities_are_smoothed_with_the_associations_decided():
     world = load_scenario("hidden_identities")
     world = world.model_copy(update={"steps": 60})
