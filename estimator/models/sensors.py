@@ -245,6 +245,15 @@ class Sensor:
             apart[..., 1] = 0.0
         return apart
 
+    def distances(self, readings: Array) -> Array:
+        """Return the distances of landmarks by their readings (m, 2), or infinity."""
+        if self.inverse is None:
+            return np.full(len(readings), np.inf)
+        if self == BEARING_RANGE:
+            return readings[:, 1]
+        x, y = self.inverse(readings[:, 0], readings[:, 1])
+        return np.asarray(np.hypot(x, y))
+
     def slopes(self, x: Array, y: Array) -> Array:
         """Return D of landmarks at (x, y) in the robot's frame, shape (m, 2, 2)."""
         columns = np.broadcast_arrays(x, *self.h(x, y)[1])[1:]

@@ -17,11 +17,21 @@ from ...arrays import Array, IntArray
 from ..interface import Belief, SlamEstimator, SupportsSmoothing
 from ..map_management.hypotheses import HypothesisSlam
 from ..models.bearing_range import locate_landmark, wrap_angle
+from ..models.sensors import BEARING_RANGE, Sensor
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
-from .drive import Drive, path_between
+from .drive import Drive, Sightings, path_between
 from .elimination import conditionals
-from .optimiser import KINDS, Estimate, Noise, Optimiser, Solution, factorised, start_of
+from .optimiser import (
+    KINDS,
+    Estimate,
+    Noise,
+    Optimiser,
+    Solution,
+    factorised,
+    filter_drive,
+    start_of,
+)
 from .reassociation import Reassociation, reassociate
 
 ITERATIONS = 5  # of an update of the filter that gives the second start
@@ -102,10 +112,12 @@ def smooth(
             tolerance=tolerance,
             iterations=iterations,
         )
-    noise = Noise(drive.rules, *robust_kernel(robust, robust_scale))
+    kernel, given = robust_kernel(robust, robust_scale), landmarks
+    if not drive.sensor.places:
+        drive, start, given = _placed(drive, start, landmarks or {})
     arrays, order = drive.arrays()
-    optimiser = Optimiser(arrays, noise)
-    starts = _starts(drive, start, _places(landmarks or {}, order), order)
+    optimiser = Optimiser(arrays, Noise(drive.sensor, drive.rules, *kernel))
+    starts = _starts(drive, start, _places(given or {}, order), order)
     found = _best(optimiser, starts, tolerance, iterations)
     return SmoothedDrive(optimiser, found, order.tolist(), drive)
 
@@ -127,6 +139,26 @@ def robust_kernel(robust: str | None, scale: float | None) -> tuple[float, float
         argument_checks.one_of("robust", robust, tuple(SCALES))
     chosen = SCALES.get(robust or "", 1.0) if scale is None else scale
     return KINDS[robust], argument_checks.above("robust_scale", chosen, 0.0)
+
+
+def _placed(
+    drive: Drive, start: ArrayLike | Belief | None, given: Mapping[int, ArrayLike]
+) -> tuple[Drive, ArrayLike | Belief, dict[int, ArrayLike]]:
+    """Return a drive without landmarks that a filter cannot place, and the others.
+
+    For a sensor whose single reading does not determine a landmark.
+    """
+    found = start
+    if not isinstance(found, Belief):
+        _, found = filter_drive(drive, iterations=ITERATIONS)
+    pairs = zip(found.landmark_ids, found.landmarks, strict=True)
+    read = set(drive.landmark_ids)
+    known = {i: place for i, place in pairs if i in read} | dict(given)
+    kept = [
+        Sightings(z, np.where(np.isin(ids, list(known)), ids, -1))
+        for z, ids in drive.scans
+    ]
+    return drive.with_scans(kept), found if start is None else start, known
 
 
 def _best(
@@ -200,10 +232,15 @@ def _landmarks_at(
     if len(places) < len(order):
         for k in range(drive.poses):
             readings, ids = drive.sightings(k)
-            located = locate_landmark(poses[k], readings).position
+            located = _located(drive.sensor, poses[k], readings)
             for i, place in zip(ids.tolist(), located, strict=True):
                 places.setdefault(i, place)
     return np.concatenate([places[i] for i in order.tolist()])
+
+
+def _located(sensor: Sensor, pose: Array, readings: Array) -> Array:
+    locate = locate_landmark if sensor == BEARING_RANGE else sensor.locate
+    return locate(pose, readings).position
 
 
 class _Marginals(NamedTuple):
@@ -261,6 +298,7 @@ class SmoothedDrive:
         self._motions, self._noise = tuple(drive.motions), drive.motion_noise
         #: Number of readings of landmarks.
         self.readings = drive.readings
+        self._numbers = drive.sensor.size * drive.readings
         #: Number of components of readings of the poses themselves.
         self.pose_components = drive.pose_components
         self._slots = {i: slot for slot, i in enumerate(order)}
@@ -295,7 +333,7 @@ class SmoothedDrive:
 
         It is about 1 if the noise is as assumed, and the kernel not robust.
         """
-        freedom = 2 * self.readings - 2 * len(self.landmarks) + self.pose_components
+        freedom = self._numbers - 2 * len(self.landmarks) + self.pose_components
         return 2 * self.cost / freedom if freedom else float("nan")
 
     @property

@@ -21,7 +21,7 @@ from ..models.bearing_range import wrap_angle
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.motions import Motion as DriveMotion
 from ..models.rigid_motion import pose_rotation, predict
-from ..models.sensors import Sensor, former_noise, only_bearing_range
+from ..models.sensors import Sensor, find_sensor, former_noise
 from ..support import argument_checks
 
 
@@ -94,7 +94,7 @@ class Drive:
         motion: str | DriveMotion = UNICYCLE,
     ) -> None:
         self.motion_noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
-        self.sensor = only_bearing_range(sensor, "the smoother")
+        self.sensor = find_sensor(sensor)
         self.rules = rules = checked_rules(
             measurement_std,
             sensor=self.sensor,
@@ -164,7 +164,7 @@ class Drive:
         Parameters
         ----------
         measurements : array_like, shape (m, 2)
-            Rows (β, r) [rad, m].
+            Rows (β, r) [rad, m], or those of the sensor.
         landmark_ids : sequence of int, length m
             Identity of the landmark behind each row, without repetition.
 
@@ -173,11 +173,11 @@ class Drive:
         ValueError
             If the arguments are malformed; the drive is then as before.
         """
-        readings = argument_checks.scan(measurements)
+        readings = argument_checks.scan(measurements, self.sensor.columns)
         ids = argument_checks.identities(landmark_ids, len(readings))
         argument_checks.refuse_unusable(readings, ids)
         self.end_motion()
-        usable = readings[:, 1] >= self.rules.min_range
+        usable = self.sensor.distances(readings) >= self.rules.min_range
         chosen = np.array(ids, dtype=np.int64)[usable]
         self._sightings[-1].append(Sightings(readings[usable], chosen))
 

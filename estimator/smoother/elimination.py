@@ -35,8 +35,10 @@ from ...arrays import Array
 from ...jit import jit, njit_internal
 from ..kernels.scan_update import as_rules, variances
 from ..models.bearing_range import (
+    difference_jit,
     expected_reading_jit,
-    reading_slopes_jit,
+    pose_slopes_jit,
+    read_distance_jit,
     wrap_angle_jit,
 )
 from ..models.rigid_motion import composed_jit
@@ -91,7 +93,7 @@ def eliminate(
     Parameters
     ----------
     stds : ndarray, shape (M, 2)
-        (σβ, σr) of each reading.
+        Those of each reading.
     robust
         Kind and scale of the robust kernel.
     damping : float
@@ -143,17 +145,20 @@ def _absorb(
     """Add reading j of pose k: Hᵀ Q⁻¹ H and Hᵀ Q⁻¹ ν, weighted by a robust kernel."""
     k, j = where
     curvature, slope, coupling = system
-    bearing_std, range_std, c = stds[j, 0], stds[j, 1], drive.columns[j]
-    to_bearing, to_range = innovation(poses, landmarks, drive, k, j)
+    std, std_below, c = stds[j, 0], stds[j, 1], drive.columns[j]
+    nu, nu_below = innovation(poses, landmarks, drive, k, j)
     dx, dy = landmarks[c] - poses[k, 0], landmarks[c + 1] - poses[k, 1]
-    bx, by, rx, ry = reading_slopes_jit(dx, dy)
-    squared = (to_bearing / bearing_std) ** 2 + (to_range / range_std) ** 2
+    ax, ay, bx, by, a_turn, b_turn = pose_slopes_jit(dx, dy, poses[k, 2])
+    squared = (nu / std) ** 2 + (nu_below / std_below) ** 2
     weight = robust_weight(squared, robust[0], robust[1])
-    b, r = weight / bearing_std**2, weight / range_std**2
-    xx, yy = b * bx * bx + r * rx * rx, b * by * by + r * ry * ry
-    xy = b * bx * by + r * rx * ry
-    ux = b * bx * to_bearing + r * rx * to_range
-    uy = b * by * to_bearing + r * ry * to_range
+    a, b = weight / std**2, weight / std_below**2
+    xx, yy = a * ax * ax + b * bx * bx, a * ay * ay + b * by * by
+    xy = a * ax * ay + b * bx * by
+    ux, uy = a * ax * nu + b * bx * nu_below, a * ay * nu + b * by * nu_below
+    x_turn, y_turn = (
+        a * ax * a_turn + b * bx * b_turn,
+        a * ay * a_turn + b * by * b_turn,
+    )
     block, right = out.blocks[c // 2], out.right
     block[0, 0] += xx
     block[0, 1] += xy
@@ -165,19 +170,19 @@ def _absorb(
     curvature[0, 1] += xy
     curvature[1, 0] += xy
     curvature[1, 1] += yy
-    for i, value in ((0, b * bx), (1, b * by)):
-        curvature[i, 2] += value
-        curvature[2, i] += value
-    curvature[2, 2] += b
+    for i, value in ((0, x_turn), (1, y_turn)):
+        curvature[i, 2] -= value
+        curvature[2, i] -= value
+    curvature[2, 2] += a * a_turn * a_turn + b * b_turn * b_turn
     slope[0] -= ux
     slope[1] -= uy
-    slope[2] -= b * to_bearing
+    slope[2] += a * a_turn * nu + b * b_turn * nu_below
     coupling[0, c] -= xx
     coupling[0, c + 1] -= xy
     coupling[1, c] -= xy
     coupling[1, c + 1] -= yy
-    coupling[2, c] -= b * bx
-    coupling[2, c + 1] -= b * by
+    coupling[2, c] += x_turn
+    coupling[2, c + 1] += y_turn
 
 
 @njit_internal
@@ -433,7 +438,7 @@ def robust_weight(squared: float, kind: float, scale: float) -> float:
 def reading_stds(
     poses: Array, landmarks: Array, drive: DriveArrays, rule_values: Array
 ) -> Array:
-    """Return (σβ, σr) of each reading, (M, 2), at the range that it should have."""
+    """Return σ of each reading, (M, 2), at the range that it should have."""
     rules = as_rules(rule_values)
     stds = np.empty((len(drive.readings), 2))
     for k in range(len(poses)):
@@ -442,7 +447,7 @@ def reading_stds(
             dx, dy = landmarks[c] - poses[k, 0], landmarks[c + 1] - poses[k, 1]
             distance = np.sqrt(dx * dx + dy * dy)
             if rules.noise_as_read:
-                distance = drive.readings[j, 1]
+                distance = read_distance_jit(drive.readings[j, 0], drive.readings[j, 1])
             distance = max(distance, rules.min_range)
             variance, below = variances(rules, distance)
             stds[j, 0], stds[j, 1] = np.sqrt(variance), np.sqrt(below)
@@ -477,9 +482,8 @@ def innovation(
     """Return ν = z − h of reading j, taken at pose k."""
     c = drive.columns[j]
     dx, dy = landmarks[c] - poses[k, 0], landmarks[c + 1] - poses[k, 1]
-    bearing, distance = expected_reading_jit(dx, dy, poses[k, 2])
-    z = drive.readings[j]
-    return wrap_angle_jit(z[0] - bearing), z[1] - distance
+    z, expected = drive.readings[j], expected_reading_jit(dx, dy, poses[k, 2])
+    return difference_jit(z[0], z[1], expected[0], expected[1])
 
 
 @njit_internal
@@ -509,7 +513,7 @@ def total_cost(
     kind: float,
     scale: float,
 ) -> float:
-    """Return the cost of poses (N, 3) and landmarks (2n,); stds (M, 2) are (σβ, σr)."""
+    """Return the cost of poses (N, 3) and landmarks (2n,), stds (M, 2) of readings."""
     total = 0.0
     for k in range(len(poses)):
         dx, dy, turn, cos, sin = motion_residual(poses, drive, k)

@@ -18,11 +18,13 @@ from ..interface import Belief
 from ..kernels.kalman_gain import Rules
 from ..kernels.scan_update import as_rules, variances
 from ..models.bearing_range import (
+    difference_jit,
     expected_reading_jit,
-    located_jit,
+    placed_jit,
+    read_distance_jit,
     wrap_angle,
-    wrap_angle_jit,
 )
+from ..models.sensors import Sensor, for_sensor
 from ..support.argument_checks import refuse_beyond_memory
 from . import elimination
 from .drive import Drive, DriveArrays
@@ -44,6 +46,7 @@ FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e10
 class Noise(NamedTuple):
     """The noise of the sensor, and how much an outlier counts."""
 
+    sensor: Sensor
     rules: Rules  # of a filter, which hold the noise
     kind: float  # of the robust kernel, one of `KINDS`
     scale: float  # of the robust kernel, in standard deviations
@@ -106,7 +109,7 @@ class Optimiser:
     """
 
     def __init__(self, drive: DriveArrays, noise: Noise) -> None:
-        self._drive = drive
+        self._drive, self._sensor = drive, noise.sensor
         poses, landmarks = len(drive.increments), int(drive.widths[0]) // 2
         refuse_beyond_memory(
             f"smoothing {poses} poses among {landmarks} landmarks",
@@ -126,11 +129,11 @@ class Optimiser:
     def plausible_cost(self) -> float:
         """Largest cost that is plausible for a correct solution.
 
-        Twice the cost of the correct solution is about χ², with two degrees of freedom
-        for each reading less two for each landmark, and one for each component of a
+        Twice the cost of the correct solution is about χ², with a degree of freedom
+        for each number read less two for each landmark, and one for each component of a
         reading of a pose.
         """
-        freedom = 2 * len(self._drive.readings) - len(self._room.right)
+        freedom = self._sensor.size * len(self._drive.readings) - len(self._room.right)
         freedom += int(self._drive.fixes.whiteners.any(axis=2).sum())
         return 0.6 * freedom + 6 * float(np.sqrt(freedom / 2)) + 1
 
@@ -188,16 +191,20 @@ class Optimiser:
 
     def reading_stds(self, estimate: Estimate) -> Array:
         """Return (σβ, σr) of each reading, shape (M, 2), at its expected range."""
-        return elimination.reading_stds(*estimate, self._drive, self._rule_values)
+        deviations = for_sensor(elimination.reading_stds, self._sensor)
+        stds: Array = deviations(*estimate, self._drive, self._rule_values)
+        return stds
 
     def cost(self, estimate: Estimate, stds: Array) -> float:
         """Return the cost, with the noise of every reading given."""
-        return elimination.total_cost(*estimate, self._drive, stds, *self._robust)
+        total = for_sensor(elimination.total_cost, self._sensor)
+        return float(total(*estimate, self._drive, stds, *self._robust))
 
     def linearise(self, estimate: Estimate, stds: Array, damping: float = 0.0) -> Array:
         """Eliminate the poses; return the information of the landmarks, (2n, 2n)."""
         room, drive = self._room, self._drive
-        elimination.eliminate(*estimate, drive, stds, self._robust, damping, room)
+        eliminate = for_sensor(elimination.eliminate, self._sensor)
+        eliminate(*estimate, drive, stds, self._robust, damping, room)
         rows = room.rows.reshape(-1, len(room.right))
         information = -(rows.T @ rows)
         n = len(room.blocks)
@@ -219,7 +226,9 @@ class Optimiser:
 
     def _relocate(self, state: _State) -> int:
         """Move landmarks out of local minima, in place; return how many."""
-        moved = relocate(
+        if not self._sensor.places:
+            return 0
+        moved: int = for_sensor(relocate, self._sensor)(
             *state.estimate,
             self._drive,
             self._by_landmark,
@@ -331,9 +340,8 @@ def relocate(
         for i in range(0, len(own), max(len(own) // CANDIDATES, 1)):
             j = own[i]
             pose, z = poses[owners[j]], drive.readings[j]
-            place[0], place[1], _, _ = located_jit(
-                pose[0], pose[1], pose[2], z[0], z[1]
-            )
+            found = placed_jit((pose[0], pose[1], pose[2]), z[0], z[1], 0.0, 0.0)
+            place[0], place[1] = found[0], found[1]
             cost = _cost_at(place, own, poses, drive, owners, rules, robust)
             if cost < least:
                 least = cost
@@ -356,13 +364,10 @@ def _cost_at(
     total = 0.0
     for j in own:
         pose, z = poses[owners[j]], drive.readings[j]
-        bearing, distance = expected_reading_jit(
-            place[0] - pose[0], place[1] - pose[1], pose[2]
-        )
-        to_bearing = wrap_angle_jit(z[0] - bearing)
-        bearing_variance, range_variance = variances(rules, z[1])
-        squared = to_bearing**2 / bearing_variance
-        squared += (z[1] - distance) ** 2 / range_variance
+        h = expected_reading_jit(place[0] - pose[0], place[1] - pose[1], pose[2])
+        nu, nu_below = difference_jit(z[0], z[1], h[0], h[1])
+        variance, below = variances(rules, read_distance_jit(z[0], z[1]))
+        squared = nu**2 / variance + nu_below**2 / below
         total += elimination.robust_loss(squared, robust[0], robust[1])
     return total
 

@@ -39,6 +39,7 @@ from ..association.constellations import TwoPlaces, largest_clique, tables
 from ..kernels.assignment_search import compare_pairs
 from ..kernels.scan_update import as_rules, variances
 from ..models.bearing_range import wrap_angle, wrap_angle_jit
+from ..models.sensors import only_bearing_range
 from .drive import Drive, DriveArrays, Sightings, landmark_order
 from .optimiser import Estimate, Noise, Optimiser, start_of
 
@@ -113,6 +114,7 @@ def reassociate(
     >>> np.concatenate(reassociate(drive).ids).tolist()
     [0, 0, 0, 0, 0, 0, 0, 0]
     """
+    only_bearing_range(drive.sensor, "the repair of an association")
     search = _Search(drive)
     poses = start_of(drive)[0] if start is None else np.asarray(start, dtype=float)
     first = search.first(poses)
@@ -140,7 +142,7 @@ class _Search:
 
     def __init__(self, drive: Drive) -> None:
         self.drive, (self.data, self.order) = drive, drive.arrays()
-        self.noise = Noise(drive.rules, 0.0, 1.0)
+        self.noise = Noise(drive.sensor, drive.rules, 0.0, 1.0)
         counts = np.diff(self.data.firsts)
         self.count = len(counts)
         self.owners = np.repeat(np.arange(self.count), counts)

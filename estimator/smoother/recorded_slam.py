@@ -60,7 +60,8 @@ class RecordedSlam:
     """
 
     def __init__(self, slam: interface.SlamEstimator, **noise: Any) -> None:
-        Drive(**noise)  # refuses what it cannot smooth
+        # It refuses what it cannot smooth.
+        self._columns = Drive(**noise).sensor.columns
         self._slam, self._noise = slam, noise
         self._editor = MapEditor(slam)
         self._last: Event | None = None
@@ -133,7 +134,7 @@ class RecordedSlam:
         used = {
             row: i for row, i in enumerate(decided) if i is not None and i not in unused
         }
-        readings = np.asarray(measurements, dtype=np.float64).reshape(-1, 2)
+        readings = argument_checks.scan(measurements, self._columns)
         self._record("update", readings[list(used)], list(used.values()))
         for kept, gone in report.merged_ids:
             self._record("merge", kept, gone)

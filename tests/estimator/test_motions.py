@@ -235,11 +235,6 @@ def test_plans_of_another_drive_are_refused():
         imagine(slam, [np.zeros((2, 2))], load_scenario("loop").sensor)
 
 
-def test_the_smoother_refuses_another_sensor():
-    with pytest.raises(ValueError, match="the smoother accepts only sensor"):
-        SmoothingSlam(**NOISE, sensor="position")
-
-
 @pytest.mark.parametrize("path", ["nowhere:CAR", "slamgym.sim_configs:CAR", "torn:CAR"])
 def test_a_drive_that_cannot_be_imported_is_named(path, tmp_path, monkeypatch):
     (tmp_path / "torn.py").write_text("CAR = 1 / 0")

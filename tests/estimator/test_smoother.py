@@ -1,5 +1,7 @@
 """The batch smoother against dense least squares, RTS, GTSAM, and its own promises."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from dense_smoother import DenseSmoother
@@ -8,8 +10,14 @@ from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
 from slamgym.estimator import make_estimator
 from slamgym.estimator.map_management import ManagedSlam
 from slamgym.estimator.models.bearing_range import wrap_angle
-from slamgym.estimator.models.sensors import BEARING_RANGE
-from slamgym.estimator.smoother import Drive, SmoothingSlam, smooth
+from slamgym.estimator.models.sensors import (
+    BEARING,
+    BEARING_RANGE,
+    POSITION,
+    SENSORS,
+    from_bearing_range,
+)
+from slamgym.estimator.smoother import Drive, SmoothingSlam, reassociate, smooth
 from slamgym.estimator.smoother.optimiser import start_of
 
 START_STD = (0.1, 0.2, 0.05)
@@ -54,6 +62,44 @@ def test_poses_and_landmarks_are_those_of_dense_least_squares(example):
     rng = np.random.default_rng(0)
     found, _ = twin.solve(state + 0.01 * rng.standard_normal(len(state)))
     assert found == pytest.approx(state, abs=1e-7)  # differences are good to that
+
+
+@pytest.mark.parametrize(
+    ("sensor", "std"),
+    [
+        (replace(BEARING_RANGE, name="copy"), MEASUREMENT_STD),
+        (POSITION, (0.1, 0.2)),
+        (BEARING, (0.03,)),
+        (SENSORS["range"], (0.1,)),
+    ],
+    ids=lambda value: getattr(value, "name", None),
+)
+def test_other_sensors_are_smoothed_as_by_dense_least_squares(sensor, std):
+    noise = {"measurement_std": std, "sensor": sensor}
+    slam = SmoothingSlam(MOTION_STD, initial_pose_std=START_STD, **noise)
+    slam.update(np.empty((0, 2)), [])
+    moves, scans = [], [(np.empty((0, 2)), [])]
+    for odometry, readings, _ in drive(3, 30):
+        seen = np.arange(len(readings))
+        moves.append(odometry)
+        scans.append((sensor.read(*from_bearing_range(*readings.T)), seen))
+        slam.predict(odometry)
+        slam.update(scans[-1][0][:, : sensor.size], seen)
+    made = slam.smoothed()
+    known = set(made.landmark_ids)
+    assert len(known) >= 3
+    scans = [(z[[i in known for i in ids]], [i for i in ids if i in known])
+             for z, ids in scans]  # fmt: skip
+    twin, state, order = dense_twin(made, moves, scans, **noise)
+    assert made.cost == pytest.approx((twin.residual(state) ** 2).sum() / 2)
+    found, expected = twin.solve(state + 1e-4, iterations=6)
+    assert found == pytest.approx(state, abs=1e-6)
+    joint = made.covariance(range(len(made.poses)), order)
+    assert joint == pytest.approx(expected, rel=1e-4, abs=1e-7)
+    freedom = sensor.size * made.readings - 2 * len(made.landmarks)
+    assert made.cost_per_degree == pytest.approx(2 * made.cost / freedom)
+    with pytest.raises(ValueError, match="an association accepts only sensor"):
+        reassociate(slam.recorded())
 
 
 def test_readings_of_poses_are_those_of_dense_least_squares():

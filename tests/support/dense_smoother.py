@@ -14,9 +14,17 @@ class DenseSmoother:
     """
 
     def __init__(
-        self, moves, scans, motion_std, measurement_std, start_std, bearing_std_metres=0
+        self,
+        moves,
+        scans,
+        motion_std,
+        measurement_std,
+        start_std,
+        *,
+        bearing_std_metres=0,
+        sensor=None,
     ):
-        self.moves, self.scans = moves, scans
+        self.moves, self.scans, self.sensor = moves, scans, sensor
         self.motion_std, self.measurement_std = motion_std, measurement_std
         self.bearing_std_metres = bearing_std_metres
         self.start_std = np.asarray(start_std, dtype=float)
@@ -33,6 +41,12 @@ class DenseSmoother:
             slip[2] = wrap_angle(slip[2])
             parts.append(motion.jacobian_noise.T @ slip / self.motion_std)
         for pose, (readings, seen) in zip(poses, self.scans, strict=True):
+            if self.sensor is not None:
+                expected = self.sensor.predict(pose, landmarks[seen]).measurement
+                apart = self.sensor.difference(readings, expected)
+                of_numbers = np.arange(self.sensor.size)
+                parts.append((apart[:, of_numbers] / self.measurement_std).ravel())
+                continue
             expected = predict_measurement(pose, landmarks[seen]).measurement
             innovation = np.asarray(readings).reshape(-1, 2) - expected
             innovation[:, 0] = wrap_angle(innovation[:, 0])
