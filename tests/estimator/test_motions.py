@@ -1,4 +1,5 @@
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -129,7 +130,6 @@ def test_a_drive_passes_its_check_and_is_found_by_its_name(motion):
 @pytest.mark.parametrize(
     ("displacement", "mistake"),
     [
-        (lambda a, b: (a + 0.1, 0 * a, b), "must be zero"),
         (lambda a, b: (a, 0 * a, np.divide(b, 1.0 * (a == 0))), "finite"),
         (lambda a, b: (a, 0 * a, np.sum(b)), "arrays"),
         (lambda a, b: (a, 0 * a, np.sign(b)), "smooth"),
@@ -139,6 +139,24 @@ def test_the_check_names_the_mistake(displacement, mistake):
     wrong = Motion("wrong", ("a", "b"), ("m", "m"), displacement)
     with np.errstate(all="ignore"), pytest.raises(ValueError, match=mistake):
         check_motion(wrong)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"columns": ("a",)}, "columns of motion 'unicycle' must name the two numbers"),
+        ({"units": ("m", "m", "rad")}, "units of motion 'unicycle' must name the two"),
+        ({"displacement": 3}, "displacement of motion 'unicycle' must be a function"),
+        ({"displacement": lambda a, b: (a, b)}, "must return"),
+        ({"displacement": lambda a: (a, a, a)}, "must return"),
+        ({"displacement": lambda a, b: a}, "must return"),
+        ({"displacement": lambda a, b: (a + 0.1, 0, b)}, r"and zeros .* got \[0.1, 0"),
+        ({"displacement": lambda a, b: (np.nan, a, b)}, r"and zeros .* got \[nan"),
+    ],
+)
+def test_a_motion_whose_parts_do_not_fit_is_refused_when_built(change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(motions.UNICYCLE, **change)
 
 
 @pytest.mark.parametrize(
