@@ -66,7 +66,7 @@ def test_kernels_that_are_loaded_import_no_compiler():
     code = """
 import sys
 from slamgym import EkfSlam
-from slamgym.estimator.kernels.filter_memory import move_pose
+from slamgym.estimator.filters.gaussian_map import move_pose
 EkfSlam((0.1, 0.05, 0.03), (0.02, 0.1)).predict((0.1, 0.2))
 print(sum(move_pose.stats.cache_hits.values()), *sys.modules)
 """
