@@ -279,7 +279,7 @@ def _driven(knowledge: AgentKnowledge, tours: Array, steps: int) -> Array:
         turn = np.clip(np.where(arrived, turning, error), -turning, turning)
         ahead = (np.abs(error) < _ALIGNED) & ~arrived
         drive = np.where(ahead, np.minimum(distance, longest), 0.0)
-        plans[:, t] = np.column_stack([drive, turn])
+        plans[:, t, 0], plans[:, t, 1] = drive, turn
         x, y = x + drive * np.cos(heading), y + drive * np.sin(heading)
         heading, leg = heading + turn, leg + arrived
     return plans

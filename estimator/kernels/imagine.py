@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...arrays import Array, IntArray
+from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
 from ..models.bearing_range import difference_jit, expected_reading_jit
 from ..models.rigid_motion import predict
@@ -104,7 +104,7 @@ def imagine_plans(
         (workspace[0], workspace[1]),
     )
     points, weights = density
-    missed = np.empty(len(weights[0]))
+    missed, in_view = np.empty(len(weights[0])), np.empty(len(weights[0]), np.bool_)
     for b in range(len(means)):
         size = 3 + 2 * np.sum(slots[b] >= 0)
         for k in range(plans.shape[1]):
@@ -114,7 +114,9 @@ def imagine_plans(
                 d, turn = plans[b, k, t, 0], plans[b, k, t, 1]
                 if not imagine_step(room, size, d, turn, sensor):
                     break
-                found += look_for_new(room.mean, points, weights[b], sensor, missed)
+                found += look_for_new(
+                    room.mean, points, weights[b], sensor, missed, in_view
+                )
                 outcome.new_landmarks[b, k, t] = found
                 for i in range(3):
                     outcome.poses[b, k, t, i] = room.mean[i]
@@ -188,22 +190,29 @@ def expect_readings(
 
 @njit_internal
 def look_for_new(
-    mean: Array, points: Array, weights: Array, settings: Settings, missed: Array
+    mean: Array,
+    points: Array,
+    weights: Array,
+    settings: Settings,
+    missed: Array,
+    in_view: BoolArray,
 ) -> float:
     """Return how many landmarks are expected that have been missed until now.
 
     ``missed`` has the probability of that for a landmark at each point; it falls where
-    a point is in view.
+    a point is in view.  ``in_view`` is room for intermediate results.
     """
     found, sight = 0.0, settings.sight
     x, y, cos, sin = mean[0], mean[1], math.cos(mean[2]), math.sin(mean[2])
+    for c in range(len(missed)):  # without a branch: on whole vector registers
+        dx, dy = points[0, c] - x, points[1, c] - y
+        ahead, distance = dx * cos + dy * sin, math.sqrt(dx * dx + dy * dy)
+        weight = weights[c] * missed[c]
+        in_view[c] = is_in_view(ahead, distance, sight) & (weight > 0.0)
     for c in range(len(missed)):
-        if weights[c] > 0.0 and missed[c] > 0.0:
+        if in_view[c]:
             dx, dy = points[0, c] - x, points[1, c] - y
-            ahead, distance = dx * cos + dy * sin, math.sqrt(dx * dx + dy * dy)
-            if is_in_view(ahead, distance, sight) and not is_hidden(
-                x, y, dx, dy, sight.walls
-            ):
+            if not is_hidden(x, y, dx, dy, sight.walls):
                 found += weights[c] * missed[c] * (1.0 - settings.dropout)
                 missed[c] *= settings.dropout
     return found
