@@ -176,6 +176,23 @@ def test_new_landmarks_are_expected_where_a_plan_looks_first():
     assert not imagine(slam, [ahead], sight).new_landmarks.any()
 
 
+def test_new_landmarks_are_those_that_the_sensor_sees():
+    rng = np.random.default_rng(4)
+    points, counts = rng.uniform(-6.0, 6.0, (60, 2)), rng.uniform(0.0, 1.0, 60)
+    counts[:10] = 0.0
+    sight = sensor(occlusion=True, dropout=0.25, min_range=0.0)
+    slam, density = make_estimator("ekf", **NOISE), (points, counts)
+    found = imagine(slam, PLANS, sight, walls=WALLS, density=density)
+    for poses, each in zip(found.poses[0], found.new_landmarks[0], strict=True):
+        missed, total = np.ones(60), []
+        for pose in poses:
+            readings = predict_measurement(pose, points).measurement
+            seen = not_hidden(pose, points, readings)
+            total.append((counts * missed)[seen].sum() * 0.75)
+            missed[seen] *= 0.25
+        np.testing.assert_allclose(each, np.cumsum(total), atol=1e-12)
+
+
 @pytest.mark.parametrize("name", FAMILY)
 def test_horizons_tell_what_shorter_plans_tell(name):
     slam = driven(name)
