@@ -410,8 +410,8 @@ def test_without_a_lower_time_limit_that_of_the_scenario_holds(most):
 
 
 def test_the_estimators_that_run_side_by_side_are_those_of_the_documents():
-    page = (Path(__file__).parents[2] / "docs" / "active_slam.md").read_text()
-    sentence = page.split("run in batches:")[1].split("So do")[0]
+    page = (Path(__file__).parents[2] / "docs" / "filters.md").read_text()
+    sentence = page.split("## Batches")[1].split("and registered")[0]
     able = set(re.findall(r"`(\w+)`", sentence))
     assert able
     for name in able:
