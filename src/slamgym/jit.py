@@ -76,10 +76,21 @@ def _compile(
         "no_cpython_wrapper": not callable_from_python,
         "fastmath": {"reassoc", "nsz", "contract"} if reordered else False,
     }
-    kernel = njit(**options)(function)
+    return cast("Kernel", _kept(njit(**options)(function)))
+
+
+def _kept(kernel: Any) -> Any:
+    """Keep a kernel in the cache, and compile it once for constants and variables."""
+
+    def of_variables(args: Any, kws: Any) -> Any:
+        plain: Any = types.unliteral
+        named = {name: plain(value) for name, value in kws.items()}
+        return type(kernel).get_call_template(kernel, tuple(map(plain, args)), named)
+
     if hasattr(kernel, "py_func"):  # else compilation is turned off
         kernel._cache = KernelCache(kernel)
-    return cast("Kernel", kernel)
+        kernel.get_call_template = of_variables
+    return kernel
 
 
 def specialised(
@@ -131,9 +142,7 @@ def _recompiled(function: Any, like: Any) -> Any:
     """Compile a function as another one was."""
     options = {k: v for k, v in like.targetoptions.items() if k != "nopython"}
     kernel = njit(**options)(function)
-    if isinstance(like._cache, KernelCache):
-        kernel._cache = KernelCache(kernel)
-    return kernel
+    return _kept(kernel) if isinstance(like._cache, KernelCache) else kernel
 
 
 def _emitted_fma(_typing: Any, _a: Any, _b: Any, _c: Any) -> tuple[Any, Any]:

@@ -17,7 +17,7 @@ import pytest
 import slamgym
 from slamgym import jit as kernel_cache
 from slamgym.estimator import list_peers
-from slamgym.jit import UnknownValueError, code_fingerprint, fma, jit
+from slamgym.jit import UnknownValueError, code_fingerprint, fma, jit, njit_internal
 
 CALLER = """
     from callee import twice
@@ -111,6 +111,21 @@ def test_an_edit_while_a_process_runs_does_not_reach_the_cache(kernels):
     """
     assert answer(kernels, code) == (7, 0)
     assert answer(kernels) == (19, 0)
+
+
+def test_a_kernel_that_is_called_with_constants_is_compiled_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernel_cache, "cache_folder", lambda: tmp_path)
+
+    @njit_internal
+    def power(x, k):
+        return x**k
+
+    @jit
+    def powers(x, k):
+        return power(x, k) + power(x, 2) + power(x, k=3)
+
+    assert powers(2.0, 1) == 14
+    assert len(power.nopython_signatures) == 1
 
 
 @pytest.mark.slow
