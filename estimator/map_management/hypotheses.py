@@ -222,7 +222,7 @@ class HypothesisSlam:
             self._keep([Hypothesis(0.0, self.best)])
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
-        """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
+        """Move by odometry (d, α) [m, rad], dt multiplies its noise variance."""
         motion = argument_checks.pair("odometry", odometry)
         slams = [hypothesis.slam for hypothesis in self.hypotheses]
         begun, steps = [slam.steps for slam in slams], self.steps + 1

@@ -163,7 +163,7 @@ class ManagedSlam:
             self._recent.forget()
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
-        """Move by odometry (d, α) [m, rad], its motion noise counted √dt times."""
+        """Move by odometry (d, α) [m, rad], dt multiplies its noise variance."""
         reading = argument_checks.pair("odometry", odometry)
         displacement = self._motion_noise.motion.moved(reading)
         variance = self._motion_noise.over(displacement, dt)

@@ -44,6 +44,7 @@ BETTER = {
     r"goes? on (?:after|with)": "continues after; continues with",
     r"wander(?:s|ed|ing)?|blindly": "drives at random; without feedback",
     r"what there is": "the available …",
+    r"counted √dt times": "dt multiplies the variance",
     r"(?:is|are) of (?:another|none|no|one)": "belongs to; shows; has",
     r"nobody (?:names|says|knows|has driven|(?:has )?stopped)": "without …",
 }
