@@ -99,6 +99,7 @@ sphinx_gallery_conf = {
     "download_all_examples": False,
     "remove_config_comments": True,
     "show_memory": False,
+    "write_computation_times": False,  # a page with scripts of other servers
     "capture_repr": (),
     "abort_on_example_error": True,
     "image_scrapers": (figures_of,),
