@@ -25,6 +25,7 @@ import numpy as np
 
 from ... import __version__
 from ...arrays import Array
+from ...estimator.models.sensors import find_sensor
 from ...evaluation.noise_findings import CHANNELS, MOMENTS
 from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import replace_when_written, scenario_text
@@ -180,6 +181,8 @@ def attributes(job: Job, runs: range, command: str) -> dict[str, Any]:
         "scenario": identity["scenario"],
         "assumed": identity["assumed"],
         "estimators": json.dumps(identity["estimators"]),
+        # 1 where filters use readings later than they were made
+        "readings_may_wait": int(not find_sensor(job.scenario.sensor.kind).places),
         "seed": job.seed,
         "runs": len(runs),
         "block_size": job.block_size,

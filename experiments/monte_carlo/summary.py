@@ -7,7 +7,6 @@ summary.
 
 import json
 import math
-import tomllib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -16,7 +15,6 @@ import xarray as xr
 
 from ...arrays import AnyArray, Array
 from ...estimator.models.rigid_motion import ErrorFrame
-from ...estimator.models.sensors import find_sensor
 from ...evaluation.association_scores import CUTOFF, Gospa
 from ...evaluation.consistency_report import ConsistencyReport
 from ...evaluation.error_bound import Efficiency, efficiency
@@ -205,23 +203,13 @@ def consistency_of(
 
 def _unused_readings(scores: EstimatorScores) -> float | None:
     """Divide the readings that a gate or the least range rejected by all readings."""
-    if KNOWN_IDS_ATE in scores.results or _may_wait(scores.results.attrs):
+    attrs = scores.results.attrs
+    if KNOWN_IDS_ATE in scores.results or attrs.get("readings_may_wait"):
         return None
     corrected = scores.per_run("nis_dof").sum(axis=1) / 2
     added = scores.per_run("relative_map_dof") / 2
     readings = scores.per_run("readings")
     return quotient(readings - corrected - added, readings)
-
-
-def _may_wait(attrs: dict[str, Any]) -> bool:
-    """Return whether filters may use readings later than they were made."""
-    world = tomllib.loads(attrs.get("assumed", attrs["scenario"]))
-    try:
-        return not find_sensor(
-            world.get("sensor", {}).get("kind", "bearing_range")
-        ).places
-    except ValueError:  # a sensor of the user, not on this machine
-        return True
 
 
 # --------------------------------------------------------------------------------------

@@ -517,11 +517,6 @@ def test_readings_that_wait_are_not_called_unused():
     assert (
         summarise_monte_carlo(results)["estimators"]["ekf"]["unused_readings"] is None
     )
-    results.attrs["scenario"] = 'sensor = {kind = "nowhere:SONAR"}'
-    results.attrs.pop("assumed", None)
-    assert (
-        summarise_monte_carlo(results)["estimators"]["ekf"]["unused_readings"] is None
-    )
 
 
 @pytest.mark.parametrize("width", [85.0, 170.0])
