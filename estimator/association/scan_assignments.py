@@ -62,6 +62,7 @@ def assign_scan(
     density: float | Array,
     *,
     ceiling: float = np.inf,
+    most: int | None = None,
 ) -> Assignments:
     """Assign readings (m, 2) to the landmarks of a map.
 
@@ -99,7 +100,8 @@ def assign_scan(
         limits=_limits(policy, count),
         pairs_first=pairs_first,
     )
-    most = policy.branches if policy.association == "hypotheses" else 1
+    if most is None:
+        most = policy.branches if policy.association == "hypotheses" else 1
     found = best_assignments(
         problem,
         most=most,

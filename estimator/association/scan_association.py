@@ -37,6 +37,9 @@ from .tentative_landmarks import TENTATIVE, TentativeLandmarks
 
 NO_LABEL = -1
 
+SECTORS, RINGS = 16, 8
+EVEN = np.full(24, 0.5)
+
 #: A label is the scan of the first sighting, shifted by these bits, plus its row.
 LABEL_BITS = 20
 
@@ -60,7 +63,8 @@ class ScanAssociation:
         self._tentative = candidates.tentative.next_scan(policy.confirm[1])
         self._waiting = dict(candidates.waiting)
         self._next_id, self.scan = candidates.next_id, candidates.scan
-        self._density, self._longest = candidates.density, 0.0
+        self._density = candidates.density
+        self._readings = np.zeros((rows, 2))
         self._detections = candidates.detections
         #: For each row the landmark that the filter associates it with, if any.
         self.row_ids: list[int | None] = [None] * rows
@@ -77,10 +81,8 @@ class ScanAssociation:
     def candidates(self) -> Candidates:
         """The candidates after the scan."""
         first = [label < 0 or label >> LABEL_BITS == self.scan for label in self.labels]
-        unexplained = sum(
-            i is None and fresh for i, fresh in zip(self.row_ids, first, strict=True)
-        )
-        density = self._density.after(unexplained, self._longest, len(self.confirmed))
+        is_new = [i is None and f for i, f in zip(self.row_ids, first, strict=True)]
+        density = self._density.after(self._readings, is_new, len(self.confirmed))
         return Candidates(
             self._tentative,
             self._waiting,
@@ -103,7 +105,7 @@ class ScanAssociation:
         Rows that no landmark explains may belong to a tentative one; the other rows of
         the scan have no usable bearing and are ambiguous.
         """
-        self._longest = float(readings[:, 1].max(initial=0.0))
+        self._readings = readings
         for row, slot in zip(rows.tolist(), slots.tolist(), strict=True):
             if slot >= 0:
                 self.row_ids[row] = view.ids[slot]
@@ -137,8 +139,11 @@ class ScanAssociation:
     def _match_tentative(self, rows: IntArray, readings: Array, noise: Noise) -> None:
         """Match rows that no landmark explains with tentative ones; confirm these."""
         tentative = self._tentative
-        fit = tentative.distances(readings[rows], noise, self._policy.new_gate)
-        slots = assign_nearest(self._policy, fit)
+        density = self._density.at(readings[rows])
+        found = assign_scan(
+            self._policy, tentative.view(), readings[rows], noise, density, most=1
+        )
+        slots = found.ranked[0].slots
         self.ambiguous_rows += rows[slots == AMBIGUOUS].tolist()
         pairs = list(zip(rows.tolist(), slots.tolist(), strict=True))
         for row, slot in pairs:
@@ -268,6 +273,16 @@ class UnexplainedDensity(NamedTuple):
     longest: float = 1.0
     #: How many landmarks were confirmed.
     landmarks: float = 1.0
+    #: How many of them in each sector and in each ring, shape (SECTORS + RINGS,).
+    cells: Array = EVEN
+
+    def at(self, readings: Array) -> Array:
+        """Return the density at readings (m, 2) [1 / (rad m)]."""
+        s, r = SECTORS, RINGS
+        sector, ring = _cells(readings, self.longest)
+        a, b = self.cells[:s], self.cells[s:]
+        shape = a[sector] * s / a.sum() * b[ring] * r / b.sum()
+        return np.asarray(self.value * shape)
 
     @property
     def value(self) -> float:
@@ -285,15 +300,28 @@ class UnexplainedDensity(NamedTuple):
         return min(self.landmarks / self.readings, 1.0)
 
     def after(
-        self, readings: int, longest: float, landmarks: int = 0
+        self, readings: Array, is_new: Sequence[bool], landmarks: int = 0
     ) -> UnexplainedDensity:
         """Count one more scan, with the landmarks that it has confirmed."""
+        longest = max(self.longest, float(readings[:, 1].max(initial=0.0)))
+        cells = self.cells.copy()
+        sector, ring = _cells(readings[np.asarray(is_new, np.bool_)], longest)
+        np.add.at(cells, sector, 1.0)
+        np.add.at(cells, SECTORS + ring, 1.0)
         return UnexplainedDensity(
-            MEMORY * self.readings + readings,
+            MEMORY * self.readings + sum(is_new),
             MEMORY * self.scans + 1,
-            max(self.longest, longest),
+            longest,
             MEMORY * self.landmarks + landmarks,
+            cells,
         )
+
+
+def _cells(readings: Array, longest: float) -> tuple[IntArray, IntArray]:
+    """Return sector and ring of readings (m, 2)."""
+    sector = np.floor((readings[:, 0] + np.pi) * (SECTORS / (2 * np.pi)))
+    ring = np.minimum(readings[:, 1] * (RINGS / longest), RINGS - 1)
+    return sector.astype(np.int64) % SECTORS, ring.astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -514,7 +542,8 @@ def _unexplained_density(
     A tentative landmark of one sighting is a landmark with the probability that the
     scans so far suggest; one of more sightings surely is.
     """
-    density = np.full(len(readings), policy.density or candidates.density.value)
+    density = candidates.density.at(readings)
+    if policy.density is not None: density[:] = policy.density
     if policy.association in ("nearest", "compatibility"):  # they use none
         return density
     tentative = candidates.tentative.next_scan(policy.confirm[1])

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array, BoolArray, IntArray
+from ..interface import MapView
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import rotation
 from ..support import saved_states
@@ -86,14 +87,21 @@ class TentativeLandmarks(NamedTuple):
         seen = (self.seen << np.uint64(1)) & window
         return self._replace(seen=seen).chosen(seen > 0)
 
-    def distances(self, readings: Array, noise: Noise, largest: float) -> Distances:
-        """Compare readings with all landmarks; see :func:`innovation_distances`."""
+    def view(self) -> MapView:
+        """Return them as a map in the robot's frame, its pose known."""
         t = len(self.seen)
         mean, covariance = np.zeros(3 + 2 * t), np.zeros((3 + 2 * t, 3 + 2 * t))
         mean[3:] = self.places.ravel()
         blocks = covariance[3:, 3:].reshape(t, 2, t, 2)
         blocks[np.arange(t), :, np.arange(t), :] = self.covariances
-        return innovation_distances(mean, covariance, t, readings, noise, largest)
+        return MapView(mean, covariance, tuple(range(t)))
+
+    def distances(self, readings: Array, noise: Noise, largest: float) -> Distances:
+        """Compare readings with all landmarks; see :func:`innovation_distances`."""
+        view = self.view()
+        return innovation_distances(
+            view.mean, view.covariance, len(self.seen), readings, noise, largest
+        )
 
     def with_sighting(
         self, which: int, reading: Array, noise: Noise
