@@ -81,13 +81,17 @@ def assign_scan(
         [1 / (rad m)].
     ceiling : float
         Cost beyond which only the most likely assignment is of interest.
+    most : int, optional
+        How many assignments at most, if fewer than the policy considers.
     """
     fit = innovation_distances(
         view.mean, view.covariance, len(view.ids), readings, noise, policy.new_gate
     )
     explained = np.flatnonzero(np.isfinite(fit.squared).any(axis=0))
     if policy.association == "nearest":
-        return Assignments([Assignment(0.0, assign_nearest(policy, fit))], explained)
+        gates = {"match": policy.match_gate, "new": policy.new_gate}
+        slots = nearest_neighbours(fit, **gates, ambiguity=policy.ambiguity)
+        return Assignments([Assignment(0.0, slots)], explained)
     expected, joint = predicted_readings(view.mean, view.covariance, explained)
     pairs_first, count = policy.association == "compatibility", len(readings)
     problem = Problem(
@@ -126,13 +130,6 @@ def _is_superfluous(
     return any(
         ambiguous[marks != other].all() and largest_change(problem, other, marks) < SAME
         for other in better
-    )
-
-
-def assign_nearest(policy: AssociationPolicy, fit: Distances) -> IntArray:
-    """Assign each reading to its most likely landmark, as the policy's gates allow."""
-    return nearest_neighbours(
-        fit, match=policy.match_gate, new=policy.new_gate, ambiguity=policy.ambiguity
     )
 
 

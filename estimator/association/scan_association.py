@@ -30,15 +30,17 @@ from .scan_assignments import (
     NEW,
     AssociationPolicy,
     Noise,
-    assign_nearest,
     assign_scan,
+    innovation_distances,
 )
 from .tentative_landmarks import TENTATIVE, TentativeLandmarks
 
 NO_LABEL = -1
 
+#: Cells over the bearings, and over the ranges up to the longest reading.
 SECTORS, RINGS = 16, 8
-EVEN = np.full(24, 0.5)
+
+NO_COUNTS = np.zeros((SECTORS, RINGS))
 
 #: A label is the scan of the first sighting, shifted by these bits, plus its row.
 LABEL_BITS = 20
@@ -52,26 +54,25 @@ class ScanAssociation:
     policy : AssociationPolicy
     candidates : Candidates
         Before the scan.
-    rows : int
-        Number of readings in the scan.
+    readings : ndarray, shape (m, 2)
+        The scan, rows (β, r) [rad, m].
     """
 
     def __init__(
-        self, policy: AssociationPolicy, candidates: Candidates, rows: int
+        self, policy: AssociationPolicy, candidates: Candidates, readings: Array
     ) -> None:
         self._policy = policy
         self._tentative = candidates.tentative.next_scan(policy.confirm[1])
         self._waiting = dict(candidates.waiting)
         self._next_id, self.scan = candidates.next_id, candidates.scan
-        self._density = candidates.density
-        self._readings = np.zeros((rows, 2))
+        self._density, self._readings = candidates.density, readings
         self._detections = candidates.detections
         #: For each row the landmark that the filter associates it with, if any.
-        self.row_ids: list[int | None] = [None] * rows
+        self.row_ids: list[int | None] = [None] * len(readings)
         #: Labels of landmarks that were tentative before this scan.
         self.confirmed: dict[int, int] = {}
         #: For each row the label of its tentative landmark, if any.
-        self.labels: list[int] = [NO_LABEL] * rows
+        self.labels: list[int] = [NO_LABEL] * len(readings)
         self.tentative_rows: list[int] = []
         self.ambiguous_rows: list[int] = []
         #: Landmarks that some row may belong to, so that they are not missing.
@@ -82,7 +83,9 @@ class ScanAssociation:
         """The candidates after the scan."""
         first = [label < 0 or label >> LABEL_BITS == self.scan for label in self.labels]
         is_new = [i is None and f for i, f in zip(self.row_ids, first, strict=True)]
-        density = self._density.after(self._readings, is_new, len(self.confirmed))
+        density = self._density.after(
+            self._readings, np.array(is_new, dtype=np.bool_), len(self.confirmed)
+        )
         return Candidates(
             self._tentative,
             self._waiting,
@@ -93,27 +96,21 @@ class ScanAssociation:
         )
 
     def assign(
-        self,
-        rows: IntArray,
-        slots: IntArray,
-        readings: Array,
-        view: MapView,
-        noise: Noise,
+        self, rows: IntArray, slots: IntArray, view: MapView, noise: Noise
     ) -> None:
         """Take the slots of the map that some rows are assigned to.
 
         Rows that no landmark explains may belong to a tentative one; the other rows of
         the scan have no usable bearing and are ambiguous.
         """
-        self._readings = readings
         for row, slot in zip(rows.tolist(), slots.tolist(), strict=True):
             if slot >= 0:
                 self.row_ids[row] = view.ids[slot]
-        self.ambiguous_rows += sorted(set(range(len(readings))) - set(rows.tolist()))
+        self.ambiguous_rows += sorted(set(range(len(self.labels))) - set(rows.tolist()))
         self.ambiguous_rows += rows[slots == AMBIGUOUS].tolist()
         new = rows[slots == NEW]
         if len(new):
-            self._match_tentative(new, readings, noise)
+            self._match_tentative(new, noise)
         self.ambiguous_rows.sort()
         self.tentative_rows.sort()
 
@@ -136,13 +133,12 @@ class ScanAssociation:
             else:
                 self.tentative_rows.append(row)
 
-    def _match_tentative(self, rows: IntArray, readings: Array, noise: Noise) -> None:
+    def _match_tentative(self, rows: IntArray, noise: Noise) -> None:
         """Match rows that no landmark explains with tentative ones; confirm these."""
-        tentative = self._tentative
+        tentative, readings = self._tentative, self._readings
         density = self._density.at(readings[rows])
-        found = assign_scan(
-            self._policy, tentative.view(), readings[rows], noise, density, most=1
-        )
+        view = tentative.view()
+        found = assign_scan(self._policy, view, readings[rows], noise, density, most=1)
         slots = found.ranked[0].slots
         self.ambiguous_rows += rows[slots == AMBIGUOUS].tolist()
         pairs = list(zip(rows.tolist(), slots.tolist(), strict=True))
@@ -262,9 +258,12 @@ class UnexplainedDensity(NamedTuple):
     --------
     >>> density = UnexplainedDensity()
     >>> for _ in range(500):
-    ...     density = density.after(2, longest=8.0)
-    >>> round(density.value * 2 * np.pi * 8.0, 2)
+    ...     density = density.after(np.array([[0, 7.9], [1, 8]]), np.array([True] * 2))
+    >>> round(density.per_scan, 2)
     2.0
+    >>> far, near = density.at(np.array([[0, 7.5], [0, 2.5]]))
+    >>> bool(far > 100 * near)
+    True
     """
 
     readings: float = 1.0
@@ -273,15 +272,23 @@ class UnexplainedDensity(NamedTuple):
     longest: float = 1.0
     #: How many landmarks were confirmed.
     landmarks: float = 1.0
-    #: How many of them in each sector and in each ring, shape (SECTORS + RINGS,).
-    cells: Array = EVEN
+    #: How many readings each sector and ring has shown, shape (SECTORS, RINGS).
+    cells: Array = NO_COUNTS
 
     def at(self, readings: Array) -> Array:
-        """Return the density at readings (m, 2) [1 / (rad m)]."""
-        s, r = SECTORS, RINGS
+        """Return the density at readings (m, 2), shape (m,) [1 / (rad m)].
+
+        New landmarks come into view at certain bearings and ranges, most of them far
+        ahead.  The density is the product of the shares p of its sector and its ring::
+
+            n / (2π r) · p(sector) SECTORS · p(ring) RINGS
+
+        with n readings per scan, r the longest range, and half a reading added to every
+        sector and ring.
+        """
+        sectors, rings = self.cells.sum(axis=1) + 0.5, self.cells.sum(axis=0) + 0.5
         sector, ring = _cells(readings, self.longest)
-        a, b = self.cells[:s], self.cells[s:]
-        shape = a[sector] * s / a.sum() * b[ring] * r / b.sum()
+        shape = sectors[sector] / sectors.mean() * rings[ring] / rings.mean()
         return np.asarray(self.value * shape)
 
     @property
@@ -300,16 +307,15 @@ class UnexplainedDensity(NamedTuple):
         return min(self.landmarks / self.readings, 1.0)
 
     def after(
-        self, readings: Array, is_new: Sequence[bool], landmarks: int = 0
+        self, readings: Array, is_new: BoolArray, landmarks: int = 0
     ) -> UnexplainedDensity:
-        """Count one more scan, with the landmarks that it has confirmed."""
-        longest = max(self.longest, float(readings[:, 1].max(initial=0.0)))
+        """Count one more scan (m, 2), its rows of no landmark, and those confirmed."""
+        finite = np.isfinite(readings).all(axis=1)
+        longest = max(self.longest, float(readings[finite, 1].max(initial=0.0)))
         cells = self.cells.copy()
-        sector, ring = _cells(readings[np.asarray(is_new, np.bool_)], longest)
-        np.add.at(cells, sector, 1.0)
-        np.add.at(cells, SECTORS + ring, 1.0)
+        np.add.at(cells, _cells(readings[is_new & finite], longest), 1.0)
         return UnexplainedDensity(
-            MEMORY * self.readings + sum(is_new),
+            MEMORY * self.readings + int(is_new.sum()),
             MEMORY * self.scans + 1,
             longest,
             MEMORY * self.landmarks + landmarks,
@@ -318,9 +324,9 @@ class UnexplainedDensity(NamedTuple):
 
 
 def _cells(readings: Array, longest: float) -> tuple[IntArray, IntArray]:
-    """Return sector and ring of readings (m, 2)."""
+    """Return the sector and the ring of readings (m, 2)."""
     sector = np.floor((readings[:, 0] + np.pi) * (SECTORS / (2 * np.pi)))
-    ring = np.minimum(readings[:, 1] * (RINGS / longest), RINGS - 1)
+    ring = np.clip(readings[:, 1] * (RINGS / longest), 0, RINGS - 1)
     return sector.astype(np.int64) % SECTORS, ring.astype(np.int64)
 
 
@@ -348,6 +354,8 @@ class Candidates:
             **vars(self),
             **self.tentative._asdict(),
             "waiting": waiting,
+            "density": self.density[:4],
+            "unexplained": self.density.cells,
             "detected": self.detections.seen,
             "expected": self.detections.expected,
             "missed": list(self.detections.missed.items()),
@@ -371,6 +379,8 @@ class Candidates:
             )
         if density.min() <= 0:
             raise ValueError(f"state['tentative.density'] must be > 0, got {density}")
+        if saved["unexplained"].min() < 0:
+            raise ValueError("state['tentative.unexplained'] must be >= 0")
         if not ((seen >= 0) & (seen <= expected)).all():
             raise ValueError(
                 "state['tentative.detected'] must be >= 0, and at most "
@@ -384,7 +394,7 @@ class Candidates:
             waiting,
             int(saved["next_id"]),
             int(saved["scan"]),
-            UnexplainedDensity(*density.tolist()),
+            UnexplainedDensity(*density.tolist())._replace(cells=saved["unexplained"]),
             Detections(seen, expected, missed),
         )
 
@@ -393,9 +403,6 @@ class Candidates:
 MEMORY = 0.98
 
 
-#: Cells over the bearings, and over the ranges up to the longest reading.
-SECTORS, RINGS = 16, 8
-
 #: What a saved state holds about the landmarks that are not in the map yet.
 CANDIDATES: saved_states.Table = {
     **TENTATIVE,
@@ -403,6 +410,7 @@ CANDIDATES: saved_states.Table = {
     "next_id": (saved_states.COUNTS,),
     "scan": (saved_states.COUNTS,),
     "density": (saved_states.NUMBERS, 4),
+    "unexplained": (saved_states.NUMBERS, SECTORS, RINGS),
     "detected": (saved_states.NUMBERS, SECTORS, RINGS),
     "expected": (saved_states.NUMBERS, SECTORS, RINGS),
     "missed": (saved_states.NUMBERS, -1, 2),
@@ -517,9 +525,9 @@ def associate(
 
     def complete(slots: IntArray, detections: Detections) -> ScanAssociation:
         before = replace(candidates, detections=detections)
-        association = ScanAssociation(policy, before, len(readings))
+        association = ScanAssociation(policy, before, readings)
         association.explained = set(explained)
-        association.assign(rows, slots, readings, view, sensor.noise)
+        association.assign(rows, slots, view, sensor.noise)
         return association
 
     options = []
@@ -543,13 +551,17 @@ def _unexplained_density(
     scans so far suggest; one of more sightings surely is.
     """
     density = candidates.density.at(readings)
-    if policy.density is not None: density[:] = policy.density
+    if policy.density is not None:
+        density[:] = policy.density
     if policy.association in ("nearest", "compatibility"):  # they use none
         return density
     tentative = candidates.tentative.next_scan(policy.confirm[1])
     if not len(tentative.seen):
         return density
-    fit = tentative.distances(readings, noise, policy.new_gate)
+    mean, covariance, slots = tentative.view()[:3]
+    fit = innovation_distances(
+        mean, covariance, len(slots), readings, noise, policy.new_gate
+    )
     share = np.where(tentative.sightings > 1, 1.0, candidates.density.landmark_share)
     again = share * np.exp(-fit.unlikelihood / 2) / (2 * np.pi)
     return np.asarray(density + again.max(axis=1))

@@ -22,7 +22,7 @@ from ..interface import MapView
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import rotation
 from ..support import saved_states
-from .scan_assignments import Distances, Noise, innovation_distances
+from .scan_assignments import Noise
 
 Masks = NDArray[np.uint64]
 
@@ -95,13 +95,6 @@ class TentativeLandmarks(NamedTuple):
         blocks = covariance[3:, 3:].reshape(t, 2, t, 2)
         blocks[np.arange(t), :, np.arange(t), :] = self.covariances
         return MapView(mean, covariance, tuple(range(t)))
-
-    def distances(self, readings: Array, noise: Noise, largest: float) -> Distances:
-        """Compare readings with all landmarks; see :func:`innovation_distances`."""
-        view = self.view()
-        return innovation_distances(
-            view.mean, view.covariance, len(self.seen), readings, noise, largest
-        )
 
     def with_sighting(
         self, which: int, reading: Array, noise: Noise

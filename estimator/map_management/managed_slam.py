@@ -238,7 +238,7 @@ class ManagedSlam:
     def as_given(self, readings: Array, landmark_ids: LandmarkIds) -> ScanAssociation:
         """Associate readings (m, 2) by their identities."""
         given = argument_checks.identities(landmark_ids, len(readings))
-        plan = ScanAssociation(self._policy, self.candidates, len(readings))
+        plan = ScanAssociation(self._policy, self.candidates, readings)
         view = self._editor.map_view(self._policy.reach(readings))
         plan.translate(given, view.mapped, self._pruner.merger.aliases)
         return plan

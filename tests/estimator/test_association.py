@@ -14,6 +14,7 @@ from slamgym.estimator.association.scan_assignments import (
     innovation_distances,
     nearest_neighbours,
 )
+from slamgym.estimator.association.scan_association import UnexplainedDensity
 from slamgym.estimator.association.tentative_landmarks import TentativeLandmarks
 from slamgym.estimator.kernels import scan_update as screening
 from slamgym.estimator.kernels.kalman_gain import (
@@ -199,6 +200,43 @@ def test_sightings_count_as_long_as_they_are_recent():
 
 
 # --- all of it ---
+
+
+@pytest.mark.parametrize("association", ["joint", "hypotheses"])
+def test_two_landmarks_less_apart_than_the_noise_are_both_confirmed(association):
+    rng = np.random.default_rng(5)
+    true = predict_measurement(np.zeros(3), np.array([(4.0, -0.25), (4.0, 0.25)]))
+    sizes = []
+    for _ in range(10):
+        slam = make_estimator(
+            "invariant",
+            motion_std=(0.01, 0.01, 0.01),
+            measurement_std=(0.1, 0.1),
+            management={"association": association, "confirm": (3, 3)},
+        )
+        for _ in range(3):
+            noise = rng.normal(scale=(0.05, 0.05), size=(2, 2))
+            slam.update(rng.permutation(true.measurement + noise))
+        sizes.append(len(slam.landmark_ids))
+    assert sizes == [2] * 10
+
+
+def test_the_density_is_large_where_new_readings_appear():
+    rng = np.random.default_rng(3)
+    density = UnexplainedDensity()
+    for _ in range(400):
+        near = (rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 5.0))  # clutter
+        ahead = (rng.uniform(-0.7, 0.7), rng.uniform(7.0, 8.0))  # new landmarks
+        known = (2.0, 2.0)
+        readings = np.array([near, ahead, known])
+        density = density.after(readings, np.array([True, True, False]))
+    bearing, distance = (rng.uniform(low, 1.0, 20_000) for low in (-1.0, 0.0))
+    readings = np.column_stack([np.pi * bearing, density.longest * distance])
+    total = density.at(readings).mean() * 2 * np.pi * density.longest
+    np.testing.assert_allclose(total, 2.0, rtol=0.05)
+    ahead, behind, middle = density.at(np.array([(0, 7.5), (3, 7.5), (0, 2.0)]))
+    assert ahead > 3 * behind
+    assert ahead > 3 * middle
 
 
 @pytest.mark.slow
