@@ -136,7 +136,7 @@ class ScanAssociation:
     def _match_tentative(self, rows: IntArray, noise: Noise) -> None:
         """Match rows that no landmark explains with tentative ones; confirm these."""
         tentative, readings = self._tentative, self._readings
-        density = self._density.at(readings[rows])
+        density = _assumed_density(self._policy, self._density, readings[rows])
         view = tentative.view()
         found = assign_scan(self._policy, view, readings[rows], noise, density, most=1)
         slots = found.ranked[0].slots
@@ -325,7 +325,8 @@ class UnexplainedDensity(NamedTuple):
 
 def _cells(readings: Array, longest: float) -> tuple[IntArray, IntArray]:
     """Return the sector and the ring of readings (m, 2)."""
-    sector = np.floor((readings[:, 0] + np.pi) * (SECTORS / (2 * np.pi)))
+    turned = np.mod(readings[:, 0] + np.pi, 2 * np.pi)
+    sector = np.floor(turned * (SECTORS / (2 * np.pi)))
     ring = np.clip(readings[:, 1] * (RINGS / longest), 0, RINGS - 1)
     return sector.astype(np.int64) % SECTORS, ring.astype(np.int64)
 
@@ -550,9 +551,7 @@ def _unexplained_density(
     A tentative landmark of one sighting is a landmark with the probability that the
     scans so far suggest; one of more sightings surely is.
     """
-    density = candidates.density.at(readings)
-    if policy.density is not None:
-        density[:] = policy.density
+    density = _assumed_density(policy, candidates.density, readings)
     if policy.association in ("nearest", "compatibility"):  # they use none
         return density
     tentative = candidates.tentative.next_scan(policy.confirm[1])
@@ -565,6 +564,15 @@ def _unexplained_density(
     share = np.where(tentative.sightings > 1, 1.0, candidates.density.landmark_share)
     again = share * np.exp(-fit.unlikelihood / 2) / (2 * np.pi)
     return np.asarray(density + again.max(axis=1))
+
+
+def _assumed_density(
+    policy: AssociationPolicy, learned: UnexplainedDensity, readings: Array
+) -> Array:
+    """Return the density that the policy gives, or else the learned one."""
+    if policy.density is not None:
+        return np.full(len(readings), policy.density)
+    return learned.at(readings)
 
 
 class Sensor(NamedTuple):

@@ -239,6 +239,29 @@ def test_the_density_is_large_where_new_readings_appear():
     assert ahead > 3 * middle
 
 
+def test_bearings_of_many_turns_count_in_their_sector():
+    far = np.array([[1e200, 2.0], [-1e200, 2.0]])
+    within = np.column_stack([wrap_angle(far[:, 0]), far[:, 1]])
+    counts = [
+        UnexplainedDensity().after(z, np.ones(2, dtype=bool)).cells
+        for z in (far, within)
+    ]
+    np.testing.assert_array_equal(*counts)
+
+
+@pytest.mark.parametrize(("density", "size"), [(None, 1), (1e-3, 1), (1e6, 0)])
+def test_a_given_density_counts_for_tentative_landmarks_too(density, size):
+    slam = make_estimator(
+        "ekf",
+        motion_std=(0.1, 0.1, 0.1),
+        measurement_std=(0.1, 0.1),
+        management={"association": "joint", "confirm": (3, 3), "density": density},
+    )
+    for _ in range(3):
+        slam.update([(0.3, 4.0)])
+    assert len(slam.landmark_ids) == size
+
+
 @pytest.mark.slow
 def test_hidden_identities_are_found_out():
     world = load_scenario("hidden_identities")
@@ -315,7 +338,7 @@ def test_a_landmark_is_too_near_within_ten_standard_deviations(seed, share):
 
 
 def test_a_reading_is_screened_at_the_expected_distance(monkeypatch):
-    for name in ("is_too_near", "set_noise", "variances"):
+    for name in ("is_too_near", "variances"):
         monkeypatch.setattr(screening, name, plain(getattr(screening, name)))
     rules = Rules(first_std=0.1, second_std=0.2, std_per_metre=0.1, std_metres=0.3)
     mean = np.array([1.0, 2.0, 0.5, 9.0, 9.0, 4.0, 6.0])  # 5 m from the second landmark
