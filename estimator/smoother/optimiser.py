@@ -120,7 +120,9 @@ class Optimiser:
         rules = noise.rules
         self._rule_values = np.array(rules)
         self._robust = noise.kind, noise.scale
-        varies = max(rules.std_per_metre, rules.std_metres) > 0
+        std = rules.first_std, rules.second_std
+        near, far = noise.sensor.stds(std, np.array([1.0, 2.0]))
+        varies = bool((near != far).any())
         self._varies = varies and not rules.noise_as_read
         self._owners = np.repeat(np.arange(poses), np.diff(drive.firsts))
         self._by_landmark = np.argsort(drive.columns, kind="stable")

@@ -366,6 +366,19 @@ def test_noise_that_grows_with_the_range_is_that_of_the_expected_range():
     assert not np.allclose(smooth(read).poses, smoothed.poses, atol=1e-4)
 
 
+def grown_std(noise, distance):
+    return noise[0] + 0.0 * distance, noise[1] + 0.05 * distance
+
+
+@pytest.mark.slow
+def test_noise_that_grows_by_a_function_of_ones_own_is_taken_at_the_solution():
+    own = replace(BEARING_RANGE, name="own", std=grown_std)
+    shipped = BEARING_RANGE.with_noise(range_std_per_metre=0.05)
+    noise = {"measurement_std": (0.02, 0.02)}
+    one, other = (smooth(recorded(sensor=s, **noise)[0]) for s in (own, shipped))
+    assert one.poses == pytest.approx(other.poses, abs=1e-12)
+
+
 def test_a_sensor_of_positions_is_smoothed_as_dense_least_squares():
     std, sensor = (0.005, 0.1), BEARING_RANGE.with_noise(bearing_std_metres=0.1)
     as_read = sensor.with_noise(range_noise_at="reading")
