@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array
 from ..estimator.interface import ScanDecisions
+from ..estimator.models.rigid_motion import rotation
 from ..estimator.models.sensors import Sensor, find_sensor, former_noise
 from ..estimator.support.argument_checks import as_floats
 
@@ -181,9 +182,11 @@ def oracle_errors(
         z, of = readings[np.isin(of, names)], of[np.isin(of, names)]
         if not len(z) or not np.isfinite(pose).all():
             continue
-        distance = np.hypot(*(true - pose[:2]).T)
+        x, y = ((true - pose[:2]) @ rotation(pose[2])).T
+        distance = np.maximum(np.hypot(x, y), 1e-12)
         stds = np.maximum(read.stds(measurement_std, distance), 1e-12)
-        apart = read.difference(z[:, None], read.predict(pose, true).measurement)
+        with np.errstate(divide="ignore", invalid="ignore"):  # slopes at the landmark
+            apart = read.difference(z[:, None], read.read(x, y))
         squared = ((apart / stds) ** 2).sum(axis=2)
         right = [_place(places, i) for i in of.tolist()]
         wrong += int((groups[squared.argmin(axis=1)] != right).sum())

@@ -117,7 +117,7 @@ def posterior_bound(
     check = argument_checks.standard_deviations
     stds = check("measurement_std", measurement_std, 2)
     read = find_sensor(sensor)
-    noise = np.array([*stds, read.range_std_per_metre, float(read == POSITION)])
+    noise = np.array([*read.noise(stds), float(read == POSITION)])
     motion = check("motion_std", motion_std, 3) ** 2
     start = check("start_std", start_std, 3)
     durations = np.broadcast_to(np.asarray(dt, dtype=np.float64), (count, steps)).copy()
@@ -271,9 +271,9 @@ def _follow(
             dx, dy = landmarks[i, 0] - x, landmarks[i, 1] - y
             bx, by, rx, ry = reading_slopes_jit(dx, dy)
             distance = np.sqrt(dx * dx + dy * dy)
-            across = noise[0] ** 2
+            across = (noise[0] + noise[3] / max(distance, 1e-12)) ** 2
             along = (noise[1] + noise[2] * distance) ** 2
-            if noise[3] > 0:  # (x, y) in the robot's frame
+            if noise[4] > 0:  # (x, y) in the robot's frame
                 ry, rx = np.cos(poses[t, 2]), -np.sin(poses[t, 2])
                 bx, by, distance = ry, -rx, 1.0
             c = 3 + 2 * i

@@ -351,7 +351,7 @@ def _sensor_noise(
     bearing, distance = readings[run, step, landmark].T
     expected = np.arctan2(dy, dx) - poses[run, step, 2], np.hypot(dx, dy)
     bearing_error = wrap_angle(bearing - expected[0])
-    bearing_std, range_std = sensor.stds(std, expected[1]).T
+    bearing_std, range_std = sensor.stds(std, np.maximum(expected[1], 1e-12)).T
     return [
         _Noise(bearing_error, bearing_std, 1.0, run, follows),
         _Noise(distance - expected[1], range_std, 1.0, run, follows),

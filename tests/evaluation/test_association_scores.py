@@ -195,5 +195,8 @@ def test_the_oracle_takes_the_landmark_of_the_least_mahalanobis_distance():
         )
         assert 0 < found < 1
         assert found == np.mean(wrong)
+    at_one = [(0.0, 0.0), (1.0, 0.0)]  # the robot is where a landmark is
+    drive = np.zeros((1, 3)), [np.array([(0.0, 1.0)])], [[3]]
+    assert oracle_errors(*drive, [2, 3], at_one, std) == 0
     nothing = oracle_errors(poses[4:5], scans[4:5], truth[4:5], ids, world, std)
     assert math.isnan(nothing)

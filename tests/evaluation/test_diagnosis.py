@@ -94,6 +94,12 @@ def test_steps_that_do_not_count_are_left_out_of_the_motion_alone():
     assert sums[:, 3:, 0].tolist() == summed(*data)[:, 3:, 0].tolist()
 
 
+def test_a_reading_from_the_place_of_its_landmark_is_counted():
+    poses, points, *rest = drive(np.random.default_rng(3))[:5]
+    points[0, 0] = poses[0, 2, :2]
+    assert np.isfinite(summed(poses, points, *rest)).all()
+
+
 def test_a_noise_that_is_not_assumed_and_not_there_is_no_channel():
     data = drive(np.random.default_rng(3), noise_in="odometry")[:5]
     options = {"measurement_std": SENSOR_STD, "motion_std": (0.2, 0.0, 0.05)}

@@ -18,7 +18,9 @@ from slamgym.evaluation.error_bound import (
 NOISE = {
     "motion_std": (0.1, 0.05, 0.03),
     "measurement_std": (0.02, 0.1),
-    "sensor": BEARING_RANGE.with_noise(range_std_per_metre=0.01),
+    "sensor": BEARING_RANGE.with_noise(
+        range_std_per_metre=0.01, bearing_std_metres=0.05
+    ),
 }
 START_STD = (0.1, 0.2, 0.05)
 PLACES = np.array([[3.0, 2.0], [-1.0, 4.0], [2.0, -5.0], [6.0, 1.0]])
