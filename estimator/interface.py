@@ -511,7 +511,9 @@ def hides_its_belief(slam: object) -> bool:
     """
     kind: Any = type(slam)
     owner = next((base for base in kind.__mro__ if "map_view" in vars(base)), kind)
-    return owner is not kind and kind.belief is not owner.belief
+    return owner is not kind and kind.belief is not getattr(
+        owner, "belief", kind.belief
+    )
 
 
 @lru_cache(maxsize=64)

@@ -80,7 +80,7 @@ class Motion:
         rest: Any
         try:
             rest = [float(part) for part in self.displacement(0.0, 0.0)]
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, ArithmeticError) as error:
             rest = error
         if rest != [0.0, 0.0, 0.0]:
             raise ValueError(

@@ -117,6 +117,8 @@ class Sensor:
             part = getattr(self, name)
             if not (callable(part) or (name == "inverse" and part is None)):
                 raise self._refused(f"{name} must be a function, got {part!r}")
+        for name in ("columns", "units", "angles"):  # kernels are kept by the sensor
+            object.__setattr__(self, name, tuple(getattr(self, name)))
         if self.size not in (1, 2) or len(self.units) != self.size:
             raise self._refused(
                 "columns and units must name the same one or two numbers, got "

@@ -9,7 +9,7 @@ from scipy.optimize import root
 from slamgym.estimator import EkfSlam, list_estimators, make_estimator
 from slamgym.estimator.filters.conditioning import coincide, separation
 from slamgym.estimator.filters.gaussian_map import without_landmarks
-from slamgym.estimator.interface import marginal
+from slamgym.estimator.interface import marginal, view_map
 from slamgym.estimator.map_management.map_editor import MapEditor
 from slamgym.estimator.models.rigid_motion import invariant_covariance, invariant_error
 
@@ -18,6 +18,21 @@ MANAGEABLE = list_estimators()
 START_STD = (0.05, 0.05, 0.1)
 IDS = list(range(6))
 TRUE_MAP = dict(enumerate(SIX))
+
+
+class Views:
+    """A part of a filter that shows the map of its belief."""
+
+    def map_view(self):
+        return "view"
+
+
+def test_a_map_view_of_a_class_without_belief_is_used():
+    class Own(Views):
+        def belief(self):
+            raise AssertionError
+
+    assert view_map(Own()) == "view"
 
 
 def random_map(seed, landmarks=4):

@@ -147,6 +147,7 @@ def test_the_check_names_the_mistake(displacement, mistake):
         ({"columns": ("a",)}, "columns of motion 'unicycle' must name the two numbers"),
         ({"units": ("m", "m", "rad")}, "units of motion 'unicycle' must name the two"),
         ({"displacement": 3}, "displacement of motion 'unicycle' must be a function"),
+        ({"displacement": lambda d, a: (d / a, 0, a)}, "got float division by zero"),
         ({"displacement": lambda a, b: (a, b)}, "must return"),
         ({"displacement": lambda a: (a, a, a)}, "must return"),
         ({"displacement": lambda a, b: a}, "must return"),

@@ -390,6 +390,13 @@ def test_a_sensor_whose_parts_do_not_fit_is_refused_when_built(change, message):
         replace(BEARING, inverse=mirrored)
 
 
+def test_names_of_a_sensor_may_be_lists():
+    names = {name: list(getattr(COPY, name)) for name in ("columns", "units", "angles")}
+    lists = replace(COPY, **names)
+    assert lists == COPY
+    assert hash(lists) == hash(COPY)
+
+
 @pytest.mark.parametrize(
     "door",
     [
