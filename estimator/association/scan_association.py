@@ -198,6 +198,21 @@ class ScanAssociation:
 # for long.  For the same reason something may hide a landmark until it is seen again::
 #
 #     P(missed so often) = ε + (1 − ε) Π (1 − P_D)
+#
+# A run is probably lost if the scans show far fewer landmarks than its map promises.
+# Page's test [1]_ compares the P_D of landmarks that are in view for sure, the least
+# within two σ, with a fraction ρ of it::
+#
+#     g ← max(0, g + min(c, Σ_seen ln ρ + Σ_missed ln (1 − ρ P_D) / (1 − P_D)))
+#
+# A scan adds at most c, since a single wrong pose may cause all its misses.  A landmark
+# that no two scans have shown since it entered the map may be of clutter: to miss it is
+# no evidence.  P_D learns the rates of a lost run, too, so g falls again: the largest g
+# counts.
+#
+# References
+# ----------
+# .. [1] E. S. Page, Continuous inspection schemes, Biometrika 41, 1954.
 
 
 class Detections(NamedTuple):
@@ -221,11 +236,17 @@ class Detections(NamedTuple):
     #: For landmarks that may have been in view since they were last seen, the
     #: probability of missing them so often if nothing hides them.
     missed: Mapping[int, float]
+    #: In how many scans a landmark was shown, up to `PROVEN`.
+    shown: Mapping[int, int]
+    #: g, evidence that the run is lost: a logarithm of a ratio of likelihoods.
+    lost: float = 0.0
+    #: The largest g so far.
+    most_lost: float = 0.0
 
     @classmethod
     def none(cls) -> Detections:
         """Return the state before the first scan."""
-        return cls(np.zeros((SECTORS, RINGS)), np.zeros((SECTORS, RINGS)), {})
+        return cls(np.zeros((SECTORS, RINGS)), np.zeros((SECTORS, RINGS)), {}, {})
 
     def after(
         self, view: MapView, slots: IntArray, longest: float
@@ -245,10 +266,16 @@ class Detections(NamedTuple):
         is_seen[slots[slots >= 0]] = True
         missed = np.array([self.missed.get(i, 1.0) for i in view.ids])
         counts = self.seen.copy(), self.expected.copy()
-        cost = _count(view.mean, view.covariance, is_seen, longest, counts, missed)
+        shown = np.array([self.shown.get(i, 0) for i in view.ids], dtype=np.int64)
+        known, P = (is_seen, shown >= PROVEN), view.covariance
+        cost, fewer = _count(view.mean, P, known, longest, counts, missed)
+        shown = np.minimum(shown + is_seen, PROVEN)
+        lost = max(0.0, self.lost + min(fewer, MOST_OF_SCAN))
         every = {**self.missed, **dict(zip(view.ids, missed.tolist(), strict=True))}
         some = {i: left for i, left in every.items() if left < 1}
-        return cost, Detections(*counts, some)
+        proven = {**self.shown, **dict(zip(view.ids, shown.tolist(), strict=True))}
+        most_lost = max(self.most_lost, lost)
+        return cost, Detections(*counts, some, proven, lost, most_lost)
 
 
 class UnexplainedDensity(NamedTuple):
@@ -345,7 +372,7 @@ class Candidates:
     scan: int = 0
     #: Of readings that belong to no landmark of the map.
     density: UnexplainedDensity = field(default_factory=UnexplainedDensity)
-    #: Which landmarks the scans have shown; counted for hypotheses only.
+    #: Which landmarks the scans have shown.
     detections: Detections = field(default_factory=Detections.none)
 
     def state_dict(self) -> dict[str, Any]:
@@ -360,6 +387,8 @@ class Candidates:
             "detected": self.detections.seen,
             "expected": self.detections.expected,
             "missed": list(self.detections.missed.items()),
+            "shown": list(self.detections.shown.items()),
+            "lost": [self.detections.lost, self.detections.most_lost],
         }
         return saved_states.write(found, CANDIDATES)
 
@@ -390,13 +419,19 @@ class Candidates:
         missed = {int(i): left for i, left in saved["missed"].tolist()}
         if not all(0 <= left <= 1 for left in missed.values()):
             raise ValueError("state['tentative.missed'] must be probabilities")
+        shown = dict(saved["shown"].tolist())
+        lost, most_lost = saved["lost"].tolist()
+        if not 0 <= lost <= most_lost:
+            raise ValueError(
+                "state['tentative.lost'] must be >= 0, the first at most the second"
+            )
         return cls(
             TentativeLandmarks(*(saved[key] for key in TENTATIVE)),
             waiting,
             int(saved["next_id"]),
             int(saved["scan"]),
             UnexplainedDensity(*density.tolist())._replace(cells=saved["unexplained"]),
-            Detections(seen, expected, missed),
+            Detections(seen, expected, missed, shown, lost, most_lost),
         )
 
 
@@ -415,6 +450,8 @@ CANDIDATES: saved_states.Table = {
     "detected": (saved_states.NUMBERS, SECTORS, RINGS),
     "expected": (saved_states.NUMBERS, SECTORS, RINGS),
     "missed": (saved_states.NUMBERS, -1, 2),
+    "shown": (saved_states.WHOLE, -1, 2),
+    "lost": (saved_states.NUMBERS, 2),
 }
 
 #: Weights of a Gaussian at 0, +2 σ and −2 σ, which keep its variance.
@@ -429,23 +466,40 @@ SUREST = 0.95
 #: A bearing whose two σ are wider than this says nothing [rad].
 WIDEST = np.pi / 4
 
+#: ρ: detection rate of a lost run, relative to that of its map.
+FEWER = 0.3
+
+#: c: most evidence of being lost from one scan.
+MOST_OF_SCAN = 3.0
+
+#: A run whose g has exceeded this is probably lost.
+LOST_SCORE = 6.0
+
+#: A landmark that was shown in this many scans is not of clutter.
+PROVEN = 2
+
 
 @jit
 def _count(
     mean: Array,
     P: Array,
-    is_seen: BoolArray,
+    known: tuple[BoolArray, BoolArray],
     longest: float,
     counts: tuple[Array, Array],
     missed: Array,
-) -> float:
+) -> tuple[float, float]:
+    """Count a scan; return its cost, and the evidence that the run is lost.
+
+    Known of every landmark is whether the scan shows it, and whether it is proven.
+    """
+    is_seen, is_proven = known
     seen, expected = counts
     sectors, rings = seen.shape
     ring = (seen.sum(axis=0) + 1) / (expected.sum(axis=0) + 2)
     sector = (seen.sum(axis=1) + 1) / (expected.sum(axis=1) + 2)
     usual = np.minimum(sector.reshape(-1, 1), ring.reshape(1, -1))
     shares = np.minimum((seen + 2 * usual) / (expected + 2), SUREST)
-    cost = 0.0
+    cost, fewer = 0.0, 0.0
     for j in range(len(is_seen)):
         bearing, distance, turn, aside = _place_in_scan(mean, P, j)
         cell = (
@@ -459,6 +513,7 @@ def _count(
         if is_seen[j]:
             cost -= 2 * np.log(shares[cell])
             missed[j] = 1.0
+            fewer += is_sure * np.log(FEWER)
         elif distance - aside < longest:
             least, likely = SUREST, 0.0
             for a in range(-1, 2):
@@ -472,7 +527,9 @@ def _count(
             odds = HIDDEN + (1 - HIDDEN) * left
             cost -= 2 * np.log(odds / (HIDDEN + (1 - HIDDEN) * missed[j]))
             missed[j] = left
-    return cost
+            if is_sure and is_proven[j]:
+                fewer += np.log((1 - FEWER * least) / (1 - least))
+    return cost, fewer
 
 
 @jit
@@ -533,12 +590,10 @@ def associate(
 
     options = []
     for cost, slots in found.ranked:
-        missed, detections = 0.0, candidates.detections
-        if policy.association == "hypotheses":
-            longest = candidates.density.longest
-            missed, detections = detections.after(view, slots, longest)
-            if policy.density is None:  # the Poisson probability of no other reading
-                missed += 2 * candidates.density.per_scan
+        longest = candidates.density.longest
+        missed, detections = candidates.detections.after(view, slots, longest)
+        if policy.density is None:  # the Poisson probability of no other reading
+            missed += 2 * candidates.density.per_scan
         options.append((cost + missed, partial(complete, slots, detections)))
     return sorted(options, key=lambda option: option[0])
 

@@ -211,6 +211,16 @@ class HypothesisSlam:
         return self.best.landmark_ids
 
     @property
+    def lost_score(self) -> float:
+        """Evidence that the most probable hypothesis is lost, see `ManagedSlam`."""
+        return self.best.lost_score
+
+    @property
+    def probably_lost(self) -> bool:
+        """Whether the most probable hypothesis is probably lost."""
+        return self.best.probably_lost
+
+    @property
     def decisions(self) -> Sequence[ScanDecisions]:
         """The decisions of the most probable hypothesis about the scans so far."""
         return self.best.decisions

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array
 from ..association.scan_association import (
+    LOST_SCORE,
     Candidates,
     Option,
     ScanAssociation,
@@ -147,6 +148,16 @@ class ManagedSlam:
         places = self.candidates.tentative.places
         x, y, heading = self._editor.map_view().mean[:3]
         return np.asarray(places @ rotation(heading).T + (x, y))
+
+    @property
+    def lost_score(self) -> float:
+        """Evidence that the run is lost, see `Detections` [-]; 0 at the start."""
+        return self.candidates.detections.most_lost
+
+    @property
+    def probably_lost(self) -> bool:
+        """Whether the run is probably lost: `lost_score` is above `LOST_SCORE`."""
+        return self.lost_score > LOST_SCORE
 
     @property
     def decisions(self) -> list[ScanDecisions]:

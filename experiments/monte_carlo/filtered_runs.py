@@ -283,12 +283,13 @@ def bound_runs(scenario: Scenario, runs: SimulatedRuns) -> PosteriorBound:
         measurement_std=scenario.sensor.std,
         start_std=scenario.start.std,
         pose_std=runs.fix_std,
-        sensor=_with_noise(scenario.sensor.kind, scenario),
+        sensor=sensor_with_noise(scenario.sensor.kind, scenario),
     )
     return bound._replace(covariances=())
 
 
-def _with_noise(kind: str, scenario: Scenario) -> Sensor:
+def sensor_with_noise(kind: str, scenario: Scenario) -> Sensor:
+    """Return a sensor with the noise per metre of a world."""
     growth = scenario.sensor.range_std_per_metre
     return find_sensor(kind).with_noise(range_std_per_metre=growth)
 
@@ -313,7 +314,7 @@ def noise_of_runs(scenario: Scenario, assumed: Scenario, runs: SimulatedRuns) ->
         identified.visible & (scenario.sensor.kind == "bearing_range"),
         motion_std=assumed.motion.std,
         measurement_std=assumed.sensor.std,
-        sensor=_with_noise("bearing_range", assumed),
+        sensor=sensor_with_noise("bearing_range", assumed),
         noise_in=assumed.motion.noise_in,
         noisy_steps=noisy,
     )

@@ -232,7 +232,8 @@ def _bad_run(summary: dict[str, Any]) -> str:
     return (
         " A run is bad if it failed, or if its path error is more than "
         f"{scores[0]['bad_runs']['margin']:g} m above that of the same filter with "
-        "known identities."
+        "known identities. A filter raises the alarm where scans show far fewer "
+        "landmarks than its map promises."
     )
 
 

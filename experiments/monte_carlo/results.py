@@ -245,7 +245,7 @@ def _coordinates(job: Job, runs: range) -> dict[str, np.ndarray[Any, Any]]:
 # --------------------------------------------------------------------------------------
 # The folder of a Monte Carlo: it belongs to one job (``job.json``) and one writer.
 
-FORMAT = "slamgym monte carlo 4"
+FORMAT = "slamgym monte carlo 5"
 JOB, BLOCKS, RESULTS = "job.json", "blocks", "results.nc"
 REPORT, SUMMARY = "report.html", "summary.json"
 

@@ -17,7 +17,12 @@ from ...estimator.interface import Belief
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.rigid_motion import ERROR_FRAMES, invariant_error
 from ...evaluation import nees
-from ...evaluation.association_scores import AssociationScores, Gospa
+from ...evaluation.association_scores import (
+    AssociationScores,
+    Gospa,
+    oracle_errors,
+    places_of,
+)
 from ...evaluation.error_bound import PosteriorBound, invariant_squares
 from ...evaluation.noise_findings import CHANNELS, MOMENTS
 from ...evaluation.trajectory_error import ellipse_areas, position_accuracy
@@ -25,7 +30,7 @@ from ...sim_configs import Scenario
 from ..runs.filter_settings import FilterSettings
 from ..runs.simulated_runs import SimulatedRuns
 from ..runs.trace import TrueLandmarks, compare_association
-from .filtered_runs import Failure, FilteredRuns, filter_runs
+from .filtered_runs import Failure, FilteredRuns, filter_runs, sensor_with_noise
 
 Block = dict[str, NDArray[np.generic]]
 
@@ -95,6 +100,10 @@ MAPS = ("raw", "aligned")
 
 PREFIX = "association_"
 
+ALARM = "probably_lost"
+
+ORACLE = f"{PREFIX}oracle_errors"
+
 #: Followed by the error frame.
 KNOWN_IDS_NEES = "known_ids_nees"
 
@@ -107,6 +116,8 @@ _ASSOCIATION: dict[str, str] = {
         for which in MAPS
         for part in Gospa._fields
     },
+    ORACLE: "share of readings that even the true pose and map would take wrongly",
+    ALARM: "1 if the filter reports that it is probably lost, else 0",
     KNOWN_IDS_ATE: "path error of the same filter with known identities, raw [m]",
 }
 
@@ -360,8 +371,10 @@ def measure_association(
         made, truth, belief.landmark_ids, belief.landmarks, resolution=resolution
     )
     scores = {} if found.scores is None else found.scores.as_dict()
+    alarm = {} if made.probably_lost is None else {ALARM: float(made.probably_lost)}
     parts = {"raw": found.raw, "aligned": found.aligned}
     return {
+        **alarm,
         **{f"{PREFIX}{name}": float(value) for name, value in scores.items()},
         **{
             f"gospa_{which}_{part}": float(value)
@@ -369,6 +382,36 @@ def measure_association(
             for part, value in whole._asdict().items()
         },
     }
+
+
+def oracle_of_runs(scenario: Scenario, runs: SimulatedRuns, resolution: float) -> Array:
+    """Return the share of readings that true pose and map assign wrongly, shape (B,).
+
+    The noise is that of the world, see :func:`~slamgym.evaluation.oracle_errors`; nan
+    where identities are known.
+    """
+    shares = np.full(len(runs.visible), np.nan)
+    if runs.true_ids is None:
+        return shares
+    sensor = sensor_with_noise(scenario.sensor.kind, scenario)
+    for run, landmarks in enumerate(runs.landmarks):
+        rows = runs.visible[run]
+        true_ids, z = (
+            [part[seen] for part, seen in zip(whole[run], rows, strict=True)]
+            for whole in (runs.true_ids, runs.measurements)
+        )
+        ids = np.arange(len(landmarks))
+        shares[run] = oracle_errors(
+            runs.true_poses[run],
+            z,
+            true_ids,
+            ids,
+            landmarks,
+            scenario.sensor.std,
+            sensor=sensor,
+            places=places_of(ids, landmarks, resolution),
+        )
+    return shares
 
 
 def identified(belief: Belief, identities: Mapping[int, int]) -> Belief:

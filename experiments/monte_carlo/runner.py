@@ -44,7 +44,14 @@ from .results import (
     opened,
     write_results,
 )
-from .run_measures import SMALL_NOISE, Block, measure_runs, with_known_ids
+from .run_measures import (
+    ORACLE,
+    SMALL_NOISE,
+    Block,
+    measure_runs,
+    oracle_of_runs,
+    with_known_ids,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -286,6 +293,7 @@ class _Work:
         runs = simulate_runs(world, len(span), first, only_read=True)
         bound = bound_runs(world, runs)
         noise = noise_of_runs(world, self.job.assumed, runs)
+        oracle = oracle_of_runs(world, runs, self.job.resolution)
         parts = []
         for settings in self.settings:
             filtered = filter_runs(settings, runs, threads=self.threads)
@@ -294,6 +302,7 @@ class _Work:
             )
             if runs.true_ids is not None:
                 part |= with_known_ids(settings, runs, self.threads)
+                part[ORACLE] = oracle
             parts.append(part)
         return parts
 

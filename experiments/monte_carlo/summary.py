@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from ...arrays import AnyArray, Array
+from ...arrays import AnyArray, Array, BoolArray
 from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation.association_scores import CUTOFF, Gospa
 from ...evaluation.consistency_report import ConsistencyReport
@@ -24,7 +24,16 @@ from ...evaluation.hypothesis_tests import (
     average_band,
 )
 from ..runs.trace import finite, mean, quotient, root_mean_square
-from .run_measures import COUNTS, KNOWN_IDS_ATE, MAPS, MARGIN, PREFIX, SHARES
+from .run_measures import (
+    ALARM,
+    COUNTS,
+    KNOWN_IDS_ATE,
+    MAPS,
+    MARGIN,
+    ORACLE,
+    PREFIX,
+    SHARES,
+)
 from .verdict import (
     FITTED,
     POINT_FREEDOM,
@@ -265,6 +274,18 @@ def _missed_and_false(found: dict[str, float | None]) -> str:
     return ", ".join(NOTHING if count is None else number(count) for count in counts)
 
 
+def _alarms(found: dict[str, int]) -> str:
+    """Write the alarms among bad and among other runs.
+
+    Examples
+    --------
+    >>> _alarms({"count": 4, "runs": 60, "found": 3, "bad": 3})
+    '3 of 3, 1 of 57'
+    """
+    false, others = found["count"] - found["found"], found["runs"] - found["bad"]
+    return f"{found['found']} of {found['bad']}, {false} of {others}"
+
+
 def _count(found: list[Any]) -> str:
     return str(len(found))
 
@@ -366,8 +387,10 @@ _ASSOCIATION: tuple[tuple[Any, ...], ...] = (
     ("missed", "… not used", "0"),
     ("clutter_used", "… clutter used", "0"),
     ("precision", "precision", "1", share),
+    ("oracle_errors", "… with true pose and map", "", lambda wrong: share(1 - wrong)),
     ("recall", "recall", "1", share),
     ("bad_runs.count", "bad runs of {runs}", "0", str),
+    ("alarm", "… alarms in bad runs, in others", "all, 0", _alarms),
 )
 
 
@@ -575,12 +598,16 @@ def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
         the metric and its parts, and the ``cutoff`` [m].  ``resolution`` [m].
         ``bad_runs``: ``count`` and ``share`` of all runs, failed or more than
         ``margin`` [m] worse than with known identities.  ``median_ate``: ``hidden``
-        and ``known`` [m], raw.
+        and ``known`` [m], raw.  ``oracle_errors``, the mean share of readings that
+        even the true pose and map would assign wrongly.  ``alarm``: ``count`` and
+        ``share`` of the ``runs`` that report whether they are probably lost, and do;
+        ``found`` of the ``bad`` ones among them; None where no run reports it.
     """
     if KNOWN_IDS_ATE not in scores.results:
         return None
     hidden, known = scores.per_run("ate"), scores.per_run(KNOWN_IDS_ATE)
-    bad = int((~scores.good).sum() + (hidden > known + MARGIN).sum())
+    is_bad = hidden > known + MARGIN
+    bad = int((~scores.good).sum() + is_bad.sum())
     parts = {
         which: {
             part: mean(scores.per_run(f"gospa_{which}_{part}"))
@@ -593,7 +620,23 @@ def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
         "gospa": {**parts, "cutoff": CUTOFF},
         "resolution": float(scores.results.attrs.get("resolution", 0.0)),
         "bad_runs": {"count": bad, "share": bad / len(scores.good), "margin": MARGIN},
+        "oracle_errors": mean(scores.per_run(ORACLE)),
+        "alarm": _alarm(scores.per_run(ALARM), is_bad),
         "median_ate": {"hidden": _median(hidden), "known": _median(known)},
+    }
+
+
+def _alarm(raised: Array, is_bad: BoolArray) -> dict[str, Any] | None:
+    known = np.isfinite(raised)
+    if not known.any():
+        return None
+    is_raised, is_bad = raised[known] > 0, is_bad[known]
+    return {
+        "count": int(is_raised.sum()),
+        "share": float(is_raised.mean()),
+        "runs": int(known.sum()),
+        "found": int((is_raised & is_bad).sum()),
+        "bad": int(is_bad.sum()),
     }
 
 

@@ -19,7 +19,7 @@ from ...estimator.interface import Belief, MapView, SlamEstimator, UpdateReport
 from ...estimator.map_management import hypotheses, managed_slam
 from ..logs import ground_truth, recording, slamlog
 from .filter_settings import one_blas_thread, refuse_large_map
-from .trace import DecisionRecorder, MapEstimate, RunDecisions, RunTrace
+from .trace import DecisionRecorder, MapEstimate, RunDecisions, RunTrace, alarm_of
 
 Progress = Callable[[int, int], object]
 Watcher = Callable[[int, SlamEstimator, UpdateReport | None], object]
@@ -61,6 +61,9 @@ class Replay:
     last_seen: Mapping[int, int] = field(default_factory=dict)
     #: Its decisions about readings without identity, if the log has true ids.
     decisions: RunDecisions | None = None
+    #: Whether it reports at the end that it is probably lost; None where identities are
+    #: known, or it does not say.
+    probably_lost: bool | None = None
 
 
 def replay(
@@ -149,7 +152,8 @@ def replay(
                 recorder.add(predicted, report)
             watch(number, estimator, report)
             progress(number + 1, len(steps))
-    made = decisions.result() if ground_truth.hides_identities(log) else None
+    hidden = ground_truth.hides_identities(log)
+    made = decisions.result() if hidden else None
     identities = None if made is None else made.identities()
     trace = recorder.trace(_name_of(estimator, name), times, log, identities)
     return Replay(
@@ -161,6 +165,7 @@ def replay(
         changes=MapChanges(**recorder.changes),
         last_seen=recorder.last_seen,
         decisions=made,
+        probably_lost=alarm_of(estimator) if hidden else None,
     )
 
 

@@ -51,7 +51,8 @@ def summarise(
         `nis_summary`; ``nees``, see `nees_summary`; ``ate``, the root mean
         square distance of the path from the truth at the times of the truth, and
         ``landmark_rmse``, that of the map, both ``{raw, aligned}`` [m];
-        ``association``, see `association_summary`; ``warnings``, see
+        ``association``, see `association_summary`; ``probably_lost``, whether the
+        filter reports so, None where identities are known; ``warnings``, see
         `run_warnings`; ``log``, ``estimator``, ``settings``, and
         ``slamgym``, the version.
     """
@@ -73,6 +74,7 @@ def summarise(
         "ate": rmse_table(ground_truth.path_accuracy(log, trace.t, trace.poses)),
         "landmark_rmse": rmse_table(map_accuracy(trace)),
         "association": association_summary(replay, resolution, settings),
+        "probably_lost": replay.probably_lost,
         "warnings": run_warnings(replay),
     }
 
@@ -299,6 +301,13 @@ MANY_SCANS = 10
 MOST_ABANDONED = 0.25
 
 
+#: Of a filter that is probably lost.
+LOST = (
+    "The run is probably lost: the scans showed far fewer landmarks than the map "
+    "promised."
+)
+
+
 def run_warnings(replay: Replay) -> list[str]:
     """List what is suspicious about a run.
 
@@ -307,7 +316,8 @@ def run_warnings(replay: Replay) -> list[str]:
     list of str
         Sentences of one line.
     """
-    found = [_rejections(replay), _nis(replay), _crowded_map(replay)]
+    found = [LOST * bool(replay.probably_lost)]
+    found += [_rejections(replay), _nis(replay), _crowded_map(replay)]
     return [sentence for sentence in found if sentence]
 
 

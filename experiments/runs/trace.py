@@ -155,6 +155,8 @@ class RunDecisions(NamedTuple):
     true_ids: Sequence[IntArray]
     #: (k, n): the filter believes a landmark seen in k of n scans.
     confirm: tuple[int, int]
+    #: Whether the filter reports that it is probably lost; None: it does not say.
+    probably_lost: bool | None = None
 
     def identities(self) -> dict[int, int]:
         """Return the true landmark of each mapped one, -1 for clutter."""
@@ -224,7 +226,14 @@ class DecisionRecorder:
         true_ids = [ids for ids in self._true_ids if ids is not None]
         if [len(scan.row_ids) for scan in made] != [len(ids) for ids in true_ids]:
             return None
-        return RunDecisions(made, true_ids, policy_of(self._slam).confirm)
+        confirm = policy_of(self._slam).confirm
+        return RunDecisions(made, true_ids, confirm, alarm_of(self._slam))
+
+
+def alarm_of(slam: object) -> bool | None:
+    """Return whether an estimator is probably lost; None where it does not say."""
+    alarm = getattr(slam, "probably_lost", None)
+    return None if alarm is None else bool(alarm)
 
 
 def compare_association(

@@ -1,5 +1,6 @@
 """Costs of landmarks that a scan misses, and of readings that fit tentative ones."""
 
+import pickle
 from itertools import product
 
 import numpy as np
@@ -11,7 +12,11 @@ from slamgym.estimator.association.scan_assignments import (
     predicted_readings,
 )
 from slamgym.estimator.association.scan_association import (
+    FEWER,
     HIDDEN,
+    LOST_SCORE,
+    MOST_OF_SCAN,
+    PROVEN,
     RINGS,
     SECTORS,
     SUREST,
@@ -19,6 +24,7 @@ from slamgym.estimator.association.scan_association import (
     Detections,
 )
 from slamgym.estimator.interface import MapView
+from slamgym.estimator.map_management.hypotheses import Hypothesis
 
 LONGEST = 6.0
 
@@ -40,8 +46,8 @@ def plain_count(view, slots, detections):
     shares = (seen + 2 * np.minimum(sector[:, None], ring)) / (tries + 2)
     shares = np.minimum(shares, SUREST)
     size = np.array([2 * np.pi / SECTORS, LONGEST / RINGS])
-    cost, missed = 0.0, {}
-    after = Detections(seen.copy(), tries.copy(), missed)
+    cost, missed, fewer = 0.0, {}, 0.0
+    after = Detections(seen.copy(), tries.copy(), missed, {})
     for j, (bearing, distance) in enumerate(expected):
         std = np.sqrt(np.diagonal(joint)[2 * j : 2 * j + 2])
         middle = np.array([bearing + np.pi, distance])
@@ -52,6 +58,7 @@ def plain_count(view, slots, detections):
         if is_sure:
             after.expected[a % SECTORS, b] += 1
             after.seen[a % SECTORS, b] += j in slots
+            fewer += np.log(FEWER) * (j in slots)
         if j in slots or distance - 2 * std[1] >= LONGEST:
             continue
         found = []
@@ -61,27 +68,39 @@ def plain_count(view, slots, detections):
             weight = np.prod([1 / 8 if step else 3 / 4 for step in (across, along)])
             found.append((weight, shares[cell] if cell[1] < RINGS else 0.0))
         before = detections.missed.get(j, 1.0)
-        left = before * (1 - min(share for _, share in found))
+        least = min(share for _, share in found)
+        left = before * (1 - least)
+        if is_sure and detections.shown.get(j, 0) >= PROVEN:
+            fewer += np.log((1 - FEWER * least) / (1 - least))
         if not is_sure:
             left = min(before, 1 - sum(weight * share for weight, share in found))
         cost -= 2 * np.log(
             (HIDDEN + (1 - HIDDEN) * left) / (HIDDEN + (1 - HIDDEN) * before)
         )
         missed[j] = left
-    return cost, after
+    lost = max(0.0, detections.lost + min(fewer, MOST_OF_SCAN))
+    most_lost = max(lost, detections.most_lost)
+    return cost, after._replace(lost=lost, most_lost=most_lost)
 
 
 def test_missed_landmarks_cost_what_the_dense_equations_say():
     rng = np.random.default_rng(4)
-    total = 0.0
-    for _ in range(100):
-        view, slots = random_view(rng), rng.permutation(8)[:4]
-        counts = rng.integers(0, 30, (2, SECTORS, RINGS)).astype(float)
+    total, evidence = 0.0, []
+    for _ in range(200):
+        view, slots = random_view(rng), rng.permutation(8)[: rng.integers(5)]
+        counts = rng.integers(0, 30, (2, SECTORS, RINGS)) ** rng.uniform(0.2, 1)
         earlier = {j: rng.uniform() for j in range(0, 8, 2)}
-        before = Detections(counts.min(axis=0), counts.max(axis=0), earlier)
+        known = counts.min(axis=0), counts.max(axis=0), earlier
+        shown = {j: j % 4 for j in range(7)}
+        before = Detections(*known, shown, lost=3.0, most_lost=4.0)
         cost, after = before.after(view, slots, LONGEST)
         expected_cost, expected = plain_count(view, slots, before)
         assert cost == pytest.approx(expected_cost, rel=1e-9)
+        assert after.lost == pytest.approx(expected.lost, rel=1e-9)
+        assert after.most_lost == pytest.approx(expected.most_lost, rel=1e-9)
+        evidence.append(after.lost - before.lost)
+        more = {j: min(shown.get(j, 0) + (j in slots), PROVEN) for j in range(8)}
+        assert after.shown == more
         np.testing.assert_array_equal(after.seen, expected.seen)
         np.testing.assert_array_equal(after.expected, expected.expected)
         for j in set(range(8)) - set(slots.tolist()):
@@ -90,6 +109,9 @@ def test_missed_landmarks_cost_what_the_dense_equations_say():
         assert set(after.missed).isdisjoint(slots.tolist())
         total += cost
     assert total > 100  # many were expected
+    assert min(evidence) == -3  # both limits
+    assert max(evidence) == MOST_OF_SCAN
+    assert len(set(evidence)) > 50
 
 
 def cost_of_misses(place, std, scans):
@@ -156,3 +178,92 @@ def test_a_loop_closed_by_clutter_is_opened_where_landmarks_fail_to_appear():
     for _ in range(4):
         slam.update(np.empty((0, 2)))
     assert slam.decisions[21].row_ids == (None,)
+
+
+LANDMARKS = np.array([(4.0, 3.0), (4.0, -3.0), (-2.0, 4.0), (6.0, 0.0), (1.0, -5.0)])
+
+
+def scan_at(pose):
+    """Return the readings at a pose; the robot there drives a small circle."""
+    dx, dy = (LANDMARKS - pose[:2]).T
+    return np.column_stack([np.arctan2(dy, dx) - pose[2], np.hypot(dx, dy)])
+
+
+def circling(association, kidnapped_at=None, steps=50):
+    """Follow a robot on a circle; from one step on, its odometry misses 1.5 m."""
+    slam = make_estimator(
+        "invariant",
+        motion_std=(0.01, 0.0, 0.01),
+        measurement_std=(0.02, 0.05),
+        management={"association": association},
+    )
+    pose = np.zeros(3)
+    for step in range(steps):
+        if step == kidnapped_at:
+            pose += np.array([1.5, 1.5, 0.8])
+        slam.update(scan_at(pose))
+        pose += 0.1 * np.array([np.cos(pose[2]), np.sin(pose[2]), 1.0])
+        slam.predict((0.1, 0.1))
+    return slam
+
+
+@pytest.mark.parametrize("association", ["nearest", "joint", "hypotheses"])
+def test_a_kidnapped_robot_is_probably_lost(association):
+    slam = circling(association, kidnapped_at=30)
+    assert slam.probably_lost
+    assert slam.lost_score > LOST_SCORE
+    kept = make_estimator(
+        "invariant",
+        motion_std=(0.01, 0.0, 0.01),
+        measurement_std=(0.02, 0.05),
+        management={"association": association},
+    )
+    kept.load_state_dict(slam.state_dict())
+    assert kept.lost_score == slam.lost_score
+    assert pickle.loads(pickle.dumps(slam)).lost_score == slam.lost_score
+    slam.reset(np.zeros(3), np.zeros(3))
+    assert not slam.probably_lost
+
+
+@pytest.mark.parametrize("association", ["nearest", "joint", "hypotheses"])
+def test_a_robot_that_sees_its_map_is_not_lost(association):
+    slam = circling(association)
+    assert len(slam.landmark_ids) == len(LANDMARKS)
+    assert not slam.probably_lost
+    assert slam.lost_score < LOST_SCORE / 2
+
+
+def test_the_alarm_is_that_of_the_reported_hypothesis():
+    slam = circling("hypotheses")
+    other = circling("hypotheses", kidnapped_at=30).best
+    slam.hypotheses.append(Hypothesis(1.0, other))
+    assert not slam.probably_lost
+    slam.hypotheses.reverse()
+    assert slam.probably_lost
+
+
+def test_a_landmark_of_clutter_raises_no_alarm():
+    view = MapView(np.array([0, 0, 0, 3.0, 0.5, -2, 1]), 1e-6 * np.eye(7), (0, 1))
+    detections = Detections.none()
+    for slot in [[0]] * 80:  # landmark 1 is never shown
+        _, detections = detections.after(view, np.array(slot), LONGEST)
+    assert detections.most_lost == 0
+
+
+def test_the_alarm_stays_once_the_map_is_seen_again():
+    view = MapView(np.array([0, 0, 0, 3.0, 0.5]), 1e-6 * np.eye(5), (0,))
+    detections, scores = Detections.none(), []
+    for slot in [0] * 40 + [-1] * 8 + [0] * 40:
+        _, detections = detections.after(view, np.array([slot]), LONGEST)
+        scores.append(detections.lost)
+    assert scores[39] == scores[-1] == 0
+    assert scores[47] > LOST_SCORE
+    assert detections.most_lost == max(scores)
+
+
+@pytest.mark.parametrize("lost", [(-1.0, 2.0), (3.0, 2.0)])
+def test_a_saved_state_with_impossible_evidence_is_refused(lost):
+    slam = circling("joint", steps=5)
+    state = slam.state_dict() | {"tentative.lost": np.array(lost)}
+    with pytest.raises(ValueError, match="lost"):
+        slam.load_state_dict(state)

@@ -20,7 +20,7 @@ import xarray as xr
 
 from slamgym.envs.controllers import make_controller
 from slamgym.estimator import Belief, EkfSlam, make_estimator
-from slamgym.evaluation import AssociationScores, Gospa
+from slamgym.evaluation import AssociationScores, Gospa, oracle_errors
 from slamgym.evaluation.nees import pose_nees, state_nees
 from slamgym.experiments.command_line.monte_carlo import connected
 from slamgym.experiments.logs.recording import record_episode
@@ -244,6 +244,48 @@ def test_runs_worse_by_a_metre_than_with_known_identities_and_failed_ones_are_ba
     bad = summary["estimators"]["managed"]["association"]["bad_runs"]
     assert bad == {"count": 2, "share": 2 / 3, "margin": 1.0}
     assert summary["estimators"]["default"]["association"]["bad_runs"]["count"] == 0
+
+
+def test_alarms_are_counted_among_bad_and_other_runs(hidden):
+    results = hidden.copy(deep=True)
+    assert (hidden.probably_lost.sel(estimator="managed") == 0).all()
+    at = {"estimator": "managed"}
+    for run, (excess, alarm) in enumerate([(1.1, 1.0), (0.0, 1.0), (1.1, 0.0)]):
+        where = at | {"run": run}
+        results["ate"].loc[where] = excess + float(results.known_ids_ate.sel(where))
+        results["probably_lost"].loc[where] = alarm
+    summary = summarise_monte_carlo(results)
+    found = summary["estimators"]["managed"]["association"]["alarm"]
+    assert found == {"count": 2, "share": 2 / 3, "runs": 3, "found": 1, "bad": 2}
+    (row,) = (m for m in measures(summary) if m.path == "association.alarm")
+    assert row.of(summary["estimators"]["managed"]) == "1 of 2, 1 of 1"
+    results["probably_lost"].loc[at] = np.nan
+    summary = summarise_monte_carlo(results)
+    assert summary["estimators"]["managed"]["association"]["alarm"] is None
+
+
+def test_precision_is_compared_with_that_of_true_pose_and_map():
+    world = load_scenario("hidden_identities").with_changes(
+        steps=30, sensor={"std": (0.3, 0.8)}
+    )
+    results = monte_carlo(world, "invariant", 2)
+    runs = simulate_runs(world, 2, seed=0)
+    for run, landmarks in enumerate(runs.landmarks):
+        ids = runs.true_ids[run]
+        z = [m[i >= 0] for m, i in zip(runs.measurements[run], ids, strict=True)]
+        expected = oracle_errors(
+            runs.true_poses[run],
+            z,
+            [i[i >= 0] for i in ids],
+            np.arange(len(landmarks)),
+            landmarks,
+            (0.3, 0.8),
+        )
+        found = float(results.association_oracle_errors[0, run])
+        assert 0.01 < expected == pytest.approx(found)
+    entry = summarise_monte_carlo(results)["estimators"]["invariant"]
+    mean = float(results.association_oracle_errors.mean())
+    assert entry["association"]["oracle_errors"] == pytest.approx(mean)
 
 
 def test_a_report_shows_association_only_where_identities_are_hidden(hidden, whole):

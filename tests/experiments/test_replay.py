@@ -17,7 +17,7 @@ from slamgym.experiments.logs.recording import record_episode, steps_of
 from slamgym.experiments.logs.slamlog import LogError, OdometryRow, Scan, SlamLog
 from slamgym.experiments.runs.filter_settings import FilterSettings, settings_for
 from slamgym.experiments.runs.log_replay import MapHistory, replay
-from slamgym.experiments.runs.summary import pose_nees, summarise
+from slamgym.experiments.runs.summary import LOST, pose_nees, summarise
 from slamgym.sim_configs import load_scenario
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.02, 0.1)}
@@ -120,6 +120,33 @@ def test_without_true_ids_the_map_is_compared_with_all_landmarks():
     assert summary["correct"] is summary["precision"] is summary["map_size"] is None
     aligned = summary["gospa"]["aligned"]
     assert aligned["missed_count"] == 20 - aligned["pairs"] > 0
+
+
+def test_a_lost_run_is_announced_without_the_truth():
+    log = circles()
+    away = [  # the robot is carried away: the log lacks this part of its odometry
+        replace(event, d=0.0, alpha=0.0)
+        if isinstance(event, OdometryRow) and 40 < event.t < 55
+        else replace(event, true_ids=None)
+        if isinstance(event, Scan)
+        else event
+        for event in log.events
+    ]
+    lost = replace(log, events=away, landmark_ids=(), landmarks=np.empty((0, 2)))
+    for drive, is_lost in ((log, False), (lost, True)):
+        settings = settings_for(drive)
+        summary = summarise(replay(drive, settings.make(drive.start)))
+        assert summary["probably_lost"] is is_lost
+        assert (LOST in summary["warnings"]) == is_lost
+
+
+def test_with_known_identities_nothing_is_said_about_being_lost():
+    world = load_scenario("six_landmarks").with_changes(steps=5)
+    driver = make_controller("open_loop", world, np.random.default_rng(0))
+    drive = record_episode(world, driver, seed=1)
+    summary = summarise(replay(drive, settings_for(drive).make(drive.start)))
+    assert summary["probably_lost"] is None
+    assert LOST not in summary["warnings"]
 
 
 def short_drive(**changes):

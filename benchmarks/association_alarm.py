@@ -1,0 +1,169 @@
+"""Count the lost runs that the alarm finds, and its false alarms.
+
+    python benchmarks/association_alarm.py --runs 10
+    python benchmarks/association_alarm.py --world coarse_loop --how nearest
+
+Readings have no identity.  Where lost runs are rare, they are provoked: by a simpler
+association, by odometry that misses 25 steps (kidnapped), by a motion noise three times
+that of the filter and by gaps without scans.  A run is lost if its path error is more
+than 1 m above that with known identities and NEES / 3 of its pose is above 3 on
+average; it is sound if neither holds.  Intervals are 95 %, of Wilson.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+from association import LOST, METHODS, Scan, drive, make, worlds
+
+from slamgym.evaluation import pose_nees
+from slamgym.sim_configs import Scenario, load_scenario
+
+PRESETS = (
+    "lost_loop look_alike active_hidden coarse_loop loop active_easy active_medium "
+    "active_hard active_rooms active_uncertain dropout dense six_landmarks slippery "
+    "unknown_heading fault_odometry_turn"
+)
+AWAY, GAP = 25, 60  # steps
+OVERCONFIDENT = 3.0  # NEES / 3
+SOUND, BETWEEN, BAD = range(3)
+
+
+def all_worlds() -> dict[str, Scenario]:
+    """Return all worlds, without identities."""
+    presets = {
+        name: load_scenario(name).with_changes(sensor={"identities": False})
+        for name in PRESETS.split()
+    }
+    return presets | worlds()
+
+
+def noisier(world: Scenario, factor: float) -> Scenario:
+    std = [factor * sigma for sigma in world.motion.std]
+    return world.with_changes(motion={"std": std})
+
+
+def without(scans: list[Scan], begin: float, steps: int, **gone: Any) -> list[Scan]:
+    """Replace a part of the scans from a share of the drive on."""
+    first = int(begin * len(scans))
+    part = [scan._replace(**gone) for scan in scans[first : first + steps]]
+    return scans[:first] + part + scans[first + steps :]
+
+
+def kidnapped(scans: list[Scan]) -> list[Scan]:
+    return without(scans, 0.6, AWAY, odometry=np.zeros(2))
+
+
+def with_gaps(scans: list[Scan]) -> list[Scan]:
+    once = without(scans, 0.3, GAP, readings=None)
+    return without(once, 0.6, GAP, readings=None)
+
+
+def same(scans: list[Scan]) -> list[Scan]:
+    return scans
+
+
+#: Method, factors of the noise of the world and of the filter, and what befalls scans.
+HOW: dict[str, tuple[str, float, float, Callable[[list[Scan]], list[Scan]]]] = {
+    "default": ("hypotheses", 1, 1, same),
+    "nearest": ("nearest", 1, 1, same),
+    "joint": ("joint", 1, 1, same),
+    "kidnapped": ("hypotheses", 1, 1, kidnapped),
+    "gaps": ("hypotheses", 2, 2, with_gaps),
+    "more noise": ("hypotheses", 4, 4, same),
+    "wrong noise": ("hypotheses", 3, 1, same),
+}
+#: The worlds of each, without --world and --how; "default" takes all.
+PROVOKED = {
+    "nearest": ("coarse_loop", "loop, clutter", "slip60", "clutter5"),
+    "joint": ("coarse_loop", "loop, clutter"),
+    "kidnapped": ("hidden_identities", "corridor", "loop", "slip60", "active_hidden"),
+    "gaps": ("hidden_identities", "corridor", "loop, clutter", "active_hidden"),
+    "more noise": ("hidden_identities", "corridor", "active_hidden"),
+    "wrong noise": ("hidden_identities", "corridor", "loop"),
+}
+
+
+def follow(slam: Any, scans: list[Scan], *, known: bool) -> tuple[float, float, float]:
+    """Return the error of the path [m], NEES / 3 of its pose, and the evidence."""
+    beliefs = []
+    for k, scan in enumerate(scans):
+        if k:
+            slam.predict(scan.odometry)
+        if scan.readings is not None:
+            real = scan.ids >= 0
+            given = (scan.readings[real], scan.ids[real]) if known else (scan.readings,)
+            slam.update(*given)
+        beliefs.append(slam.belief(()))
+    poses = np.array([belief.pose for belief in beliefs])
+    truth = np.array([scan.pose for scan in scans])
+    covariances = np.array([belief.pose_covariance for belief in beliefs])
+    with np.errstate(all="ignore"):
+        nees = pose_nees(truth, poses, covariances, frame=beliefs[0].frame)
+    error = np.sqrt(np.mean(np.sum((poses - truth)[:, :2] ** 2, axis=1)))
+    score = getattr(slam, "lost_score", 0.0)
+    return float(error), float(np.nanmean(nees)) / 3, score
+
+
+def outcome(world: Scenario, how: str, seed: int) -> tuple[int, bool]:
+    """Run a filter once; return what became of the run, and whether it is alarmed."""
+    method, real, assumed, befalls = HOW[how]
+    scans = befalls(drive(noisier(world, real), seed))
+    assumed_world = noisier(world, assumed)
+    error, _, _ = follow(make(assumed_world), scans, known=True)
+    slam: Any = make(assumed_world, management=METHODS[method])
+    found, nees, score = follow(slam, scans, known=False)
+    is_worse, is_overconfident = found > error + LOST, not nees <= OVERCONFIDENT
+    kind = BETWEEN if is_worse != is_overconfident else BAD if is_worse else SOUND
+    numbers = f"{error:.2f} {found:.2f} m, {nees:.1f}, {score:.1f}"
+    print(f"{seed} {world.name} {how}: {numbers}", file=sys.stderr)
+    return kind, slam.probably_lost
+
+
+def wilson(count: int, of: int, z: float = 1.96) -> str:
+    """Write a share with its interval [%]."""
+    if not of:
+        return "–"
+    share, spread = count / of, z**2 / of
+    centre = (share + spread / 2) / (1 + spread)
+    half = z / (1 + spread) * np.sqrt(share * (1 - share) / of + spread / of / 4)
+    low, high = 100 * max(centre - half, 0.0), 100 * min(centre + half, 1.0)
+    return f"{100 * share:.1f} ({low:.1f} to {high:.1f})"
+
+
+def row(name: str, how: str, runs: Iterable[tuple[int, bool]]) -> str:
+    found = [[a for kind, a in runs if kind == k] for k in (BAD, SOUND, BETWEEN)]
+    cells = [f"{sum(alarms)} of {len(alarms)}" for alarms in found]
+    return f"| {' | '.join([name, how, *cells])} |"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=5000)
+    parser.add_argument("--world", nargs="+", choices=all_worlds())
+    parser.add_argument("--how", nargs="+", choices=HOW)
+    options = parser.parse_args()
+    known = all_worlds()
+    print("| world | how | alarms of lost runs | of sound runs | of others |")
+    print("|---" * 5 + "|")
+    every = []
+    for how in options.how or HOW:
+        for name in options.world or PROVOKED.get(how, known):
+            seeds = range(options.seed, options.seed + options.runs)
+            runs = [outcome(known[name], how, seed) for seed in seeds]
+            every += runs
+            print(row(name, how, runs), flush=True)
+    print(row("all", "all", every))
+    for kind, title in ((BAD, "lost runs found"), (SOUND, "false alarms")):
+        alarms = [alarm for k, alarm in every if k == kind]
+        print(f"{title}: {wilson(sum(alarms), len(alarms))} % of {len(alarms)}")
+
+
+if __name__ == "__main__":
+    main()
