@@ -558,7 +558,7 @@ def check_sensor(
     r, turn = 10 ** rng.uniform(-1, 2, trials), rng.uniform(-np.pi, np.pi, trials)
     x, y = r * np.cos(turn), r * np.sin(turn)
     _check_slopes(checked, x, y)
-    _check_angles(checked)
+    _check_angles(checked, x, y)
     _check_inverse(checked, x, y)
     _check_std(checked, np.resize(measurement_std, 2), r)
     _check_compiled(checked, x, y)
@@ -591,18 +591,48 @@ def _check_slopes(sensor: Sensor, x: Array, y: Array) -> None:
             )
 
 
-def _check_angles(sensor: Sensor) -> None:
-    """Look for a jump of 2π on a circle around the robot."""
-    turn = np.linspace(0.0, 2 * np.pi, 721)
-    z = sensor.read(3 * np.cos(turn), 3 * np.sin(turn))
-    jumps = np.abs(np.abs(np.diff(z, axis=0)) - 2 * np.pi) < 0.1
+def _check_angles(sensor: Sensor, x: Array, y: Array) -> None:
+    """Compare the entries of angles with units, values, and jumps around the robot."""
+    spans = np.ptp(sensor.read(x, y), axis=0)
     for column in range(sensor.size):
-        if jumps[:, column].any() and not sensor.wraps[column]:
+        name, unit = _name(sensor, column), sensor.units[column]
+        jumps = _jumps_by_a_turn(sensor, column)
+        if not sensor.wraps[column]:
+            if jumps:
+                _refuse(
+                    sensor,
+                    f"{name} jumps by 2π around the robot: set its entry of angles to "
+                    "True, so that its differences are wrapped",
+                )
+        elif not unit.startswith("rad"):
             _refuse(
                 sensor,
-                f"{_name(sensor, column)} jumps by 2π around the robot: "
-                "set its entry of angles to True, so that its differences are wrapped",
+                f"{name} has the unit '{unit}', but only radians are wrapped: set its "
+                "entry of angles to False",
             )
+        elif not jumps and spans[column] > 2 * np.pi:
+            _refuse(
+                sensor,
+                f"{name} varies by {spans[column]:.3g} and never jumps by 2π: set its "
+                "entry of angles to False",
+            )
+
+
+def _jumps_by_a_turn(sensor: Sensor, column: int) -> bool:
+    """Return whether a number jumps by 2π, not at a pole, on a circle of 3 m."""
+
+    def read(turn: Array) -> Array:
+        return sensor.read(3 * np.cos(turn), 3 * np.sin(turn))[:, column]
+
+    ends = np.linspace(0.0, 2 * np.pi, 721)
+    low, high = ends[:-1], ends[1:]
+    for _ in range(30):  # halve each step, keep the half that changes more
+        middle = (low + high) / 2
+        at_low, at_middle, at_high = read(low), read(middle), read(high)
+        later = np.abs(at_high - at_middle) > np.abs(at_middle - at_low)
+        low, high = np.where(later, middle, low), np.where(later, high, middle)
+    jumps = np.abs(read(high) - read(low))
+    return bool((np.abs(jumps - 2 * np.pi) < 1e-3).any())
 
 
 def _check_inverse(sensor: Sensor, x: Array, y: Array) -> None:

@@ -466,6 +466,29 @@ def test_check_sensor_names_what_is_wrong(change, message):
         check_sensor(replace(COPY, **change))
 
 
+@pytest.mark.parametrize("focal_length", [1.0, 500.0, 750.0])
+def test_check_sensor_does_not_take_the_pole_of_a_camera_for_a_turn(focal_length):
+    def column(x, y):
+        return (focal_length * y / x, 0.0), (
+            *(-focal_length * y / (x * x), focal_length / x),
+            *(0.0, 0.0),
+        )
+
+    check_sensor(Sensor("camera", ("column",), ("px",), column))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({}, "range has the unit 'm', but only radians are wrapped"),
+        ({"units": ("rad", "rad")}, "range varies by .* and never jumps by 2π"),
+    ],
+)
+def test_check_sensor_refuses_a_length_among_the_angles(change, message):
+    with pytest.raises(SensorContractError, match=message):
+        check_sensor(replace(COPY, angles=(True, True), **change))
+
+
 def test_check_sensor_refuses_slopes_of_the_void_number():
     single = Sensor("odd", ("bearing",), ("rad",), void_slope, angles=(True,))
     with pytest.raises(SensorContractError, match="∂the unused number/∂x"):
