@@ -602,10 +602,18 @@ def _merge(table: dict[str, Any], changes: Mapping[str, object]) -> dict[str, An
         if isinstance(change, Mapping) and isinstance(old, dict):
             kind = {"landmarks": "layout", "controls": "sequence"}.get(key, "")
             same = change.get(kind, old.get(kind)) == old.get(kind)
+            if key == "sensor" and _is_foreign(change, old):
+                old = {name: old[name] for name in old if name != "std"}
             merged[key] = {**old, **change} if same else change
         else:
             merged[key] = change
     return merged
+
+
+def _is_foreign(change: Mapping[str, object], old: Mapping[str, object]) -> bool:
+    """Return whether a sensor becomes one of the user, with noise in other units."""
+    kind = change.get("kind", old["kind"])
+    return ":" in str(kind) and kind != old["kind"]
 
 
 def _plain(value: Any) -> Any:

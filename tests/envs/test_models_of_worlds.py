@@ -179,6 +179,7 @@ def test_faults_of_the_odometry_pass_through_the_drive():
             "controls must turn by at most",
         ),
         ({"sensor": {"kind": "sonar"}}, "or 'module:SENSOR', got 'sonar'"),
+        ({"sensor": {"kind": "sonar:SONAR"}}, "sensor.std must be given"),
         ({"sensor": {"kind": "bearing"}}, r"sensor.std must be \(σ, 0\)"),
         ({"sensor": {"kind": "position", "identities": False}}, "identities must be"),
         (
