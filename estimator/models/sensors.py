@@ -157,11 +157,16 @@ class Sensor:
     def _check_returns(self) -> None:
         """Refuse functions that return something else, at a place 1 m ahead."""
         try:
-            (_, _), (_, _, _, _) = self.h(1.0, 0.1)
+            (z0, z1), (_, _, _, _) = self.h(1.0, 0.1)
         except (TypeError, ValueError) as error:
             raise self._refused(
                 f"h must return ((z0, z1), (∂z0/∂x, ∂z0/∂y, ∂z1/∂x, ∂z1/∂y)): {error}"
             ) from None
+        if self.inverse is not None:
+            try:
+                (_, _) = self.inverse(z0, z1)
+            except (TypeError, ValueError) as error:
+                raise self._refused(f"inverse must return (x, y): {error}") from None
         std = np.asarray(self.std(self.noise((0.1, 0.1)), 1.0), dtype=np.float64)
         if std.shape != (2,) or not (np.isfinite(std) & (std > 0)).all():
             raise self._refused(
@@ -361,18 +366,21 @@ def find_sensor(sensor: str | Sensor) -> Sensor:
     Raises
     ------
     ValueError
-        If there is no such sensor, with the nearest name.
+        If there is no such sensor, with the nearest name, or a path names another
+        object.
     """
     if isinstance(sensor, Sensor):
         return sensor
     name = str(sensor)
-    found: Any = SENSORS.get(name)
-    if found is None and ":" in name:
+    if name in SENSORS:
+        return SENSORS[name]
+    if ":" in name:
         found = imported(name, f"cannot import sensor '{name}': ", kind=True)
-    if not isinstance(found, Sensor):
-        hint, known = closest(name, SENSORS), ", ".join(SENSORS)
-        raise ValueError(f"unknown sensor '{sensor}'{hint} (known: {known})")
-    return found
+        if isinstance(found, Sensor):
+            return found
+        raise ValueError(f"'{name}' is a {type(found).__name__}, not a Sensor")
+    hint, known = closest(name, SENSORS), ", ".join(SENSORS)
+    raise ValueError(f"unknown sensor '{sensor}'{hint} (known: {known})")
 
 
 def sensor_in(options: Mapping[str, Any]) -> Sensor:
@@ -550,17 +558,21 @@ def check_sensor(
 
     Raises
     ------
+    ValueError
+        If filters would refuse the noise.
     SensorContractError
         At the first contradiction, naming the number and where it was seen.
     """
     checked = find_sensor(sensor)
+    noise = _two_stds(checked, measurement_std)
     rng = np.random.default_rng(0)
     r, turn = 10 ** rng.uniform(-1, 2, trials), rng.uniform(-np.pi, np.pi, trials)
     x, y = r * np.cos(turn), r * np.sin(turn)
+    _check_arrays(checked, x, y)
     _check_slopes(checked, x, y)
     _check_angles(checked, x, y)
     _check_inverse(checked, x, y)
-    _check_std(checked, np.resize(measurement_std, 2), r)
+    _check_std(checked, noise, r)
     _check_compiled(checked, x, y)
 
 
@@ -570,6 +582,30 @@ def _refuse(sensor: Sensor, what: str) -> None:
 
 def _name(sensor: Sensor, column: int) -> str:
     return sensor.columns[column] if column < sensor.size else "the unused number"
+
+
+def _two_stds(sensor: Sensor, measurement_std: ArrayLike) -> Array:
+    """Return the noise as two numbers; refuse what filters refuse."""
+    if sensor.size == 1 and np.size(measurement_std) == 1:
+        measurement_std = np.resize(measurement_std, 2)
+    return argument_checks.standard_deviations("measurement_std", measurement_std, 2)
+
+
+def _check_arrays(sensor: Sensor, x: Array, y: Array) -> None:
+    """Look for functions of numbers alone, such as those of `math`."""
+    name = "h"
+    try:
+        readings = sensor.read(x, y)
+        sensor.slopes(x, y)
+        name = "inverse"
+        if sensor.inverse is not None:
+            sensor.inverse(*readings.T)
+    except (TypeError, ValueError) as error:
+        _refuse(
+            sensor,
+            f"{name} must accept arrays: use functions of numpy, not of math, and no "
+            f"if ({error})",
+        )
 
 
 def _check_slopes(sensor: Sensor, x: Array, y: Array) -> None:
@@ -595,27 +631,18 @@ def _check_angles(sensor: Sensor, x: Array, y: Array) -> None:
     """Compare the entries of angles with units, values, and jumps around the robot."""
     spans = np.ptp(sensor.read(x, y), axis=0)
     for column in range(sensor.size):
-        name, unit = _name(sensor, column), sensor.units[column]
+        unit, span, is_angle = sensor.units[column], spans[column], sensor.wraps[column]
         jumps = _jumps_by_a_turn(sensor, column)
-        if not sensor.wraps[column]:
-            if jumps:
-                _refuse(
-                    sensor,
-                    f"{name} jumps by 2π around the robot: set its entry of angles to "
-                    "True, so that its differences are wrapped",
-                )
-        elif not unit.startswith("rad"):
-            _refuse(
-                sensor,
-                f"{name} has the unit '{unit}', but only radians are wrapped: set its "
-                "entry of angles to False",
-            )
-        elif not jumps and spans[column] > 2 * np.pi:
-            _refuse(
-                sensor,
-                f"{name} varies by {spans[column]:.3g} and never jumps by 2π: set its "
-                "entry of angles to False",
-            )
+        if jumps and not is_angle:
+            what = "jumps by 2π around the robot"
+        elif is_angle and not unit.startswith("rad"):
+            what = f"has the unit '{unit}', but only radians are wrapped"
+        elif is_angle and not jumps and span > 2 * np.pi:
+            what = f"varies by {span:.3g} and never jumps by 2π"
+        else:
+            continue
+        what += f": set its entry of angles to {not is_angle}"
+        _refuse(sensor, f"{_name(sensor, column)} {what}")
 
 
 def _jumps_by_a_turn(sensor: Sensor, column: int) -> bool:

@@ -51,8 +51,8 @@ def imported(path: str, refusal: str, *, kind: bool = False) -> Any:
     Raises
     ------
     ValueError
-        If it cannot be imported: the refusal, perhaps the kind of the error, and the
-        error.
+        If it cannot be imported: the refusal, perhaps the kind of the error, the
+        error, and what to do if the module lies in another folder.
 
     Examples
     --------
@@ -64,4 +64,9 @@ def imported(path: str, refusal: str, *, kind: bool = False) -> Any:
         return attrgetter(name)(import_module(module))
     except Exception as error:
         of_kind = f"{type(error).__name__}: " if kind else ""
-        raise ValueError(f"{refusal}{of_kind}{error}") from error
+        file = module.split(".")[0]
+        is_elsewhere = isinstance(error, ModuleNotFoundError) and error.name == file
+        hint = f"; run in the folder of {file}.py, or set PYTHONPATH"
+        raise ValueError(
+            f"{refusal}{of_kind}{error}{hint if is_elsewhere else ''}"
+        ) from error

@@ -1,5 +1,6 @@
 """Sensors as values: slopes, kernels against the dense oracle, and the check."""
 
+import math
 import pickle
 from dataclasses import replace
 
@@ -325,6 +326,13 @@ def test_sensors_are_found_by_name_and_by_path():
         find_sensor("postion")
     with pytest.raises(ValueError, match="cannot import sensor 'nowhere:X': ModuleNot"):
         find_sensor("nowhere:X")
+    with pytest.raises(
+        ValueError, match=r"in the folder of nowhere\.py, or set PYTHON"
+    ):
+        find_sensor("nowhere:X")
+    path = "slamgym.estimator.models.sensors:read_range"
+    with pytest.raises(ValueError, match=f"'{path}' is a function, not a Sensor"):
+        find_sensor(path)
 
 
 NOISE = {"motion_std": MOTION, "measurement_std": (0.1, 0.1)}
@@ -370,6 +378,10 @@ def test_noise_that_a_sensor_does_not_have_is_refused(option, message):
         ({"h": lambda x, y: ((x, y), (1.0, 0.0, 0.0))}, "h must return"),
         ({"h": lambda x: ((x, x), (1.0, 0.0, 0.0, 1.0))}, "h must return"),
         ({"inverse": 3}, "inverse must be a function, got 3"),
+        (
+            {"inverse": lambda z0, z1: (z0, z1, 0.0)},
+            r"inverse must return \(x, y\): too",
+        ),
         ({"std": (0.1, 0.2)}, "std must be a function"),
         ({"std": lambda noise, distance: noise[:1]}, "std must return two finite"),
         ({"std": lambda noise, distance: (noise[0], -1.0)}, "two finite numbers > 0"),
@@ -487,6 +499,28 @@ def test_check_sensor_does_not_take_the_pole_of_a_camera_for_a_turn(focal_length
 def test_check_sensor_refuses_a_length_among_the_angles(change, message):
     with pytest.raises(SensorContractError, match=message):
         check_sensor(replace(COPY, angles=(True, True), **change))
+
+
+def by_math(x, y):
+    _, slopes = read_bearing_range(x, y)
+    return (math.atan2(y, x), math.hypot(x, y)), slopes
+
+
+def test_check_sensor_explains_that_functions_must_accept_arrays():
+    with pytest.raises(SensorContractError, match=r"h must accept arrays: .* not of m"):
+        check_sensor(replace(COPY, h=by_math))
+
+
+@pytest.mark.parametrize(
+    ("sensor", "std"),
+    [(COPY, (0.02, 0.1, 1.0)), (COPY, 0.02), (COPY, "a"), (BEARING, (0.1, 0.1, 0.1))],
+)
+def test_check_sensor_refuses_the_noise_that_filters_refuse(sensor, std):
+    with pytest.raises(ValueError, match="measurement_std must be"):
+        make_estimator("ekf", motion_std=MOTION, measurement_std=std, sensor=sensor)
+    with pytest.raises(ValueError, match="measurement_std must be"):
+        check_sensor(sensor, std)
+    check_sensor(BEARING, (0.1,))
 
 
 def test_check_sensor_refuses_slopes_of_the_void_number():
