@@ -137,7 +137,7 @@ def drive_likelihood(
             f"{type(estimator).__name__} is not one of the filters on the shared "
             "kernels, which can compute innovations for many noises at once"
         )
-    only_bearing_range(estimator.sensor, "drive_likelihood")
+    only_bearing_range(estimator.sensor, "fit-noise (drive_likelihood)")
     values = argument_checks.as_floats("noises", noises)
     if values.ndim != 2 or values.shape[1] != NOISE_WIDTH:
         raise ValueError(
