@@ -203,5 +203,5 @@ def test_a_filter_off_the_shared_kernels_is_refused():
 def test_another_sensor_is_refused_by_the_name_of_the_command():
     noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
     slam = make_estimator("ekf", **noise, sensor="position")
-    with pytest.raises(ValueError, match="^fit-noise .* accepts only sensor"):
+    with pytest.raises(ValueError, match=r"^fit-noise .* accepts only sensor"):
         drive_likelihood(slam, events(), [NOISE])
