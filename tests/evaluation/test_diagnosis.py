@@ -234,6 +234,15 @@ def test_what_is_left_of_an_excess_with_less_noise_names_the_cause(
     assert found.repeat == 0
 
 
+def test_a_run_that_is_lost_with_less_noise_too_is_not_the_average_of_all():
+    scores = wrong(11, 3.0)
+    small = less_noise(scores, 0.001, factor=0.01)
+    small.nees[0] = 3e7
+    found = diagnose(**scores, small_noise=small)
+    assert found.cause == "linearisation"
+    assert "those of the median run are 1" in found.sentence
+
+
 def test_an_excess_of_which_a_part_remains_is_repeated_with_still_less_noise():
     scores = wrong(11, 4.0)
     found = diagnose(**scores, small_noise=less_noise(scores, 0.2))
