@@ -477,13 +477,9 @@ def excess_of(
             f"{found}, but the innovations are too large for linearisation: is an "
             "angle not wrapped?"
         )
-    if ratio > max(
-        errors.ratio, 1.0
-    ):  # by a few runs that are lost with less noise too
-        ratio = float(np.median(few))
-        found = (
-            f"With {share} of the noise, those of the median run are {ratio:.3g} times"
-        )
+    if ratio > max(errors.ratio, 1.0):  # a few runs are lost with less noise, too
+        typical = f"those of the median run are {np.median(few):.3g} times"
+        found = f"With {share} of the noise, {typical}"
     return LINEARISATION, f"{found}, so the excess vanishes with the noise."
 
 
