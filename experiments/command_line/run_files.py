@@ -1,5 +1,6 @@
 """Filter a log for a command: `filter_and_write` writes and prints a run's results."""
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -14,7 +15,7 @@ from ..logs.recording import steps_of
 from ..logs.slamlog import SlamLog, write_slamlog
 from ..runs.filter_settings import FilterSettings
 from ..runs.log_replay import replay
-from ..runs.summary import summarise
+from ..runs.summary import association_failed, summarise
 from ..runs.trace import RunTrace
 from ..viewers import RunFrames, ViewedRun, write_rerun, write_run_page
 from ..viewers.rerun_recording import import_rerun
@@ -182,6 +183,9 @@ def show_run(summary: dict[str, Any], place: Path, reporter: Reporter) -> None:
     if summary["warnings"]:
         warnings = (Text(f"Warning: {text}", "yellow") for text in summary["warnings"])
         reporter.show(*warnings, "")
+    if association_failed(summary):
+        repair = ["slamgym", "smooth", str(place / "log.csv"), "--associate"]
+        reporter.show_verbatim(f"Repair the association: {shlex.join(repair)}\n")
     reporter.show(tables.written(str(place), summary["files"]))
     reporter.finish({**summary, "out": str(place)})
 

@@ -233,7 +233,8 @@ def _bad_run(summary: dict[str, Any]) -> str:
         " A run is bad if it failed, or if its path error is more than "
         f"{scores[0]['bad_runs']['margin']:g} m above that of the same filter with "
         "known identities. A filter raises the alarm where scans show far fewer "
-        "landmarks than its map promises."
+        "landmarks than its map promises. To repair the log of such a run: slamgym "
+        "smooth LOG --associate"
     )
 
 

@@ -5,6 +5,7 @@
 
 import json
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -306,6 +307,23 @@ LOST = (
     "The run is probably lost: the scans showed far fewer landmarks than the map "
     "promised."
 )
+
+
+def association_failed(summary: Mapping[str, Any]) -> bool:
+    """Return whether the association of a run failed, by the alarm or the truth.
+
+    By the truth, it failed if a filter that knew pose and map would assign at least
+    `MOST_REJECTED` more of the readings rightly.
+
+    Parameters
+    ----------
+    summary : mapping
+        Of `summarise`.
+    """
+    scores = summary["association"] or {}
+    precision, wrong = scores.get("precision"), scores.get("oracle_errors") or 0.0
+    is_wrong = precision is not None and 1 - precision > wrong + MOST_REJECTED
+    return bool(summary["probably_lost"] or is_wrong)
 
 
 def run_warnings(replay: Replay) -> list[str]:

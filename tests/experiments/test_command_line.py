@@ -941,3 +941,16 @@ def test_a_log_too_large_for_memory_is_named(log, monkeypatch):
 
 def test_an_error_without_text_has_a_message():
     assert errors.message_of(MemoryError()) == "there is not enough memory"
+
+
+def test_a_run_whose_association_failed_names_the_command_that_repairs_it(
+    here, without_pictures
+):
+    hidden = ("--steps", 400, "--set", "sensor.identities=false")
+    clutter = ("--set", "sensor.clutter=1", "--set", "sensor.max_clutter=5")
+    wrong = ("-e", 'invariant[management={association="nearest"}]', "--seed", 71006)
+    shown = slamgym("run", "loop", *hidden, "--out", "good").stdout
+    assert "--associate" not in shown
+    shown = slamgym("run", "loop", *hidden, *clutter, *wrong, "--out", "a b").stdout
+    assert "slamgym smooth 'a b/log.csv' --associate\n" in shown
+    assert slamgym("smooth", "a b/log.csv", "--associate").exit_code == 0

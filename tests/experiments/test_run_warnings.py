@@ -6,7 +6,11 @@ import pytest
 from slamgym.estimator import make_estimator
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
 from slamgym.experiments.runs.log_replay import replay
-from slamgym.experiments.runs.summary import abandoned_landmarks, run_warnings
+from slamgym.experiments.runs.summary import (
+    abandoned_landmarks,
+    association_failed,
+    run_warnings,
+)
 
 NOISE = {"motion_std": (0.02, 0.02, 0.01), "measurement_std": (0.02, 0.1)}
 PLACES = np.array([(4.0, 1.0), (5.0, -1.0), (3.0, -2.0)])
@@ -79,3 +83,22 @@ def test_landmarks_out_of_view_are_not_missed():
     done = run(SlamLog("turned", events=events), management=True)
     assert len(done.belief.landmark_ids) == 6
     assert abandoned_landmarks(done) == 0
+
+
+@pytest.mark.parametrize(
+    ("is_lost", "precision", "oracle_errors", "failed"),
+    [
+        (True, None, None, True),
+        (False, None, None, False),
+        (None, 0.87, 0.002, True),
+        (False, 0.87, 0.1, False),  # no filter is much better
+        (False, 0.97, None, False),
+    ],
+)
+def test_association_failed_by_the_alarm_or_the_truth(
+    is_lost, precision, oracle_errors, failed
+):
+    scores = {"precision": precision, "oracle_errors": oracle_errors}
+    summary = {"probably_lost": is_lost, "association": scores}
+    assert association_failed(summary) is failed
+    assert association_failed(summary | {"association": None}) is bool(is_lost)
