@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _FATES = {
     "rejected": "rejected by the gate",
-    "skipped": "too close",
+    "skipped": "with range ≤ 0 or too near",
     "tentative": "of unconfirmed ones",
     "ambiguous": "ambiguous",
 }
@@ -219,9 +219,25 @@ def smoothing_figures(summary: dict[str, Any]) -> Table:
         ("misfit", f"{ratio} per degree of freedom; 1 is expected"),
     ]
     if (repair := summary["repair"]) is not None:
-        scores = f"score {repair['first']:.1f}, then {repair['last']:.1f}"
-        rows.append(("association", f"{scores}; {repair['unused']} readings unused"))
+        scores = _repaired(repair["first"], repair["last"])
+        rows.append(("association", scores))
+        rows.append(("unused", f"{repair['unused']} readings, given to no landmark"))
     return named_rows(rows)
+
+
+def _repaired(first: float, last: float) -> str:
+    """Write the scores before and after a repair.
+
+    Examples
+    --------
+    >>> _repaired(177.7, 150.1)
+    'score 177.7, then 150.1 (lower is better)'
+    >>> _repaired(177.7, 177.7)
+    'score 177.7 (lower is better): no better one found'
+    """
+    if last < first:
+        return f"score {first:.1f}, then {last:.1f} (lower is better)"
+    return f"score {first:.1f} (lower is better): no better one found"
 
 
 # --------------------------------------------------------------------------------------
@@ -262,8 +278,9 @@ def association_table(scores: dict[str, Any]) -> Table:
         ("precision", shares),
     ]
     if scores["oracle_errors"] is not None:
-        bar = f"{scores['oracle_errors']:.1%} of the readings are wrong"
-        of_readings.append(("with true pose and map", bar))
+        wrong = f"{scores['oracle_errors']:.1%} wrongly"
+        bar = f"a filter that knew pose and map would assign {wrong}"
+        of_readings.append(("at best", bar))
     return named_rows(of_readings + of_the_map, title)
 
 

@@ -953,4 +953,12 @@ def test_a_run_whose_association_failed_names_the_command_that_repairs_it(
     assert "--associate" not in shown
     shown = slamgym("run", "loop", *hidden, *clutter, *wrong, "--out", "a b").stdout
     assert "slamgym smooth 'a b/log.csv' --associate\n" in shown
+    words = " ".join(shown.split())
+    assert "a filter that knew pose and map would assign 0.3% wrongly" in words
     assert slamgym("smooth", "a b/log.csv", "--associate").exit_code == 0
+
+
+def test_skipped_readings_are_explained():
+    counts = dict.fromkeys(("associated", "added", *tables._FATES), 0) | {"skipped": 1}
+    text = tables._and_counts("7 of known landmarks", counts, tables._FATES)
+    assert text == "7 of known landmarks, 1 with range ≤ 0 or too near"

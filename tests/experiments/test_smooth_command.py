@@ -241,7 +241,8 @@ def test_the_association_is_repaired_on_request(tmp_path):
     found = json.loads((out / "summary.json").read_text())
     assert found["repair"]["last"] <= found["repair"]["first"]
     assert found["repair"]["landmarks"] == found["landmarks"] == 6
-    assert "readings unused" in shown
+    assert "readings, given to no landmark" in shown
+    assert "(lower is better)" in shown
     settings = settings_for(log, estimator=SMOOTHER, options={})
     plain = smooth_log(log, settings)
     repaired = smooth_log(log, settings, associate=True)
