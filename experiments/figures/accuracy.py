@@ -182,7 +182,7 @@ def _draw_bars(axes: Axes, values: Array) -> None:
 def _summary(
     trace: RunTrace, poses: BoolArray, distances: LandmarkDistances | None
 ) -> str:
-    parts = [trace.estimator]
+    parts = [style.short_name(trace.estimator)]
     if poses.any() and trace.true_poses is not None:
         error = trace.poses[poses, :2] - trace.true_poses[poses, :2]
         rms = np.sqrt(np.mean(np.sum(error**2, axis=1)))

@@ -180,9 +180,10 @@ def _title(trace: RunTrace, step: int) -> tuple[str, str]:
     radius = 3 * np.sqrt(np.linalg.eigvalsh(now.covariances)[:, -1])
     size = f", 3σ within {radius.max():.2g} m" if len(now.ids) else ""
     many = "landmark" if len(now.ids) == 1 else "landmarks"
+    name = style.short_name(trace.estimator)
     return (
         f"Map and poses after step {step} of {trace.last_step}",
-        f"{trace.estimator}  ·  t = {trace.t[step]:.4g} {trace.time_unit}  ·  "
+        f"{name}  ·  t = {trace.t[step]:.4g} {trace.time_unit}  ·  "
         f"{len(now.ids)} {many}{size}{thinned}",
     )
 

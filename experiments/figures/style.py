@@ -122,6 +122,26 @@ def write_title(
     return above, below
 
 
+_LONGEST = 28  # characters of a filter in a subtitle
+
+
+def short_name(label: str) -> str:
+    """Return the name of a filter for a subtitle, without long options.
+
+    Examples
+    --------
+    >>> short_name("invariant[iterations=3]")
+    'invariant[iterations=3]'
+    >>> short_name('invariant[management={association="nearest"}]')
+    'invariant[…]'
+    """
+    if len(label) <= _LONGEST:
+        return label
+    name, bracket, _ = label.partition("[")
+    short = name if len(name) <= _LONGEST else f"{name[:_LONGEST]}…"
+    return f"{short}[…]" if bracket else short
+
+
 def sign(figure: Figure, text: str) -> Figure:
     """Write what a figure is of into its lower right corner, and return it."""
     figure.text(0.995, 0.004, text, ha="right", va="bottom", fontsize=7, color=GREY)

@@ -22,7 +22,7 @@ from slamgym.experiments.figures import (
 )
 from slamgym.experiments.figures.accuracy import correlations, nis_band
 from slamgym.experiments.figures.maps import FIRST, LATER, PREDICTED, UPDATED
-from slamgym.experiments.figures.style import new_figure
+from slamgym.experiments.figures.style import lay_out, new_figure
 
 
 def noise_study(trace):
@@ -327,6 +327,16 @@ def test_the_names_of_many_landmarks_beside_a_low_map_do_not_overlap():
     assert 10 < len(boxes) < 40
     for above, below in itertools.pairwise(sorted(boxes, key=lambda box: -box.y0)):
         assert above.y0 >= below.y1 - 1
+
+
+@pytest.mark.parametrize("figure_of", [map_figure, truth_figure])
+def test_a_long_name_of_a_filter_leaves_the_map_its_width(figure_of):
+    widths = []
+    for name in ("invariant", 'invariant[management={association="nearest"}]' * 2):
+        figure = figure_of(make_trace(estimator=name))
+        lay_out(figure, 100)
+        widths.append(figure.axes[0].get_window_extent().width)
+    assert widths[1] == pytest.approx(widths[0], rel=0.02)
 
 
 @pytest.mark.parametrize("figure_of", [map_figure, truth_figure])
