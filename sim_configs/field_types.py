@@ -17,6 +17,7 @@ from pydantic import (
     StrictBool,
     StrictStr,
     ValidationError,
+    ValidationInfo,
     ValidatorFunctionWrapHandler,
     WrapValidator,
     model_validator,
@@ -76,16 +77,22 @@ def expect(expectation: str) -> WrapValidator:
     """Replace every error inside a field by one message with the expectation."""
 
     def validate(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
-        try:
-            return handler(value)
-        except ValidationError:
-            raise PydanticCustomError(
-                "expected",
-                "must be {expected}, got {got}",
-                {"expected": expectation, "got": short_repr(value)},
-            ) from None
+        return _expected(value, handler, expectation)
 
     return WrapValidator(validate)
+
+
+def _expected(
+    value: Any, handler: ValidatorFunctionWrapHandler, expectation: str
+) -> Any:
+    try:
+        return handler(value)
+    except ValidationError:
+        raise PydanticCustomError(
+            "expected",
+            "must be {expected}, got {got}",
+            {"expected": expectation, "got": short_repr(value)},
+        ) from None
 
 
 def _within_bounds(value: Any) -> Any:
@@ -156,9 +163,24 @@ PoseStd = Annotated[
 MotionStd = Annotated[
     _ThreeStds, expect("3 finite numbers >= 0 (σx, σy, σα) [m, m, rad]"), BOUNDED
 ]
-MeasurementStd = Annotated[
-    _TwoStds, expect("2 finite numbers >= 0 (σβ, σr) [rad, m]"), BOUNDED
-]
+
+
+def _expect_stds(
+    value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo
+) -> Any:
+    """Name the numbers that the sensor's kind, an earlier field, reads."""
+    kind = info.data.get("kind", "bearing_range")
+    expected = _STDS.get(kind, f"in the units of '{kind}'")
+    return _expected(value, handler, f"2 finite numbers >= 0 {expected}")
+
+
+_STDS = {
+    "bearing_range": "(σβ, σr) [rad, m]",
+    "position": "(σx, σy) [m, m]",
+    "bearing": "(σβ, 0) [rad]",
+    "range": "(σr, 0) [m]",
+}
+MeasurementStd = Annotated[_TwoStds, WrapValidator(_expect_stds), BOUNDED]
 Ends = Annotated[_Two, expect("2 finite numbers, low and high"), BOUNDED]
 Command = Annotated[
     tuple[Number, Number, Annotated[Integer, Field(ge=1)]],

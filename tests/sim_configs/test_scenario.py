@@ -74,6 +74,15 @@ def test_a_wrong_sensor_std_is_named(std):
 
 
 @pytest.mark.parametrize(
+    ("kind", "expected"),
+    [("position", "(σx, σy) [m, m]"), ("sonar:SONAR", "in the units of 'sonar:SONAR'")],
+)
+def test_a_wrong_sensor_std_is_named_by_the_kind_of_the_sensor(kind, expected):
+    message = mistake_of(sensor={"kind": kind, "std": [0.1]})
+    assert message == f"sensor.std must be 2 finite numbers >= 0 {expected}, got [0.1]"
+
+
+@pytest.mark.parametrize(
     ("changes", "field"),
     [
         ({"dt": "3"}, "dt"),
