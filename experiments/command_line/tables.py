@@ -102,6 +102,10 @@ def key_figures(summary: dict[str, Any]) -> Table:
     for name, key in (("path error", "ate"), ("map error", "landmark_rmse")):
         if summary[key] is not None and not are_compared:
             rows.append((name, _rmse(summary[key])))
+    if never := summary["never_placed"]:
+        more = ", …" * (len(never) > _MOST_ROWS)
+        names = ", ".join(map(str, never[:_MOST_ROWS]))
+        rows.insert(3, ("never placed", f"{len(never)} landmarks: {names}{more}"))
     frame = (summary["nees"] or {}).get("frame", "additive")
     for name, key, hint in (
         (f"pose NEES, {frame}", "nees", ("too cautious", "overconfident")),

@@ -46,7 +46,9 @@ def summarise(
     Returns
     -------
     dict
-        ``landmarks``, see :func:`landmark_table`; ``pose``, ``pose_covariance``;
+        ``landmarks``, see :func:`landmark_table`; ``never_placed``, the ids of
+        landmarks that the log names and the map never held; ``pose``,
+        ``pose_covariance``;
         ``steps``, ``scans``, ``readings`` by what became of them; ``map_changes``, the
         landmarks confirmed, removed and merged, and the most in the map; ``nis``, see
         `nis_summary`; ``nees``, see `nees_summary`; ``ate``, the root mean
@@ -70,6 +72,7 @@ def summarise(
         "pose": _finite_list(trace.poses[-1]),
         "pose_covariance": [_finite_list(row) for row in trace.pose_covariances[-1]],
         "landmarks": landmark_table(trace),
+        "never_placed": never_placed(replay),
         "nis": nis_summary(trace),
         "nees": nees_summary(trace),
         "ate": rmse_table(ground_truth.path_accuracy(log, trace.t, trace.poses)),
@@ -131,6 +134,20 @@ def _oracle_errors(
         places=places_of(log.landmark_ids, log.landmarks, resolution),
     )
     return finite(share)
+
+
+def never_placed(replay: Replay) -> list[int]:
+    """List the landmarks that the readings of a log name, but the map never held."""
+    if ground_truth.hides_identities(replay.log):
+        return []
+    named = {
+        number
+        for scan in replay.log.scans
+        if scan.landmark_ids is not None
+        for number in scan.landmark_ids.tolist()
+    }
+    held = {*replay.last_seen, *replay.trace.landmark_ids.tolist()}
+    return sorted(named - held)
 
 
 def landmark_table(trace: RunTrace) -> list[dict[str, Any]]:

@@ -23,6 +23,7 @@ from slamgym.experiments.command_line import program as errors
 from slamgym.experiments.command_line import run_files as warm_up
 from slamgym.experiments.command_line.app import main
 from slamgym.experiments.jobs import MANIFEST
+from slamgym.experiments.logs import read_log
 from slamgym.experiments.runs.filter_settings import estimator_choices
 from slamgym.jit import jit
 from slamgym.sim_configs import list_presets, load_scenario
@@ -962,3 +963,15 @@ def test_skipped_readings_are_explained():
     counts = dict.fromkeys(("associated", "added", *tables._FATES), 0) | {"skipped": 1}
     text = tables._and_counts("7 of known landmarks", counts, tables._FATES)
     assert text == "7 of known landmarks, 1 with range ≤ 0 or too near"
+
+
+def test_landmarks_that_were_never_placed_are_named(here, without_pictures):
+    shown = slamgym("run", "range", "--steps", 40, "--out", "few").stdout
+    summary = json.loads((here / "few/summary.json").read_text())
+    placed = {row["id"] for row in summary["landmarks"]}
+    scans = read_log("few/log.csv").scans
+    never = sorted({i for scan in scans for i in scan.landmark_ids.tolist()} - placed)
+    assert never
+    assert summary["never_placed"] == never
+    text = f"never placed {len(never)} landmarks: {', '.join(map(str, never[:10]))}"
+    assert text in " ".join(shown.split())
