@@ -121,6 +121,7 @@ def test_active_slam_refuses_other_models():
         ActiveSlamEnv("bicycle")
 
 
+@pytest.mark.usefixtures("own_registry")
 def test_an_estimator_without_the_sensor_is_refused():
     class Own:
         def __init__(self, motion_std, measurement_std, initial_pose, initial_pose_std):
