@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from ...arrays import Array, BoolArray
+from ...arrays import Array, BoolArray, IntArray
 from ...envs.rendering.scene import EllipseKind
 from ...estimator.models.rigid_motion import additive_error
 from ...evaluation.trajectory_error import LandmarkDistances, landmark_distances
@@ -63,8 +63,8 @@ def truth_figure(trace: RunTrace, walls: Walls = ()) -> Figure:
         tall = 5.6 * height / width
         figure = style.new_figure(10.8, tall + 1.5)
         area, *beside = figure.subplots(1, 3, width_ratios=[6.2, 1.7, 1.7])
-        names = [f"l{i}" for i in trace.landmark_ids[landmarks]]
-        _draw_distances(beside[0], beside[1], distances, names, room=tall)
+        ids = trace.landmark_ids[landmarks]
+        _draw_distances(beside[0], beside[1], distances, ids, room=tall)
     style.dress_map(area, limits)
     keys = draw_against_truth(area, trace) + draw_walls(area, walls)
     style.write_title(
@@ -98,12 +98,12 @@ def draw_against_truth(axes: Axes, trace: RunTrace) -> list[Artist]:
     _LANDMARK.draw(axes, trace.landmarks, trace.landmark_covariances)
     axes.plot(*trace.landmarks.T, ".", color=style.TEAL, ms=4)
     (path,) = axes.plot(
-        *trace.poses[:, :2].T, color=style.BLUE, lw=1.6, label="estimated path"
+        *trace.poses[:, :2].T, color=style.BLUE, lw=2, label="estimated path"
     )
     keys: list[Artist] = [path, _LANDMARK.legend_key()]
     if poses.any() and trace.true_poses is not None:
         truth = np.where(poses[:, None], trace.true_poses[:, :2], np.nan)
-        (line,) = axes.plot(*truth.T, "--", color=style.INK, lw=1.3, label="true path")
+        (line,) = axes.plot(*truth.T, color=style.INK, lw=0.8, label="true path")
         steps = np.flatnonzero(poses)[:: -(-len(poses) // _MOST_ERRORS)]
         _join(axes, trace.poses[steps, :2], truth[steps], width=0.8)
         keys.insert(1, line)
@@ -145,16 +145,18 @@ def _draw_distances(
     metres: Axes,
     sigmas: Axes,
     distances: LandmarkDistances,
-    names: list[str],
+    ids: IntArray,
     *,
     room: float,
 ) -> None:
-    """Draw one bar per landmark, in the order of the state from the top.
+    """Draw one bar per landmark, in the order of their ids from the top.
 
     As many are named as fit into the height of the axes, `room` [inches].
     """
-    _draw_bars(metres, distances.euclidean)
-    _draw_bars(sigmas, distances.mahalanobis)
+    order = np.argsort(ids)
+    _draw_bars(metres, distances.euclidean[order])
+    _draw_bars(sigmas, distances.mahalanobis[order])
+    names = [f"l{i}" for i in ids[order]]
     stride = max(1, math.ceil(len(names) * _NAME_HEIGHT / room))
     metres.set_yticks(range(0, len(names), stride), names[::stride])
     sigmas.set_yticks([])

@@ -492,9 +492,7 @@ def smoothed_figure(smoothed: SmoothedLog) -> Figure:
     axes.plot(*drive.landmarks.T, ".", color=style.TEAL, ms=3)
     keys: list[Artist] = [path, filtered, _POSE.legend_key(), _LANDMARK.legend_key()]
     if len(truth):
-        (line,) = axes.plot(
-            *truth.T, "--", color=style.INK, lw=0.9, label="ground truth"
-        )
+        (line,) = axes.plot(*truth.T, color=style.INK, lw=0.6, label="ground truth")
         keys.insert(0, line)
     if len(landmarks):
         (line,) = axes.plot(

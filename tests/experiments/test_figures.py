@@ -1,5 +1,6 @@
 import functools
 import itertools
+from dataclasses import replace
 
 import forked
 import numpy as np
@@ -284,6 +285,29 @@ def test_error_lines_join_estimates_and_truth():
     np.testing.assert_array_equal(path[:, 1], trace.true_poses[:, :2])
     np.testing.assert_array_equal(landmarks[:, 0], trace.landmarks)
     np.testing.assert_array_equal(landmarks[:, 1], trace.true_landmarks)
+
+
+def test_the_true_path_is_drawn_as_its_legend_shows():
+    # Dashes of several laps fill each other's gaps, and look like a solid line.
+    lines = {
+        line.get_label(): line for line in truth_figure(make_trace()).axes[0].lines
+    }
+    truth, estimate = lines["true path"], lines["estimated path"]
+    assert truth.get_linestyle() == "-"
+    assert truth.get_linewidth() < 0.5 * estimate.get_linewidth()
+
+
+def test_landmarks_stand_in_the_order_of_their_ids():
+    trace = make_trace()
+    order = np.arange(len(trace.landmark_ids))[::-1]
+    turned = replace(trace, landmark_ids=trace.landmark_ids[order])
+    shown, other = truth_figure(trace).axes[1], truth_figure(turned).axes[1]
+    names = [
+        [tick.get_text() for tick in axes.get_yticklabels()] for axes in (shown, other)
+    ]
+    assert names[0] == names[1] == [f"l{i}" for i in sorted(trace.landmark_ids)]
+    distances = [axes.lines[0].get_xdata() for axes in (shown, other)]
+    np.testing.assert_array_equal(distances[0], distances[1][order])
 
 
 def test_distances_are_euclidean_and_mahalanobis():
