@@ -168,10 +168,13 @@ def test_the_document_leads_from_make_vec_to_a_policy(sb3):
     languages = []
     for language, code in blocks("Reinforcement learning"):
         languages.append(language)
-        if language != "text":
-            exec(compile(code, "document", "exec"), scope)
+        if language != "text":  # two updates do here
+            exec(compile(code.replace("60_000", "8192"), "document", "exec"), scope)
     assert languages == ["python", "text", "py"]
     assert scope["model"].num_timesteps == 8192
+    env = gym.make(scope["name"], scenario="active_easy")
+    observation, _ = env.reset(seed=0)
+    assert env.action_space.contains(scope["trained"](observation, env))
 
 
 def randomised():
