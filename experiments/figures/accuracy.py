@@ -63,7 +63,7 @@ def truth_figure(trace: RunTrace, walls: Walls = ()) -> Figure:
         tall = 5.6 * height / width
         figure = style.new_figure(10.8, tall + 1.5)
         area, *beside = figure.subplots(1, 3, width_ratios=[6.2, 1.7, 1.7])
-        ids = trace.landmark_ids[landmarks]
+        ids = trace.landmark_ids[landmarks].astype(np.int64)
         _draw_distances(beside[0], beside[1], distances, ids, room=tall)
     style.dress_map(area, limits)
     keys = draw_against_truth(area, trace) + draw_walls(area, walls)
