@@ -287,6 +287,17 @@ def test_without_a_closed_submap_it_is_the_base_filter():
         np.testing.assert_allclose(slam.pose, other.pose, atol=1e-9)
 
 
+def test_a_coordinate_without_variance_has_no_covariance():
+    slam = SubmapSlam((0.01, 0.0, 0.3), MEASUREMENT_STD)
+    slam.predict((3.0, 0.0))  # σy = 0 and θ = 0: y stays known
+    np.testing.assert_array_equal(slam.belief().covariance[1], 0.0)
+    slam.local_view(0.0)
+    slam.predict((-5e-200, 0.0))
+    covariance = slam.local_view(0.0).covariance
+    assert (covariance.diagonal() >= 0).all()
+    assert abs(covariance[1, 2]) <= np.sqrt(covariance[1, 1] * covariance[2, 2]) + 1e-99
+
+
 # --- honesty --------------------------------------------------------------------------
 
 

@@ -325,7 +325,8 @@ def _composed(
     covariance[few, 3:cut] = rows[:, 3:cut] + np.outer(rows[:, 2], lever[3:])
     covariance[3:cut, few] = covariance[few, 3:cut].T
     covariance[np.ix_(few, few)] = as_covariance(rows[:, at] @ T.T)
-    np.fill_diagonal(covariance, np.maximum(covariance.diagonal(), 0.0))
+    is_known = covariance.diagonal() <= 0  # without variance, only rounding is left
+    covariance[is_known], covariance[:, is_known] = 0.0, 0.0
     return Gaussian(state_of(points, float(pose[2])), covariance)
 
 
