@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from comparison import assert_same_bits
+from comparison import assert_close_beliefs, assert_same_bits, part_of
 from drives import MEASUREMENT_STD
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -54,22 +54,14 @@ def forget(full, ids):
     state = full.state_dict()
     stays = ~np.isin(state["landmark_ids"], ids)
     keep = np.concatenate([[True] * 3, np.repeat(stays, 2)])
-    full.load_state_dict(
-        state
-        | {
-            "mean": state["mean"][keep],
-            "reference": state["reference"][keep],
-            "covariance": state["covariance"][np.ix_(keep, keep)],
-            "landmark_ids": state["landmark_ids"][stays],
-        }
-    )
+    state |= {key: state[key][keep] for key in ("mean", "reference")}
+    state["covariance"] = state["covariance"][np.ix_(keep, keep)]
+    full.load_state_dict(state | {"landmark_ids": state["landmark_ids"][stays]})
 
 
 def assert_equal_beliefs(one, other):
-    assert one.landmark_ids == other.landmark_ids
     assert one.frame == other.frame
-    np.testing.assert_allclose(one.mean, other.mean, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(one.covariance, other.covariance, rtol=0, atol=1e-10)
+    assert_close_beliefs(one, other, 1e-9, 1e-10)
 
 
 def follow_both(
@@ -172,14 +164,8 @@ def test_a_part_of_the_belief_is_that_part_of_the_whole(base):
         slam.update(readings, ids)
         some = [*rng.permutation(slam.local_ids)[:2], *rng.permutation(300)[:4]]
         some = list(dict.fromkeys(int(i) for i in some))
-        part, whole = slam.belief(some), slam.belief()
-        rows = [whole.landmark_ids.index(i) for i in some]
-        entries = [0, 1, 2, *(3 + 2 * r + axis for r in rows for axis in (0, 1))]
-        assert part.landmark_ids == tuple(some)
-        np.testing.assert_allclose(part.mean, whole.mean[entries], rtol=0, atol=1e-13)
-        np.testing.assert_allclose(
-            part.covariance, whole.covariance[np.ix_(entries, entries)], atol=1e-13
-        )
+        whole = slam.belief()
+        assert_close_beliefs(slam.belief(some), part_of(whole, some), 1e-13)
         np.testing.assert_array_equal(slam.belief([]).pose, whole.pose)
 
 
@@ -201,14 +187,8 @@ def test_to_remove_landmarks_leaves_all_else_exactly_as_it_was(near):
     before = slam.belief()
     gone = [i for i in slam.landmark_ids if (i in slam.local_ids) == near][::3]
     slam.remove(gone)
-    after = slam.belief()
-    stays = ~np.isin(before.landmark_ids, gone)
-    keep = np.concatenate([[True] * 3, np.repeat(stays, 2)])
-    assert after.landmark_ids == tuple(np.array(before.landmark_ids)[stays].tolist())
-    np.testing.assert_array_equal(after.mean, before.mean[keep])
-    np.testing.assert_allclose(
-        after.covariance, before.covariance[np.ix_(keep, keep)], rtol=0, atol=1e-15
-    )
+    stays = [i for i in before.landmark_ids if i not in gone]
+    assert_close_beliefs(slam.belief(), part_of(before, stays), 0, 1e-15)
 
 
 @pytest.mark.parametrize(
@@ -317,18 +297,6 @@ def test_what_it_stores_is_about_half_a_covariance():
     assert slam.nbytes < 0.65 * 8 * 2003**2
 
 
-def test_a_local_size_below_a_scan_is_refused():
-    slam = CompressedEkfSlam(*NOISE, local_size=5)
-    readings, ids = np.full((6, 2), 1.0), range(6)
-    slam.update(readings, ids)
-    before = slam.belief()
-    with pytest.raises(
-        ValueError, match=r"local_size must be >= 6, the mapped landmarks .*, got 5"
-    ):
-        slam.update(readings, ids)
-    assert_same_bits(before, slam.belief())
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -349,17 +317,6 @@ def test_a_local_size_below_a_scan_is_refused():
 def test_bad_arguments_are_named(call, message):
     with pytest.raises(ValueError, match=message):
         call()
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200])
-def test_a_refused_reading_leaves_everything_as_it_was_also_before_a_new_phase(bad):
-    slam = map_all(CompressedEkfSlam(*NOISE), 100)
-    run(slam, wander(100, 5))
-    far = next(i for i in slam.landmark_ids if i not in slam.local_ids)
-    before = slam.belief()
-    with pytest.raises(ValueError, match=rf"measurements must .*\(landmark {far}\)"):
-        slam.update([(0.0, bad)], [far])
-    assert_same_bits(before, slam.belief())
 
 
 @pytest.mark.parametrize(
@@ -388,12 +345,8 @@ def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(change, messag
 def test_a_restart_forgets_the_map():
     slam = run(CompressedEkfSlam(*NOISE, base="invariant"), wander(200, 100))
     slam.reset((1.0, 2.0, 0.5), (0.1, 0.1, 0.1))
-    fresh = CompressedEkfSlam(
-        *NOISE,
-        base="invariant",
-        initial_pose=(1.0, 2.0, 0.5),
-        initial_pose_std=(0.1, 0.1, 0.1),
-    )
+    start = {"initial_pose": (1.0, 2.0, 0.5), "initial_pose_std": (0.1, 0.1, 0.1)}
+    fresh = CompressedEkfSlam(*NOISE, base="invariant", **start)
     for each in (slam, fresh):
         run(each, wander(200, 120))
     assert_same_bits(slam.belief(), fresh.belief())

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from comparison import assert_same_bits, digest, part_of
 from inner_parts import (
     cached_submaps,
     closed_submaps,
@@ -11,16 +12,8 @@ from inner_parts import (
     spied,
 )
 from scipy.stats import chi2
-from test_submaps import (
-    LANDMARKS,
-    MEASUREMENT_STD,
-    MOTION_STD,
-    START,
-    assert_same_bits,
-    laps,
-    made,
-    run,
-)
+from test_submaps import LANDMARKS, MEASUREMENT_STD, MOTION_STD, START, laps, made
+from town_drives import run
 
 from slamgym.estimator.filters.conditioning import coincide
 from slamgym.estimator.filters.gaussian_map import without_landmarks
@@ -37,20 +30,25 @@ ALIAS = 100
 def assert_close(one, other, tolerance):
     """Compare beliefs, in standard deviations."""
     assert one.landmark_ids == other.landmark_ids
-    std = np.sqrt(np.diag(other.covariance))
-    shift = one.mean - other.mean
+    compare(one, other, np.sqrt(np.diag(other.covariance)), tolerance)
+
+
+def compare(one, other, std, tolerance):
+    """Compare means and covariances as far as the standard deviations go."""
+    n = len(std)
+    shift = one.mean[:n] - other.mean
     shift[2] = wrap_angle(shift[2])
     np.testing.assert_allclose(shift / std, 0, atol=tolerance)
-    change = (one.covariance - other.covariance) / np.outer(std, std)
+    change = (one.covariance[:n, :n] - other.covariance) / np.outer(std, std)
     np.testing.assert_allclose(change, 0, atol=tolerance)
 
 
-def part_of(belief, ids):
-    places = np.array([belief.landmark_ids.index(i) for i in ids], dtype=int)
-    rows = np.r_[0:3, 3 + (2 * places[:, None] + [0, 1]).ravel()]
-    return type(belief)(
-        belief.mean[rows], belief.covariance[np.ix_(rows, rows)], ids, belief.frame
-    )
+def assert_as_joined(slam, tolerance, within=0.0):
+    """Compare the view with the joined map; return both."""
+    view, whole = slam.local_view(within), slam.belief()
+    part = part_of(whole, view.ids)
+    compare(view, part, np.sqrt(np.diag(part.covariance)), tolerance)
+    return view, whole
 
 
 def holders(slam):
@@ -250,16 +248,12 @@ def test_merging_is_a_reading_of_distance_zero(base, way):
     slots = [before.landmark_ids.index(i) for i in (one, one + ALIAS)]
     mean, P = coincide(before.mean, before.covariance, *slots, frame="invariant")
     slam.merge(one, one + ALIAS)
-    expected = type(before)(
-        without_landmarks(mean, slots[1:]),
-        without_landmarks(P, slots[1:]),
-        tuple(i for i in before.landmark_ids if i != one + ALIAS),
-        "invariant",
-    )
+    left = tuple(i for i in before.landmark_ids if i != one + ALIAS)
+    arrays = (without_landmarks(array, slots[1:]) for array in (mean, P))
+    expected = type(before)(*arrays, left, "invariant")
     assert_close(slam.belief(), expected, 0.02)
-    assert np.trace(expected.covariance) < 0.999 * np.trace(
-        part_of(before, expected.landmark_ids).covariance
-    )
+    loose = part_of(before, left).covariance
+    assert np.trace(expected.covariance) < 0.999 * np.trace(loose)
 
 
 @pytest.mark.slow
@@ -326,24 +320,18 @@ def test_around_the_robot_it_believes_what_the_joined_map_does():
     for odometry, readings, ids, _ in laps(80):
         slam.predict(odometry)
         slam.update(readings, ids)
-        view, whole = slam.local_view(8.0), slam.belief()
-        n = 3 + 2 * len(view.ids)
-        std = np.sqrt(np.diag(view.covariance[:n, :n]))
-        part = part_of(whole, tuple(view.ids))
-        away = np.hypot(*(whole.landmarks - whole.pose[:2]).T)
-        near = {i for i, d in zip(whole.landmark_ids, away, strict=True) if d < 7.9}
-        assert near <= set(view.ids)
+        was_surveyed = slam.closed_count > closed
+        closed = slam.closed_count
+        view, whole = assert_as_joined(slam, 1e-9 if was_surveyed else 0.3, 8.0)
         assert view.mapped == whole.landmark_ids
-        if slam.closed_count > closed:  # just surveyed
-            closed, tolerance = slam.closed_count, 1e-9
-        else:
-            tolerance = 0.3
-        shift = view.mean[:n] - part.mean
-        shift[2] = wrap_angle(shift[2])
-        np.testing.assert_allclose(shift / std, 0, atol=tolerance)
-        change = (view.covariance[:n, :n] - part.covariance) / np.outer(std, std)
-        np.testing.assert_allclose(change, 0, atol=tolerance)
+        assert around(whole, 7.9) <= set(view.ids)
     assert closed > 5
+
+
+def around(belief, reach):
+    """Return which landmarks are within reach of the robot."""
+    away = np.hypot(*(belief.landmarks - belief.pose[:2]).T)
+    return {i for i, d in zip(belief.landmark_ids, away, strict=True) if d < reach}
 
 
 def wide_laps(steps, seed=0):
@@ -375,10 +363,8 @@ def test_what_lies_around_is_a_part_of_a_large_map_and_moves_with_the_robot():
     assert len(slam.landmark_ids) > 80
     assert max(seen[100:]) < 0.75 * len(slam.landmark_ids)
     assert np.mean(nees) < 6  # one run; of the order of 2
-    whole = slam.belief()
-    away = np.hypot(*(whole.landmarks - whole.pose[:2]).T)
     for reach in (8.0, 40.0):  # the second is farther than it held until now
-        near = {i for i, d in zip(whole.landmark_ids, away, strict=True) if d < reach}
+        near = around(slam.belief(), reach)
         assert near <= set(slam.local_view(reach + 0.1).ids)
 
 
@@ -391,28 +377,9 @@ def test_what_lies_around_learns_of_a_merge_and_of_a_removal():
     before = slam.closed_count
     slam.merge(one, one + ALIAS)
     slam.remove([other])
-    view, whole = slam.local_view(8.0), slam.belief()
+    view, _ = assert_as_joined(slam, 0.1, 8.0)
     assert slam.closed_count == before
     assert {one + ALIAS, other}.isdisjoint(view.ids)
-    part, n = part_of(whole, tuple(view.ids)), 3 + 2 * len(view.ids)
-    std = np.sqrt(np.diag(part.covariance))
-    shift = view.mean[:n] - part.mean
-    shift[2] = wrap_angle(shift[2])
-    np.testing.assert_allclose(shift / std, 0, atol=0.1)
-    change = (view.covariance[:n, :n] - part.covariance) / np.outer(std, std)
-    np.testing.assert_allclose(change, 0, atol=0.1)
-
-
-def assert_as_joined(slam, tolerance):
-    """Compare the view with the joined map, in standard deviations."""
-    view, whole = slam.local_view(0.0), slam.belief()
-    part, n = part_of(whole, tuple(view.ids)), 3 + 2 * len(view.ids)
-    std = np.sqrt(np.diag(part.covariance))
-    shift = view.mean[:n] - part.mean
-    shift[2] = wrap_angle(shift[2])
-    np.testing.assert_allclose(shift / std, 0, atol=tolerance)
-    change = (view.covariance[:n, :n] - part.covariance) / np.outer(std, std)
-    np.testing.assert_allclose(change, 0, atol=tolerance)
 
 
 def surveys_of(slam):
@@ -494,19 +461,12 @@ def test_where_there_are_too_many_it_claims_no_more_than_it_holds(monkeypatch):
     for odometry, readings, ids, _ in wide_laps(120):
         slam.predict(odometry)
         slam.update(readings, ids)
-        held, extent = (
-            set(slam.local_view(25.0).ids),
-            neighbourhood_of(slam)._copy.region,
-        )
-        whole = slam.belief()
+        held = set(slam.local_view(25.0).ids)
+        extent, whole = neighbourhood_of(slam)._copy.region, slam.belief()
         away = np.hypot(*(whole.landmarks - whole.pose[:2]).T)
         cut += len(held) < len(whole.landmark_ids)
-        missing = [
-            distance
-            for i, distance in zip(whole.landmark_ids, away, strict=True)
-            if i not in held
-        ]
-        for distance in missing:
+        missing = ~np.isin(whole.landmark_ids, list(held))
+        for distance in away[missing]:
             assert not extent.covers(whole.pose[:2], distance + 1e-6)
         assert extent.covers(whole.pose[:2], 0.0)
     assert cut > 30
@@ -606,13 +566,6 @@ def edited_run(slam, drive, start=0):
     return slam
 
 
-def states_agree(one, other):
-    one, other = one.state_dict(), other.state_dict()
-    return set(one) == set(other) and all(
-        np.array_equal(one[key], other[key]) for key in one if key != "run"
-    )
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("base", "on_disk", "cut"),
@@ -640,11 +593,14 @@ def test_an_edited_run_continues_bit_for_bit(tmp_path, base, on_disk, cut):
     edited_run(other, drive, start=cut)
     assert slam.closed_count == other.closed_count > 4
     assert closed_submaps(slam).renamed
-    assert states_agree(slam, other)
-    assert_same_bits(slam.belief(), other.belief())
-    assert_same_bits(
-        slam.belief(slam.landmark_ids[:3]), other.belief(slam.landmark_ids[:3])
-    )
+    assert state_of(slam) == state_of(other)
+    for some in (None, slam.landmark_ids[:3]):
+        assert_same_bits(slam.belief(some), other.belief(some))
+
+
+def state_of(slam):
+    """Return the state but for the name of the run."""
+    return {key: bits for key, bits in digest(slam).items() if key != "run"}
 
 
 def test_editing_writes_no_submap_again(tmp_path):
@@ -663,7 +619,7 @@ def test_reset_forgets_all_edits():
     fresh = made(submap_size=9)
     for each in (slam, fresh):
         edited_run(each, list(laps(75)))
-    assert states_agree(slam, fresh)
+    assert state_of(slam) == state_of(fresh)
 
 
 @pytest.mark.parametrize(
@@ -682,9 +638,8 @@ def test_an_edited_state_that_does_not_fit_is_refused(change, message):
     slam = edited_run(made(), list(laps(45)))
     state, other = slam.state_dict(), made()
     if "local_landmark_ids" in change:
-        change = {
-            "local_landmark_ids": 50 + np.arange(len(state["local_landmark_ids"]))
-        }
+        count = len(state["local_landmark_ids"])
+        change = {"local_landmark_ids": 50 + np.arange(count)}
     with pytest.raises(ValueError, match=message):
         other.load_state_dict(state | change)
-    assert states_agree(other, made())
+    assert state_of(other) == state_of(made())
