@@ -507,130 +507,71 @@ def textbook_module(old="", new=""):
 
 
 MISTAKES = {
-    "sign of -d sin in G": (
-        "G[:2, 2] = -d * s, d * c",
-        "G[:2, 2] = d * s, d * c",
+    "sign of -d sin in G": ("G[:2, 2] = -d * s, d * c", "G[:2, 2] = d * s, d * c",
         r"predict\(\): ∂x'/∂θ has the wrong sign: covariance\[0, 1\], of x and y, must "
-        r"be 3\.15e-06, got 5\.24e-06",
-    ),
-    "sign of d cos in G": (
-        "G[:2, 2] = -d * s, d * c",
-        "G[:2, 2] = -d * s, -d * c",
-        r"predict\(\): ∂y'/∂θ has the wrong sign: covariance\[1, 2\]",
-    ),
-    "G is the identity": (
-        "G[:2, 2] = -d * s, d * c",
-        "",
-        r"predict\(\): ∂x'/∂θ and ∂y'/∂θ are missing: covariance\[1, 1\]",
-    ),
-    "sign of a sine in F": (
-        "F[:2, :2] = (c, -s), (s, c)",
-        "F[:2, :2] = (c, s), (s, c)",
-        r"predict\(\): ∂x'/∂εy has the wrong sign",
-    ),
-    "noise along the axes of the world": (
-        "F[:2, :2] = (c, -s), (s, c)",
-        "",
-        r"predict\(\): the motion noise is not rotated by the heading",
-    ),
-    "half dt": (
-        "F.T * dt",
-        "F.T * dt / 2",
+        r"be 3\.15e-06, got 5\.24e-06"),
+    "sign of d cos in G": ("G[:2, 2] = -d * s, d * c", "G[:2, 2] = -d * s, -d * c",
+        r"predict\(\): ∂y'/∂θ has the wrong sign: covariance\[1, 2\]"),
+    "G is the identity": ("G[:2, 2] = -d * s, d * c", "",
+        r"predict\(\): ∂x'/∂θ and ∂y'/∂θ are missing: covariance\[1, 1\]"),
+    "sign of a sine in F": ("F[:2, :2] = (c, -s), (s, c)",
+        "F[:2, :2] = (c, s), (s, c)", r"predict\(\): ∂x'/∂εy has the wrong sign"),
+    "noise along the axes of the world": ("F[:2, :2] = (c, -s), (s, c)", "",
+        r"predict\(\): the motion noise is not rotated by the heading"),
+    "half dt": ("F.T * dt", "F.T * dt / 2",
         r"predict\(\): the variance of the motion noise is multiplied by 0\.5: "
-        r"covariance\[\d, \d\]",
-    ),
+        r"covariance\[\d, \d\]"),
     "dt squared": ("F.T * dt", "F.T * dt**2", "motion noise is multiplied by dt²"),
     "no dt": ("F.T * dt", "F.T", "motion noise is not multiplied by dt"),
-    "deviations for variances of the motion": (
-        "np.diag(np.square(motion_std))",
+    "deviations for variances of the motion": ("np.diag(np.square(motion_std))",
         "np.diag(motion_std)",
-        "standard deviations of the motion noise are used as variances",
-    ),
+        "standard deviations of the motion noise are used as variances"),
     "cross-covariance does not move": (
         "self.P = G @ self.P @ G.T + F @ self.R @ F.T * dt",
         "A, B = G[:3, :3], F[:3]\n"
         "        self.P[:3, :3] = A @ self.P[:3, :3] @ A.T + B @ self.R @ B.T * dt",
         r"predict\(\): the covariance of pose and landmarks is not multiplied by G: "
-        r"covariance\[\d, \d\], of .*l\d[xy], must be .*, got",
-    ),
-    "new landmark without cross-covariance": (
-        "self.ids.append(landmark)",
+        r"covariance\[\d, \d\], of .*l\d[xy], must be .*, got"),
+    "new landmark without cross-covariance": ("self.ids.append(landmark)",
         "self.ids.append(landmark); self.P[-2:, :-2] = 0; self.P[:-2, -2:] = 0",
-        "new landmarks: all covariances with the pose and other landmarks are missing",
-    ),
+        "new landmarks: all covariances with the pose and other landmarks are missing"),
     "new landmark without the pose's covariance": (
-        "J[-2:, :3] = (1, 0, -r * s), (0, 1, r * c)",
-        "",
-        "new landmarks: the uncertainty of the pose is left out",
-    ),
-    "new landmarks without each other's covariance": (
-        "self.ids.append(landmark)",
+        "J[-2:, :3] = (1, 0, -r * s), (0, 1, r * c)", "",
+        "new landmarks: the uncertainty of the pose is left out"),
+    "new landmarks without each other's covariance": ("self.ids.append(landmark)",
         "self.ids.append(landmark); self.P[-2:, 3:-2] = 0; self.P[3:-2, -2:] = 0",
-        "the covariance of two new landmarks is missing",
-    ),
-    "sign in the Jacobian of a new landmark": (
-        "(1, 0, -r * s), (0, 1, r * c)",
-        "(1, 0, r * s), (0, 1, r * c)",
-        "new landmarks: ∂lx/∂θ has the wrong sign",
-    ),
-    "new landmark without the noise of the reading": (
-        " + B @ self.Q @ B.T",
-        "",
-        "new landmarks: the sensor noise is missing",
-    ),
-    "reading of a new landmark used again": (
-        "self._add(i, *scan[i])\n",
+        "the covariance of two new landmarks is missing"),
+    "sign in the Jacobian of a new landmark": ("(1, 0, -r * s), (0, 1, r * c)",
+        "(1, 0, r * s), (0, 1, r * c)", "new landmarks: ∂lx/∂θ has the wrong sign"),
+    "new landmark without the noise of the reading": (" + B @ self.Q @ B.T", "",
+        "new landmarks: the sensor noise is missing"),
+    "reading of a new landmark used again": ("self._add(i, *scan[i])\n",
         "self._add(i, *scan[i])\n        if new: self.update(*zip(*[(scan[i], i) for "
-        "i in new]))\n",
-        "new landmarks: every reading is used twice",
-    ),
+        "i in new]))\n", "new landmarks: every reading is used twice"),
     "scan used twice": (
         "S = H @ self.P @ H.T + np.kron(np.eye(len(known)), self.Q)\n",
         "H, nu = np.vstack([H, H]), np.append(nu, nu)\n"
         "        S = H @ self.P @ H.T + np.kron(np.eye(2 * len(known)), self.Q)\n",
-        r"update\(\): every reading is used twice: covariance\[\d, \d\]",
-    ),
-    "sign of the heading in H": (
-        "-dx / r**2, -1)",
-        "-dx / r**2, 1)",
-        r"update\(\): ∂β/∂θ has the wrong sign",
-    ),
-    "no heading in H": (
-        "-dx / r**2, -1)",
-        "-dx / r**2, 0)",
-        r"update\(\): ∂β/∂θ is missing",
-    ),
-    "sign in the landmark's Jacobian": (
-        "(dx / r, dy / r)",
-        "(dx / r, -dy / r)",
-        r"update\(\): ∂r/∂ly has the wrong sign",
-    ),
-    "deviations of the readings swapped": (
-        "np.diag(np.square(measurement_std))",
+        r"update\(\): every reading is used twice: covariance\[\d, \d\]"),
+    "sign of the heading in H": ("-dx / r**2, -1)", "-dx / r**2, 1)",
+        r"update\(\): ∂β/∂θ has the wrong sign"),
+    "no heading in H": ("-dx / r**2, -1)", "-dx / r**2, 0)",
+        r"update\(\): ∂β/∂θ is missing"),
+    "sign in the landmark's Jacobian": ("(dx / r, dy / r)", "(dx / r, -dy / r)",
+        r"update\(\): ∂r/∂ly has the wrong sign"),
+    "deviations of the readings swapped": ("np.diag(np.square(measurement_std))",
         "np.diag(np.square(measurement_std)[::-1])",
-        "standard deviations of the sensor noise are in another order",
-    ),
-    "covariance not updated": (
-        "self.P - K @ S @ K.T",
-        "self.P",
-        r"update\(\): the covariance is not updated",
-    ),
-    "map not corrected": (
-        "K = np.linalg.solve(S, H @ self.P).T",
+        "standard deviations of the sensor noise are in another order"),
+    "covariance not updated": ("self.P - K @ S @ K.T", "self.P",
+        r"update\(\): the covariance is not updated"),
+    "map not corrected": ("K = np.linalg.solve(S, H @ self.P).T",
         "K = np.linalg.solve(S, H @ self.P).T; K[3:] = 0",
-        r"update\(\): the gain of the landmarks is missing",
-    ),
-    "innovation against the readings": (
-        "self.x + K @ nu",
-        "self.x - K @ nu",
-        r"update\(\): the innovation has the wrong sign: mean\[\d\]",
-    ),
-    "NIS without the noise": (
-        "nu @ np.linalg.solve(S, nu)",
-        "nu @ np.linalg.solve(S / 2, nu)",
-        r"update\(\)\.nis must be νᵀ S⁻¹ ν",
-    ),
-}
+        r"update\(\): the gain of the landmarks is missing"),
+    "innovation against the readings": ("self.x + K @ nu", "self.x - K @ nu",
+        r"update\(\): the innovation has the wrong sign: mean\[\d\]"),
+    "NIS without the noise": ("nu @ np.linalg.solve(S, nu)",
+        "nu @ np.linalg.solve(S / 2, nu)", r"update\(\)\.nis must be νᵀ S⁻¹ ν"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

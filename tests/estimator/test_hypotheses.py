@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from comparison import digest
 from inner_parts import filters_of
 
 from slamgym.envs import LandmarkWorldEnv
@@ -117,30 +118,13 @@ def test_backdated_sightings_give_the_belief_of_known_identities():
     assert late <= 3
     if late == 0:
         np.testing.assert_allclose(slam.belief().mean, expected.mean, atol=1e-10)
-    gap = np.linalg.norm(slam.belief().landmarks - expected.landmarks, axis=1)
     forgetful = make(world, association="joint", backdate=False)
     follow(forgetful, scans)
-    other = np.linalg.norm(
-        forgetful.belief().landmarks - expected.landmarks[: len(mapped)], axis=1
+    gap, other = (
+        np.linalg.norm(each.belief().landmarks - expected.landmarks, axis=1).max()
+        for each in (slam, forgetful)
     )
-    assert gap.max() < other.max() / 5
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_a_saved_run_continues_bit_for_bit(method, slippery_drive, tmp_path):
-    world, scans = slippery_drive
-    slam = make(world, association=method, backdate=True)
-    follow(slam, scans[:25])
-    np.savez(tmp_path / "state.npz", **slam.state_dict())
-    other = make(world, association=method, backdate=True)
-    with np.load(tmp_path / "state.npz") as state:
-        other.load_state_dict(dict(state))
-    for odometry, readings, _ in scans[25:50]:
-        for one in (slam, other):
-            one.predict(odometry)
-        assert slam.update(readings).row_ids == other.update(readings).row_ids
-    np.testing.assert_array_equal(slam.belief().mean, other.belief().mean)
-    np.testing.assert_array_equal(slam.belief().covariance, other.belief().covariance)
+    assert gap < other / 5
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -158,18 +142,6 @@ def test_the_order_of_the_readings_changes_no_decision(method, slippery_drive):
         turned = other.update(readings[order]).row_ids
         mapped = [ids[row] for row in order]
         assert [i is None for i in mapped] == [i is None for i in turned]
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_a_refused_scan_leaves_everything_as_it_was(method, slippery_drive):
-    world, scans = slippery_drive
-    slam = make(world, association=method, backdate=True)
-    follow(slam, scans[:20])
-    before = slam.state_dict()
-    for bad in ([(np.nan, 2.0)], [(0.1, 2.0, 3.0)]):
-        with pytest.raises(ValueError, match="measurements"):
-            slam.update(bad)
-    assert_same_state(before, slam.state_dict())
 
 
 @pytest.mark.parametrize("factor", [1 / 3, 3.0])
@@ -266,23 +238,6 @@ def test_every_filter_takes_joint_assignments(name, slippery_drive):
     assert len(slam.belief().landmark_ids) > 10
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("association", "nearst"),
-        ("density", 0.0),
-        ("hypotheses", 0),
-        ("branches", 1.5),
-        ("search_nodes", 0),
-        ("pair_gate", -1.0),
-        ("backdate", "yes"),
-    ],
-)
-def test_a_policy_refuses_what_makes_no_sense(field, value):
-    with pytest.raises(ValueError, match=field):
-        make(slippery_world(), **{field: value})
-
-
 def failing_after(slam, steps):
     """Make the filter inside fail at its next update after so many."""
     update, count = slam.filter.update, iter(range(steps))
@@ -321,7 +276,7 @@ def test_a_hypothesis_whose_filter_fails_is_discarded(slippery_drive):
 def test_where_every_filter_fails_nothing_has_changed(slippery_drive, monkeypatch):
     world, scans = slippery_drive
     slam, (_, readings, _) = several_hypotheses(scans, world)
-    before = slam.state_dict()
+    before = digest(slam)
     for hypothesis in slam.hypotheses:
         failing_after(hypothesis.slam, 0)
     make_filter = filters_of(slam).fresh
@@ -334,13 +289,7 @@ def test_where_every_filter_fails_nothing_has_changed(slippery_drive, monkeypatc
     monkeypatch.setattr(slam, "_pool", FilterPool(make_failing))
     with pytest.raises(np.linalg.LinAlgError, match="degenerate"):
         slam.update(readings)
-    assert_same_state(before, slam.state_dict())
-
-
-def assert_same_state(before, after):
-    assert before.keys() == after.keys()
-    for key, entry in before.items():
-        np.testing.assert_array_equal(entry, after[key])
+    assert digest(slam) == before
 
 
 @pytest.mark.parametrize("method", ["joint", "hypotheses"])
@@ -350,14 +299,14 @@ def test_a_state_that_cannot_be_loaded_leaves_everything_as_it_was(
     world, scans = slippery_drive
     slam = make(world, association=method, backdate=True)
     follow(slam, scans[:20])
-    before = slam.state_dict()
+    before = digest(slam)
     other = make(world, association=method, backdate=True)
     follow(other, scans[:30])
     saved = other.state_dict()
     broken = {key: saved[key] for key in saved if not key.endswith(".row_ids")}
     with pytest.raises(ValueError, match="must hold 'row_ids'"):
         slam.load_state_dict(broken)
-    assert_same_state(before, slam.state_dict())
+    assert digest(slam) == before
 
 
 def test_loading_again_and_again_makes_no_more_filters(slippery_drive):
@@ -387,7 +336,7 @@ def test_alternatives_that_are_skipped_would_not_have_been_kept(
     monkeypatch.setattr(scan_assignments, "_is_superfluous", lambda *_: False)
     thorough = follow(options[1], scans[:60])
     assert [r.row_ids for r in quick] == [r.row_ids for r in thorough]
-    assert_same_state(options[0].best.state_dict(), options[1].best.state_dict())
+    assert digest(options[0].best) == digest(options[1].best)
 
 
 def test_a_sighting_of_clutter_does_not_drag_a_new_landmark_along():

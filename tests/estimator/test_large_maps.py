@@ -11,7 +11,6 @@ from scipy.stats import chi2
 
 from slamgym.estimator import make_estimator
 from slamgym.estimator.filters.conditioning import separation
-from slamgym.estimator.map_management.map_editor import MapEditor
 from slamgym.estimator.map_management.policy import LandmarkPolicy
 from slamgym.evaluation.nees import normalised_squared_error, state_nees
 from slamgym.experiments.monte_carlo import (
@@ -253,52 +252,6 @@ def both_processes(tmp_path_factory):
 def test_stopped_after_any_call_it_goes_on_in_another_process(both_processes, way):
     here, there = both_processes
     assert there[way] == here[way]
-
-
-# --- removal ---
-
-REMOVING = {
-    "ekf": ("ekf", {}),
-    "compressed": ("compressed", {"local_size": 20}),
-    "compressed invariant": ("compressed", {"base": "invariant", "local_size": 20}),
-    "sparse_information": ("sparse_information", {"active_bound": 12}),
-    "submaps": ("submaps", {"submap_size": 20}),
-}
-
-
-@pytest.mark.parametrize("name", ["compressed", "sparse_information", "submaps"])
-def test_nobody_removes_everything_by_saying_nothing(name):
-    slam = of_city(name)
-    slam.update([(0.1, 3.0), (0.9, 4.0)], [7, 9])
-    with pytest.raises(ValueError, match="landmark_ids must be integers, got None"):
-        slam.remove(None)
-    assert slam.landmark_ids == (7, 9)
-
-
-@pytest.mark.parametrize("way", REMOVING)
-def test_removal_changes_no_other_marginal_near_or_far(way):
-    name, options = REMOVING[way]
-    slam = of_city(name, **options)
-    tell(slam, calls_of("alone", 290))
-    before = slam.belief()
-    gone = list(before.landmark_ids[1::3])
-    stays = [i for i in before.landmark_ids if i not in gone]
-    MapEditor(slam).remove(gone)
-    after = slam.belief()
-    assert set(after.landmark_ids) == set(stays)
-    rows = [
-        np.r_[0:3, [3 + 2 * b.landmark_ids.index(i) + a for i in stays for a in (0, 1)]]
-        for b in (before, after)
-    ]
-    np.testing.assert_allclose(
-        after.mean[rows[1]], before.mean[rows[0]], rtol=0, atol=1e-12
-    )
-    np.testing.assert_allclose(
-        after.covariance[np.ix_(rows[1], rows[1])],
-        before.covariance[np.ix_(rows[0], rows[0])],
-        rtol=0,
-        atol=1e-12,
-    )
 
 
 # --- merging: true duplicates, and neighbours that are two ---

@@ -70,7 +70,8 @@ def polar(points, pose=(0, 0, 0)):
         ({"confirm": (4, 64)}, "confirm must be (k, n) with k <= n <= 63, got (4, 64)"),
         ({"trust_ids": 1}, "trust_ids must be True or False, got 1"),
         ({"remove_after": 5}, "view must be given with remove_after"),
-        ({"remove_after": 0, "view": AROUND}, "remove_after must be a whole number >="),
+        ({"remove_after": 0, "view": AROUND},
+         "remove_after must be a whole number >= 1, got 0"),
         ("yes", "management must be a LandmarkPolicy"),
         ({"view": 30}, "view must be a FieldOfView or None, got 30"),
         ({"merge_within": 0.0}, "merge_within must be a finite number > 0, got 0.0"),
@@ -81,9 +82,13 @@ def polar(points, pose=(0, 0, 0)):
         ({"view": {"max_range": 5, "min_range": 6}}, "max_range must be a finite"),
         ({"view": {"max_range": 5, "angle": 7.0}}, "angle must be at most 2π, got 7.0"),
         ({"view": {"max_range": 5, "shadow": -1}}, "shadow must be a finite number >="),
-        ({"view": {"max_range": 5, "visible": 3}}, "visible must be callable or None"),
+        ({"view": {"max_range": 5, "visible": 3}},
+         "visible must be callable or None, got 3"),
+        *(({field: value}, field) for field, value in {
+            "association": "nearst", "density": 0.0, "hypotheses": 0, "branches": 1.5,
+            "search_nodes": 0, "pair_gate": -1.0, "backdate": "yes"}.items()),
     ],
-)
+)  # fmt: skip
 def test_a_bad_policy_is_refused(changes, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         policies.as_policy(changes)

@@ -209,12 +209,15 @@ def without_the_last(value):
 @pytest.mark.parametrize(
     ("name", "key", "damaged", "message"),
     [
-        ("ekf", "covariance", negative, r"\['covariance'\] must be positive semid"),
-        ("robocentric", "covariance", negative, "semidefinite, got the eigenv"),
-        ("compressed", "local_covariance", negative, "l_covariance.* semidefinite"),
-        ("submaps", "submap_0_covariance", negative, "0_covariance.* semidefinite"),
-        ("sparse_information", "pose_covariance", negative, "e_covariance.* semidef"),
-        ("compressed", "far_progress", lambda v: v + np.inf, r"'\] must be finite"),
+        ("ekf", "covariance", negative,
+         r"state\['covariance'\] must be positive semidefinite"),
+        ("robocentric", "covariance", negative,
+         "must be positive semidefinite, got the eigenv"),
+        *((name, key, negative, f"{key}.* semidefinite") for name, key in (
+            ("compressed", "local_covariance"), ("submaps", "submap_0_covariance"),
+            ("sparse_information", "pose_covariance"))),
+        ("compressed", "far_progress", lambda v: v + np.inf,
+         r"state\['far_progress'\] must be finite"),
         ("sparse_information", "around_slots", lambda _: np.array([2.0**63]),
          "around_slots'] must be whole numbers <= 2⁵³"),
         ("sparse_information", "local_slots", lambda v: v[:, None],
