@@ -93,21 +93,17 @@ def test_a_trajectory_replays_in_its_environment(preset, ranges):
         assert drive.landmarks.tolist() == env.unwrapped.landmarks.tolist()
         assert drive.start_estimate.tolist() == env.unwrapped.start_estimate.tolist()
         for step, action in enumerate(drive.actions):
+            pairs = [(drive.measurements[step], observation["landmarks"])]
+            pairs += [(drive.mask[step], observation["mask"])]
+            pairs += [(drive.poses[step], info["pose"])]
             if step > 0:
-                assert (
-                    drive.odometry[step - 1].tolist()
-                    == observation["odometry"].tolist()
-                )
+                pairs += [(drive.odometry[step - 1], observation["odometry"])]
                 assert drive.collisions[step - 1] == info["collision"]
-            assert (
-                drive.measurements[step].tolist() == observation["landmarks"].tolist()
-            )
-            assert drive.mask[step].tolist() == observation["mask"].tolist()
-            assert drive.poses[step].tolist() == info["pose"].tolist()
             ids = info.get("landmark_ids")
             assert (drive.landmark_ids is None) == (ids is None)
             if ids is not None:
-                assert drive.landmark_ids[step].tolist() == ids.tolist()
+                pairs += [(drive.landmark_ids[step], ids)]
+            assert all(one.tolist() == other.tolist() for one, other in pairs)
             observation, *_, info = env.step(action)
 
 
@@ -314,18 +310,15 @@ def test_whole_shards_are_not_driven_again(tmp_path, monkeypatch):
 
 
 def test_an_error_while_writing_leaves_whole_shards_and_no_rests(tmp_path, monkeypatch):
-    written = []
+    written, npz = [], FORMATS["npz"]
 
-    npz = FORMATS["npz"]
-
-    def write_two(trajectories, path, write=npz.write):
+    def write_two(trajectories, path):
         path.write_text("half")
         if len(written) == 2:
             raise OSError("disk full")
         written.append(path)
         npz.write(trajectories, path)
 
-    npz = FORMATS["npz"]
     with monkeypatch.context() as patch:
         patch.setitem(FORMATS, "npz", npz._replace(write=write_two))
         with pytest.raises(OSError, match="disk full"):
@@ -347,6 +340,13 @@ def damage(path):
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 1
     file.write_bytes(data)
+
+
+def test_a_shard_that_is_gone_counts_as_damaged(tmp_path):
+    small(tmp_path / "out")
+    (tmp_path / "out" / "shard_00002.npz").unlink()
+    with pytest.raises(DamagedShardError, match="shard_00002"):
+        list(load_trajectories(tmp_path / "out"))
 
 
 @pytest.mark.parametrize("name", ["npz", "slamlog"])
@@ -406,13 +406,6 @@ def test_an_extension_killed_before_the_shard_is_listed_goes_on(
     assert tree(tmp_path / "out") == tree(tmp_path / "whole")
 
 
-def test_a_shard_that_is_gone_counts_as_damaged(tmp_path):
-    small(tmp_path / "out")
-    (tmp_path / "out" / "shard_00002.npz").unlink()
-    with pytest.raises(DamagedShardError, match="shard_00002"):
-        list(load_trajectories(tmp_path / "out"))
-
-
 def test_a_repair_that_gives_other_bits_is_refused(tmp_path, monkeypatch):
     small(tmp_path / "out")
     damage(tmp_path / "out" / "shard_00001.npz")
@@ -461,12 +454,10 @@ def test_more_episodes_keep_the_full_shards(tmp_path, monkeypatch):
         ({"episodes": 6}, "episodes = 7, not 6"),
         ({"episodes_per_shard": 4}, "episodes_per_shard = 3, not 4"),
         ({"scenario": LOOP.with_changes(dt=0.7)}, r"scenario\.dt = .*, not 0\.7"),
-        (
-            {"scenario": LOOP.with_changes(randomise=RANGES)},
-            r"scenario\.randomise = None",
-        ),
+        ({"scenario": LOOP.with_changes(randomise=RANGES)},
+         r"scenario\.randomise = None"),
     ],
-)
+)  # fmt: skip
 def test_a_folder_of_another_job_is_refused_and_untouched(changes, message, tmp_path):
     small(tmp_path / "out")
     before = tree(tmp_path / "out")

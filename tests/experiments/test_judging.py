@@ -28,6 +28,7 @@ from slamgym.experiments.logs.slamlog import OdometryRow, Scan
 
 ROOT = Path(__file__).parents[2]
 RUNS, SEED = 24, 300
+JOB = {"episodes": RUNS, "seed": SEED, "controller": "open_loop"}
 DEGREES = np.diag([1.0, 1.0, 180 / np.pi])
 ORDER = np.eye(3)[[2, 0, 1]]  # (θ, x, y)
 ROWS = [*range(5), 6, 5, *range(7, 30)]  # two of the 30 poses are swapped
@@ -38,22 +39,14 @@ EXACT = {"rtol": 1e-12, "atol": 0}
 def drives(tmp_path_factory):
     """Return a data set that also holds what a consistent filter believes."""
     folder = tmp_path_factory.mktemp("judge") / "drives"
-    generate_trajectories(
-        "six_landmarks",
-        folder,
-        episodes=RUNS,
-        seed=SEED,
-        controller="open_loop",
-        estimator="invariant",
-    )
+    generate_trajectories("six_landmarks", folder, **JOB, estimator="invariant")
     return folder
 
 
 @pytest.fixture(scope="module")
 def text_drives(tmp_path_factory):
     folder = tmp_path_factory.mktemp("judge") / "text"
-    job = {"episodes": RUNS, "seed": SEED, "controller": "open_loop"}
-    generate_trajectories("six_landmarks", folder, format="slamlog", **job)
+    generate_trajectories("six_landmarks", folder, **JOB, format="slamlog")
     return folder
 
 
@@ -92,13 +85,11 @@ def rows(poses, covariances, entries=9, landmarks=()):
 def filter_text(path, estimator="invariant", *, one_by_one=False):
     """Read a drive as text and filter it; return the lines of estimates."""
     log = read_slamlog(path)
+    keys = {name: name for name in ("motion_std", "measurement_std")}
+    keys["initial_pose_std"] = "start_sigma"
     stds = {
         name: [float(part) for part in log.header[key].split(",")]
-        for name, key in (
-            ("motion_std", "motion_std"),
-            ("measurement_std", "measurement_std"),
-            ("initial_pose_std", "start_sigma"),
-        )
+        for name, key in keys.items()
     }
     slam = make_estimator(estimator, initial_pose=log.start, **stds)
     poses, covariances = [], []
@@ -114,14 +105,10 @@ def filter_text(path, estimator="invariant", *, one_by_one=False):
             covariances.append(slam.belief().pose_covariance)
             slam.predict((event.d, event.alpha))
     belief = slam.belief()
+    parts = belief.landmark_ids, belief.landmarks, belief.landmark_covariances
     landmarks = [
         f"landmark,{i},{','.join(map(repr, [*place.tolist(), *P.ravel().tolist()]))}"
-        for i, place, P in zip(
-            belief.landmark_ids,
-            belief.landmarks,
-            belief.landmark_covariances,
-            strict=True,
-        )
+        for i, place, P in zip(*parts, strict=True)
     ]
     poses, covariances = [*poses, belief.pose], [*covariances, belief.pose_covariance]
     return rows(poses, covariances, landmarks=landmarks)
@@ -218,71 +205,55 @@ def relative(poses):
     return np.stack([cos * x + sin * y, cos * y - sin * x, poses[..., 2] - 1], axis=-1)
 
 
+SWAPPED = (
+    "estimates or truths of 2 drives are swapped: the estimate of drive "
+    f"{SEED} fits the truth of drive {SEED + 1} and the estimate of drive "
+    f"{SEED + 1} fits the truth of drive {SEED}."
+)
+STRAY = (
+    f"{2 * RUNS} poses are far from the truth although their neighbours are not, as "
+    f"in swapped rows; the first is step 5 of drive {SEED}, and without "
+)
+LEFT, RIGHT = (
+    f"covariances of the {side}-invariant error (the {frame}'s frame): "
+    for side, frame in (("left", "robot"), ("right", "world"))
+)
+IN_DEGREES = "headings in degrees instead of radians: "
+OTHER_ORDER = "the order (θ, x, y) instead of (x, y, θ): "
 WRONG = {
-    "degrees": (
-        lambda x, P: (x @ DEGREES, P),
-        "convention: headings in degrees instead of radians: ",
-    ),
+    "degrees": (lambda x, P: (x @ DEGREES, P), IN_DEGREES),
     "degrees everywhere": (
         lambda x, P: (x @ DEGREES, DEGREES @ P @ DEGREES),
-        "convention: headings in degrees instead of radians: ",
+        IN_DEGREES,
     ),
     "degrees in the covariance": (
         lambda x, P: (x, DEGREES @ P @ DEGREES),
-        "convention: covariances with headings in degrees: ",
+        "covariances with headings in degrees: ",
     ),
-    "order": (
-        lambda x, P: (x @ ORDER.T, ORDER @ P @ ORDER.T),
-        "convention: the order (θ, x, y) instead of (x, y, θ): ",
-    ),
+    "order": (lambda x, P: (x @ ORDER.T, ORDER @ P @ ORDER.T), OTHER_ORDER),
     "order in the covariance": (
         lambda x, P: (x, ORDER @ P @ ORDER.T),
-        "convention: covariances with the order (θ, x, y) instead of (x, y, θ): ",
+        f"covariances with {OTHER_ORDER}",
     ),
     "triangle": (
         lambda x, P: (x, lower_as_upper(P)),
-        "convention: the lower triangle of the covariance, row by row: ",
+        "the lower triangle of the covariance, row by row: ",
     ),
-    "left error": (
-        lambda x, P: (x, to_left(x, P)),
-        "convention: covariances of the left-invariant error (the robot's frame): ",
-    ),
-    "right error": (
-        lambda x, P: (x, invariant_covariance(x, P)),
-        "convention: covariances of the right-invariant error (the world's frame): ",
-    ),
-    "time": (
-        lambda x, P: (late(x), late(P)),
-        "convention: time stamps that are 1 step too late: ",
-    ),
+    "left error": (lambda x, P: (x, to_left(x, P)), LEFT),
+    "right error": (lambda x, P: (x, invariant_covariance(x, P)), RIGHT),
+    "time": (lambda x, P: (late(x), late(P)), "time stamps that are 1 step too late: "),
     "deviations": (
         lambda x, P: (x, std_of(P)),
-        "convention: standard deviations in place of variances: ",
+        "standard deviations in place of variances: ",
     ),
     "information": (
         lambda x, P: (x, np.linalg.inv(P)),
-        "convention: information matrices in place of covariances: ",
+        "information matrices in place of covariances: ",
     ),
-    "clockwise": (
-        lambda x, P: (x * [1, 1, -1], P),
-        "convention: headings that grow clockwise: ",
-    ),
-    "millimetres": (
-        lambda x, P: (x * [1e3, 1e3, 1], P),
-        "convention: positions in millimetres: ",
-    ),
-    "swapped": (
-        lambda x, P: (swapped(x), swapped(P)),
-        "convention: estimates or truths of 2 drives are swapped: the estimate of "
-        f"drive {SEED} fits the truth of drive {SEED + 1} and the estimate of drive "
-        f"{SEED + 1} fits the truth of drive {SEED}.",
-    ),
-    "rows": (
-        lambda x, P: (x[:, ROWS], P[:, ROWS]),
-        f"convention: {2 * RUNS} poses are far from the truth although their "
-        "neighbours are not, as in swapped rows; the first is step 5 of drive "
-        f"{SEED}, and without ",
-    ),
+    "clockwise": (lambda x, P: (x * [1, 1, -1], P), "headings that grow clockwise: "),
+    "millimetres": (lambda x, P: (x * [1e3, 1e3, 1], P), "positions in millimetres: "),
+    "swapped": (lambda x, P: (swapped(x), swapped(P)), SWAPPED),
+    "rows": (lambda x, P: (x[:, ROWS], P[:, ROWS]), STRAY),
 }
 
 
@@ -293,13 +264,9 @@ def test_a_broken_convention_is_named_in_one_sentence(
     change, sentence = WRONG[wrong]
     found = entry_of(judge(written(*change(*beliefs[1:3])), drives))
     said = found["diagnosis"]["sentence"]
-    assert said.startswith(sentence)
+    assert said.startswith(f"convention: {sentence}")
     assert said.count(".\n") == 0
-    if wrong not in (
-        "swapped",
-        "rows",
-        "deviations",
-    ):  # the NEES that it had, at some steps
+    if wrong not in ("swapped", "rows", "deviations"):  # the NEES that it had
         right = float(study["pose_nees_invariant"].mean() / 3)
         stated = float(said.partition("NEES / 3 is ")[2].partition(",")[0])
         assert stated == pytest.approx(right, rel=0.2)
@@ -310,13 +277,11 @@ def test_poses_relative_to_the_start_are_named(tmp_path):
     world = load_scenario("six_landmarks").with_changes(start=start)
     drives = tmp_path / "drives"
     generate_trajectories(world, drives, episodes=8, estimator="invariant")
+    names = ("seed", "belief_poses", "belief_pose_covariances")
     data = list(load_trajectories(drives))
-    np.savez(
-        tmp_path / "mine.npz",
-        seed=[each.seed for each in data],
-        belief_poses=relative(np.stack([each.belief_poses for each in data])),
-        belief_pose_covariances=np.stack([d.belief_pose_covariances for d in data]),
-    )
+    arrays = {name: np.stack([getattr(d, name) for d in data]) for name in names}
+    arrays["belief_poses"] = relative(arrays["belief_poses"])
+    np.savez(tmp_path / "mine.npz", **arrays)
     found = entry_of(judge(tmp_path / "mine.npz", drives))["diagnosis"]
     assert found["sentence"].startswith("convention: poses in the frame of the start: ")
 
@@ -424,50 +389,45 @@ def test_additive_covariances_are_those_of_a_numeric_jacobian(frame):
     np.testing.assert_allclose(found, J @ P @ J.T, rtol=1e-6)
 
 
+def changed(first, *entries):
+    """Return a function that replaces entries of every line, from the first one on."""
+
+    def change(lines):
+        parts = [line.split(",") for line in lines]
+        last = first + len(entries)
+        return [",".join([*f[:first], *entries, *f[last:]]) for f in parts]
+
+    return change
+
+
+def stamped(time):
+    """Return a function that gives every line another time."""
+    return lambda lines: [
+        ",".join(["pose", str(time(k)), *line.split(",")[2:]])
+        for k, line in enumerate(lines)
+    ]
+
+
+NO_POSE = "it has no pose for {} of the steps 0 to 29; the first of them is step {}"
 BROKEN = {
     "missing": (lambda lines: None, "there is no file of estimates"),
-    "short": (
-        lambda lines: lines[:-1],
-        "it has no pose for 1 of the steps 0 to 29; the first of them is step 29",
-    ),
-    "without some rows": (
-        lambda lines: lines[:7] + lines[9:],
-        "it has no pose for 2 of the steps 0 to 29; the first of them is step 7",
-    ),
+    "short": (lambda lines: lines[:-1], NO_POSE.format(1, 29)),
+    "without some rows": (lambda lines: lines[:7] + lines[9:], NO_POSE.format(2, 7)),
     "late from the start": (
-        lambda lines: [
-            ",".join(["pose", str(k + 1), *line.split(",")[2:]])
-            for k, line in enumerate(lines)
-        ],
+        stamped(lambda k: k + 1),
         "its time stamps begin at step 1, not at step 0",
     ),
     "seconds": (
-        lambda lines: [
-            ",".join(["pose", str(3 * k), *line.split(",")[2:]])
-            for k, line in enumerate(lines)
-        ],
+        stamped(lambda k: 3 * k),
         "its time stamps are seconds, not steps of 3 s",
     ),
-    "a step twice": (
-        lambda lines: [*lines[:-1], lines[-2]],
-        "it has no pose for 1 of the steps 0 to 29; the first of them is step 29",
-    ),
+    "a step twice": (lambda lines: [*lines[:-1], lines[-2]], NO_POSE.format(1, 29)),
     "not in order": (
         lambda lines: [*lines[:3], lines[4], lines[3], *lines[5:]],
         "pose 3 is that of step 4; each step needs one",
     ),
-    "not symmetric": (
-        lambda lines: [
-            ",".join([*(f := line.split(","))[:6], "0.5", *f[7:]]) for line in lines
-        ],
-        "the covariance is not symmetric",
-    ),
-    "negative": (
-        lambda lines: [
-            ",".join([*(f := line.split(","))[:5], "-1", *f[6:]]) for line in lines
-        ],
-        "a variance is negative",
-    ),
+    "not symmetric": (changed(6, "0.5"), "the covariance is not symmetric"),
+    "negative": (changed(5, "-1"), "a variance is negative"),
     "unknown landmark": (
         lambda lines: [*lines, "landmark,6,0,0,1,0,1"],
         "its map has landmark 6, the world has 6 from 0 on",
@@ -519,34 +479,34 @@ def test_a_damaged_or_foreign_npz_is_refused(drives, tmp_path):
     path.write_bytes(b"PK\x03\x04 from a bad disk")
     with pytest.raises(ValueError, match=r"mine\.npz is truncated, or no npz"):
         judge(path, drives)
-    np.savez(path, belief_poses=np.zeros((3, 3)))
-    with pytest.raises(ValueError, match="no belief_pose_covariances"):
-        judge(path, drives)
-    np.savez(path, belief_poses=[[0.0]], belief_pose_covariances=np.zeros((1, 3, 3)))
-    with pytest.raises(ValueError, match=r"belief_poses must be \(T, 3\)"):
-        judge(path, drives)
-    arrays = {"belief_poses": np.zeros((2, 3)), "belief_pose_covariances": np.eye(3)}
-    np.savez(path, seed=[1, 2, 3], **arrays)
-    with pytest.raises(ValueError, match="a row for each seed"):
-        judge(path, drives)
+    P = np.zeros((1, 3, 3))
+    for poses, others, message in (
+        (np.zeros((3, 3)), {}, "no belief_pose_covariances"),
+        ([[0.0]], {"belief_pose_covariances": P}, r"belief_poses must be \(T, 3\)"),
+        (np.zeros((2, 3)), {"seed": [1, 2, 3], "belief_pose_covariances": np.eye(3)},
+         "a row for each seed"),
+    ):  # fmt: skip
+        np.savez(path, belief_poses=poses, **others)
+        with pytest.raises(ValueError, match=message):
+            judge(path, drives)
 
 
 def test_what_matches_no_drive_is_refused(drives, beliefs, tmp_path):
-    path = tmp_path / "seed_7.csv"
+    path, empty = tmp_path / "seed_7.csv", tmp_path / "empty"
     path.write_text(rows(beliefs[1][0], beliefs[2][0]))
-    with pytest.raises(ValueError, match=f"such as seed_{SEED:08d}.csv, got .*seed_7"):
-        judge(path, drives)
-    with pytest.raises(ValueError, match=r"holds no truth"):
-        judge(path)
-    with pytest.raises(ValueError, match="truth must be None where drives are given"):
-        judge(path, drives, truth=path)
-    with pytest.raises(ValueError, match="covariances must be 'additive' or"):
-        judge(path, drives, covariances="up")
-    with pytest.raises(ValueError, match="does not exist"):
-        judge(tmp_path / "nowhere", drives)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match="got none in"):
-        judge(tmp_path / "empty", drives)
+    empty.mkdir()
+    for call, message in (
+        (lambda: judge(path, drives), f"such as seed_{SEED:08d}.csv, got .*seed_7"),
+        (lambda: judge(path), "holds no truth"),
+        (lambda: judge(path, drives, truth=path),
+         "truth must be None where drives are given"),
+        (lambda: judge(path, drives, covariances="up"),
+         "covariances must be 'additive' or"),
+        (lambda: judge(tmp_path / "nowhere", drives), "does not exist"),
+        (lambda: judge(empty, drives), "got none in"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            call()
     shutil.copy(path, tmp_path / "seed_0007.csv")
     with pytest.raises(ValueError, match="are both of drive 7"):
         judge(tmp_path, drives)
@@ -645,9 +605,7 @@ def test_a_fitted_alignment_leaves_no_verdict(drives):
     found = entry_of(judge(drives, align="fit"))
     assert found["verdict"] == "not shown"
     assert "an alignment fitted to the errors" in found["reason"]
-    assert found["accepted"] is None
-    assert found["decisions"] is None
-    assert found["diagnosis"] is None
+    assert {found[key] for key in ("accepted", "decisions", "diagnosis")} == {None}
     assert found["ate"]["raw"] == pytest.approx(found["ate"]["aligned"])
     with pytest.raises(ValueError, match="align must be"):
         judge(drives, align="best")

@@ -17,6 +17,7 @@ import numpy as np
 import psutil
 import pytest
 import xarray as xr
+from comparison import tree
 
 from slamgym.envs.controllers import make_controller
 from slamgym.estimator import Belief, EkfSlam, make_estimator
@@ -72,25 +73,13 @@ class Associates:
     """An estimator with an association of its own, hidden in another class."""
 
     def __init__(self, **options):
-        self._slam = make_estimator("ekf", **options, management=True)
-
-    def reset(self, pose, pose_std):
-        self._slam.reset(pose, pose_std)
-
-    def predict(self, odometry, dt=1.0):
-        self._slam.predict(odometry, dt)
+        slam = make_estimator("ekf", **options, management=True)
+        for name in ("reset", "predict", "belief", "state_dict", "load_state_dict"):
+            setattr(self, name, getattr(slam, name))
+        self._slam = slam
 
     def update(self, measurements, landmark_ids=None):
         return self._slam.update(measurements, landmark_ids)
-
-    def belief(self):
-        return self._slam.belief()
-
-    def state_dict(self):
-        return self._slam.state_dict()
-
-    def load_state_dict(self, state):
-        self._slam.load_state_dict(state)
 
 
 class SaysNothing(Associates):
@@ -206,17 +195,12 @@ def test_bad_runs_are_told_by_the_same_filter_with_known_identities(hidden):
         steps=40, sensor={"identities": True, "clutter": 0.0, "max_clutter": 0}
     )
     twin = monte_carlo(known, "invariant", 3)
+    twin = twin.sel(estimator="invariant")
     for label in hidden.estimator.values:
-        np.testing.assert_allclose(
-            hidden.known_ids_ate.sel(estimator=label),
-            twin.ate.sel(estimator="invariant"),
-            rtol=1e-12,
-        )
-        np.testing.assert_allclose(
-            hidden.known_ids_nees_invariant.sel(estimator=label),
-            twin.pose_nees_invariant.sel(estimator="invariant"),
-            rtol=1e-9,
-        )
+        one = hidden.sel(estimator=label)
+        np.testing.assert_allclose(one.known_ids_ate, twin.ate, rtol=1e-12)
+        nees = twin.pose_nees_invariant
+        np.testing.assert_allclose(one.known_ids_nees_invariant, nees, rtol=1e-9)
 
 
 def test_the_summary_holds_the_scores_of_association(hidden):
@@ -273,14 +257,9 @@ def test_precision_is_compared_with_that_of_true_pose_and_map():
     for run, landmarks in enumerate(runs.landmarks):
         ids = runs.true_ids[run]
         z = [m[i >= 0] for m, i in zip(runs.measurements[run], ids, strict=True)]
-        expected = oracle_errors(
-            runs.true_poses[run],
-            z,
-            [i[i >= 0] for i in ids],
-            np.arange(len(landmarks)),
-            landmarks,
-            (0.3, 0.8),
-        )
+        scans = z, [i[i >= 0] for i in ids]
+        world = np.arange(len(landmarks)), landmarks, (0.3, 0.8)
+        expected = oracle_errors(runs.true_poses[run], *scans, *world)
         found = float(results.association_oracle_errors[0, run])
         assert 0.01 < expected == pytest.approx(found)
     entry = summarise_monte_carlo(results)["estimators"]["invariant"]
@@ -291,9 +270,8 @@ def test_precision_is_compared_with_that_of_true_pose_and_map():
 def test_a_report_shows_association_only_where_identities_are_hidden(hidden, whole):
     rows = [measure.name for measure in measures(summarise_monte_carlo(hidden))]
     assert {"precision", "recall", "… duplicates"} <= set(rows)
-    assert not {"precision", "recall"} & {
-        measure.name for measure in measures(summarise_monte_carlo(whole))
-    }
+    known = {measure.name for measure in measures(summarise_monte_carlo(whole))}
+    assert not {"precision", "recall"} & known
 
 
 @pytest.mark.usefixtures("_no_figures_in_reports")
@@ -378,23 +356,17 @@ def test_results_on_disk_are_those_in_memory(whole, tmp_path):
 
 @pytest.mark.slow
 def test_more_runs_build_on_those_there_are(whole, tmp_path):
-    monte_carlo(
-        "six_landmarks", "ekf,invariant", 12, block_size=8, out=tmp_path
-    ).close()
+    job = {"estimators": "ekf,invariant", "block_size": 8, "out": tmp_path}
+    monte_carlo("six_landmarks", runs=12, **job).close()
     first = tmp_path / "blocks" / "runs-0000000-0000008.npz"
     before = first.stat().st_mtime_ns
-    with monte_carlo(
-        "six_landmarks", "ekf,invariant", RUNS, block_size=8, out=tmp_path
-    ) as more:
+    with monte_carlo("six_landmarks", runs=RUNS, **job) as more:
         xr.testing.assert_equal(more.load(), whole)
     assert first.stat().st_mtime_ns == before
     names = sorted(file.name for file in (tmp_path / "blocks").iterdir())
-    assert names == [
-        f"runs-{a:07d}-{b:07d}.npz" for a, b in ((0, 8), (8, 16), (16, 20))
-    ]
-    with monte_carlo(
-        "six_landmarks", "ekf,invariant", 18, block_size=8, out=tmp_path
-    ) as fewer:
+    blocks = ((0, 8), (8, 16), (16, 20))
+    assert names == [f"runs-{a:07d}-{b:07d}.npz" for a, b in blocks]
+    with monte_carlo("six_landmarks", runs=18, **job) as fewer:
         xr.testing.assert_equal(fewer.load(), whole.isel(run=slice(0, 18)))
 
 
@@ -455,13 +427,8 @@ def test_a_filter_that_has_changed_is_not_mixed_with_what_it_was(tmp_path, monke
     source.write_text(text + "# repaired\n")
     with pytest.raises(ValueError, match=r"holds results of code .*ask for fresh"):
         monte_carlo(*asked, out=tmp_path / "out")
-    done = []
-    monte_carlo(
-        *asked,
-        out=tmp_path / "out",
-        fresh=True,
-        progress=lambda runs, of: done.append(runs),
-    ).close()
+    done, note = [], lambda runs, of: done.append(runs)
+    monte_carlo(*asked, out=tmp_path / "out", fresh=True, progress=note).close()
     assert done == [0, 2]
 
 
@@ -492,12 +459,8 @@ class UnknownMap(OneByOne):
 
 
 def test_a_belief_that_is_no_map_of_the_world_ends_its_own_run_only(whole):
-    filters = {
-        "foreign": ForeignIds,
-        "gone": LeavesTheProgram,
-        "blind": UnknownMap,
-        "ekf": "ekf",
-    }
+    filters = {"foreign": ForeignIds, "gone": LeavesTheProgram, "blind": UnknownMap}
+    filters["ekf"] = "ekf"
     results = monte_carlo("six_landmarks", filters, RUNS)
     failed = results.failed.sum("run")
     assert 0 < failed.sel(estimator="foreign") < RUNS
@@ -507,9 +470,8 @@ def test_a_belief_that_is_no_map_of_the_world_ends_its_own_run_only(whole):
     assert any("landmark_ids must be distinct and from 0 to 5" in m for m in said[0])
     assert said[1] == {"SystemExit: 3"}
     assert said[2] == {"the belief about the map is not finite"}
-    xr.testing.assert_equal(
-        results.sel(estimator=["ekf"]), whole.sel(estimator=["ekf"])
-    )
+    one, other = (each.sel(estimator=["ekf"]) for each in (results, whole))
+    xr.testing.assert_equal(one, other)
 
 
 def test_a_block_that_cannot_be_read_for_now_is_not_touched(tmp_path, monkeypatch):
@@ -564,15 +526,10 @@ def test_a_broken_block_is_named_and_done_again(whole, tmp_path):
     monte_carlo("six_landmarks", runs=RUNS, **job).close()
     block = tmp_path / "blocks" / "runs-0000008-0000016.npz"
     block.write_bytes(block.read_bytes()[:-100])
-    done = []
+    done, job["progress"] = [], lambda runs, of: done.append(runs)
     with (
         pytest.warns(UserWarning, match=r"runs-0000008-0000016\.npz is truncated"),
-        monte_carlo(
-            "six_landmarks",
-            runs=RUNS,
-            progress=lambda runs, of: done.append(runs),
-            **job,
-        ) as mended,
+        monte_carlo("six_landmarks", runs=RUNS, **job) as mended,
     ):
         xr.testing.assert_equal(mended.load(), whole)
     assert done == [12, RUNS]
@@ -655,32 +612,22 @@ def test_what_cannot_be_run_is_refused_before_anything_is_written(
 
 
 def test_a_folder_of_another_job_is_refused_untouched(tmp_path):
-    monte_carlo("six_landmarks", "ekf", 2, out=tmp_path).close()
-    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    job = {"scenario": "six_landmarks", "estimators": "ekf", "runs": 2}
+    monte_carlo(**job, out=tmp_path, resolution=0.5).close()
+    before = tree(tmp_path)
     for changes, message in (
         ({"scenario": "anchored"}, "holds results of scenario .*six_landmarks"),
         ({"estimators": "invariant"}, "estimators ekf, not of estimators invariant"),
         ({"seed": 3}, "seed 0, not of seed 3"),
+        ({"resolution": 0.0}, r"resolution 0\.5, not of resolution 0\.0: ch"),
     ):
-        asked = {"scenario": "six_landmarks", "estimators": "ekf", "runs": 2}
         with pytest.raises(ValueError, match=message):
-            monte_carlo(**(asked | changes), out=tmp_path)
-    assert before == {f: f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()}
+            monte_carlo(**(job | {"resolution": 0.5} | changes), out=tmp_path)
+    assert tree(tmp_path) == before
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years of work")
     with pytest.raises(ValueError, match="holds no Monte Carlo"):
         monte_carlo("six_landmarks", "ekf", 2, out=tmp_path / "mine")
-
-
-def test_a_folder_of_another_resolution_is_refused_untouched(tmp_path):
-    job = {"estimators": "ekf", "runs": 2, "out": tmp_path}
-    monte_carlo("six_landmarks", **job, resolution=0.5).close()
-    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
-    with pytest.raises(
-        ValueError, match=r"resolution 0\.5, not of resolution 0\.0: ch"
-    ):
-        monte_carlo("six_landmarks", **job)
-    assert before == {f: f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()}
 
 
 def test_options_may_be_words():
