@@ -28,9 +28,7 @@ from slamgym.experiments.figures.style import lay_out, new_figure
 
 def noise_study(trace):
     names = [f"σ{name} {by}" for name in "xyαβr" for by in ("× 10", "÷ 10")]
-    return noise_study_figure(
-        [("unchanged", trace), *((name, trace) for name in names)]
-    )
+    return noise_study_figure([(name, trace) for name in ("unchanged", *names)])
 
 
 @functools.cache
@@ -44,14 +42,8 @@ def comparison(trace):
 
 
 WALLS = ((-30.0, 0.0, 30.0, 0.0), (30.0, 0.0, 30.0, 5.0))
-FIGURES = (
-    map_figure,
-    truth_figure,
-    covariance_figure,
-    errors_figure,
-    noise_study,
-    comparison,
-)
+FIGURES = (map_figure, truth_figure, covariance_figure, errors_figure)
+FIGURES += (noise_study, comparison)
 
 
 def ellipses_of(figure, kind):
@@ -149,14 +141,11 @@ def test_run_that_never_saw_a_landmark_is_drawn(figure_of):
 
 def test_the_four_kinds_of_ellipses_have_their_classic_colours():
     figure = typical(map_figure)
-    magenta, blue, red, green = (
+    magenta, blue, red, green = (1, 0, 1), (0, 0, 1), (1, 0, 0), (0, 1, 0)
+    assert [
         tuple(np.round(ellipses_of(figure, kind).get_edgecolor()[0, :3]))
         for kind in (PREDICTED, UPDATED, FIRST, LATER)
-    )
-    assert magenta == (1, 0, 1)
-    assert blue == (0, 0, 1)
-    assert red == (1, 0, 0)
-    assert green == (0, 1, 0)
+    ] == [magenta, blue, red, green]
 
 
 def test_what_only_colour_would_tell_apart_differs_by_line_style():
@@ -302,9 +291,7 @@ def test_landmarks_stand_in_the_order_of_their_ids():
     order = np.arange(len(trace.landmark_ids))[::-1]
     turned = replace(trace, landmark_ids=trace.landmark_ids[order])
     shown, other = truth_figure(trace).axes[1], truth_figure(turned).axes[1]
-    names = [
-        [tick.get_text() for tick in axes.get_yticklabels()] for axes in (shown, other)
-    ]
+    names = [[t.get_text() for t in axes.get_yticklabels()] for axes in (shown, other)]
     assert names[0] == names[1] == [f"l{i}" for i in sorted(trace.landmark_ids)]
     distances = [axes.lines[0].get_xdata() for axes in (shown, other)]
     np.testing.assert_array_equal(distances[0], distances[1][order])
@@ -411,10 +398,8 @@ def test_correlations_are_scaled_covariances():
 def test_heat_maps_show_first_and_final_correlations_on_one_scale():
     trace = make_trace()
     before, after, bar = covariance_figure(trace).axes
-    for axes, covariance in (
-        (before, trace.first_covariance),
-        (after, trace.final_covariance),
-    ):
+    covariances = trace.first_covariance, trace.final_covariance
+    for axes, covariance in zip((before, after), covariances, strict=True):
         image = axes.images[0]
         np.testing.assert_allclose(image.get_array(), correlations(covariance))
         assert image.get_clim() == (-1, 1)
@@ -427,12 +412,8 @@ def test_rows_are_named_after_the_state_and_carry_their_deviation():
     names = [label.get_text() for label in after.get_yticklabels()]
     assert names[:6] == ["x", "y", "θ", "l10x", "l10y", "l11x"]
     assert names[-1] == "l15y"
-    assert [label.get_text() for label in before.get_yticklabels()][3:] == [
-        "l10x",
-        "l10y",
-        "l13x",
-        "l13y",
-    ]  # the landmarks of the first scan
+    first = [label.get_text() for label in before.get_yticklabels()]
+    assert first[3:] == ["l10x", "l10y", "l13x", "l13y"]  # those of the first scan
     sigma = np.sqrt(trace.final_covariance[2, 2])
     assert f"σ = {sigma:.2g} rad" in [text.get_text() for text in after.texts]
 
@@ -534,10 +515,8 @@ def test_diverged_variation_does_not_shrink_the_reference():
     wild = make_trace(poses=make_trace().poses * [50, 50, 1])
     runs = [("unchanged", make_trace()), ("wild", wild)]
     width = np.ptp(noise_study_figure(runs).axes[0].get_xlim())
-    assert width <= 2.01 * max(
-        np.ptp(typical(map_figure).axes[0].get_xlim()),
-        np.ptp(typical(map_figure).axes[0].get_ylim()),
-    )
+    alone = typical(map_figure).axes[0]
+    assert width <= 2.01 * max(np.ptp(alone.get_xlim()), np.ptp(alone.get_ylim()))
 
 
 def test_only_outer_panels_are_labelled():

@@ -58,16 +58,8 @@ def a_log(seed=3, *, steps=150, world="six_landmarks", **changes):
 
 
 def fitted(log, *, start=(0.2, 0.2, 0.2, 0.1, 0.3), **settings):
-    return fit_noise(
-        log,
-        settings_for(
-            log,
-            estimator="invariant",
-            motion_std=start[:3],
-            measurement_std=start[3:],
-            **settings,
-        ),
-    )
+    noise = {"motion_std": start[:3], "measurement_std": start[3:]}
+    return fit_noise(log, settings_for(log, estimator="invariant", **noise, **settings))
 
 
 @pytest.fixture(scope="module")
@@ -142,9 +134,8 @@ def test_the_calibration_makes_the_nees_one_and_has_an_interval(example):
     factor, low, high = example.calibration
     assert low < factor < high
     settings = example.fitted.settings
-    calibrated = replace(
-        settings, measurement_std=tuple(factor * np.array(settings.measurement_std))
-    )
+    std = tuple(factor * np.array(settings.measurement_std))
+    calibrated = replace(settings, measurement_std=std)
     run = replay(example.log, calibrated.make(example.log.start))
     assert summarise(run, calibrated)["nees"]["per_degree"] == pytest.approx(1, abs=0.1)
 
@@ -235,13 +226,13 @@ def test_readings_with_correlated_errors_suggest_inflation():
             kept = replace(event, measurements=event.measurements + added)
         events.append(kept)
     fit = fitted(replace(log, events=tuple(events)))
-    assert fit.fitted.whiteness[1].p_value < 1e-6
-    assert fit.fitted.whiteness[1].first > 0.2
-    assert fit.fitted.whiteness[1].inflation > 1.2
-    assert fit.suggested.settings.measurement_std[1] == pytest.approx(
-        fit.fitted.settings.measurement_std[1] * fit.fitted.whiteness[1].inflation,
-        rel=1e-3,
-    )
+    white = fit.fitted.whiteness[1]
+    assert white.p_value < 1e-6
+    assert white.first > 0.2
+    assert white.inflation > 1.2
+    inflated = fit.fitted.settings.measurement_std[1] * white.inflation
+    found = fit.suggested.settings.measurement_std[1]
+    assert found == pytest.approx(inflated, rel=1e-3)
 
 
 def test_outliers_do_not_decide():
@@ -283,16 +274,12 @@ def test_at_rest_without_noise_at_rest_the_motion_noise_is_unknown():
         for e in log.events
     ]
     standing[1] = replace(standing[1], d=1e-9)
-    scan = log.events[0]
+    scan, readings = log.events[0], log.events[0].measurements
     rng = np.random.default_rng(0)
     for k, event in enumerate(standing):
         if isinstance(event, Scan):
-            noise = SENSOR * rng.standard_normal(scan.measurements.shape)
-            standing[k] = replace(
-                event,
-                measurements=scan.measurements + noise,
-                landmark_ids=scan.landmark_ids,
-            )
+            noise = SENSOR * rng.standard_normal(readings.shape)
+            standing[k] = replace(scan, t=event.t, measurements=readings + noise)
     header = {**log.header, "noise_at_rest": "false"}
     fit = fitted(replace(log, events=tuple(standing), header=header))
     by_name = {noise.name: noise for noise in fit.noise}
@@ -454,22 +441,17 @@ def test_the_associations_of_a_filter_become_identities_of_the_log():
     hidden = without_identities(log)
     settings = settings_for(hidden, estimator="invariant")
     known = associated_log(hidden, settings)
-    scans = [event for event in known.events if isinstance(event, Scan)]
-    true = {
-        (event.t, *reading): landmark
-        for event in log.events
-        if isinstance(event, Scan)
-        for reading, landmark in zip(
-            event.measurements.tolist(), event.landmark_ids, strict=True
-        )
-    }
-    pairs = {
-        (true[scan.t, *reading], landmark)
-        for scan in scans
-        for reading, landmark in zip(
-            scan.measurements.tolist(), scan.landmark_ids, strict=True
-        )
-    }
+    true, found = (
+        {
+            (scan.t, *reading): landmark
+            for scan in each.scans
+            for reading, landmark in zip(
+                scan.measurements.tolist(), scan.landmark_ids, strict=True
+            )
+        }
+        for each in (log, known)
+    )
+    pairs = {(true[reading], landmark) for reading, landmark in found.items()}
     assert len(pairs) == len(dict(pairs)) == len({i for _, i in pairs}) == 6
     motions = [e for e in known.events if isinstance(e, OdometryRow)]
     assert motions == [e for e in log.events if isinstance(e, OdometryRow)]
@@ -488,39 +470,36 @@ def test_the_comparison_of_a_log_without_identities_is_on_its_associations():
 @pytest.mark.slow
 def test_readings_without_identity_are_associated_once():
     log, ends = a_log(sensor={"identities": False}, steps=150), []
-    settings = settings_for(
-        log,
-        estimator="invariant",
-        motion_std=3 * np.array(MOTION),
-        measurement_std=3 * np.array(SENSOR),
-        options={"management": {"association": "nearest"}},
-    )
-    fit = fit_noise(
-        log, settings, progress=lambda done, steps: ends.append(done == steps)
-    )
+    noise = {
+        "motion_std": 3 * np.array(MOTION),
+        "measurement_std": 3 * np.array(SENSOR),
+    }
+    options = {"management": {"association": "nearest"}}
+    settings = settings_for(log, estimator="invariant", **noise, options=options)
+
+    def note(done, steps):
+        ends.append(done == steps)
+
+    fit = fit_noise(log, settings, progress=note)
     assert sum(ends) == 1
     by_name = {noise.name: noise for noise in fit.noise}
     for name, true in (("σβ", SENSOR[0]), ("σr", SENSOR[1])):
         assert abs(np.log(by_name[name].value / true)) < 0.25
 
 
+MOVE = OdometryRow(1.0, 1.0, 0.1, 1.0)
+FIRST, AGAIN, NOT_FINITE = (
+    Scan(t, [(0.1, distance)], [1]) for t, distance in ((0, 2), (1, 2), (1, np.nan))
+)
+
+
 @pytest.mark.parametrize(
     ("events", "message"),
     [
-        ((OdometryRow(1.0, 1.0, 0.1, 1.0),), "holds no scan"),
-        ((Scan(0.0, [(0.1, 2.0)], [1]), Scan(1.0, [(0.1, 2.0)], [1])), "no motion"),
-        (
-            (Scan(0.0, [(0.1, 2.0)], [1]), OdometryRow(1.0, 1.0, 0.1, 1.0)),
-            "no landmark twice",
-        ),
-        (
-            (
-                Scan(0.0, [(0.1, 2.0)], [1]),
-                OdometryRow(1.0, 1.0, 0.1, 1.0),
-                Scan(1.0, [(0.1, np.nan)], [1]),
-            ),
-            "readings must be finite",
-        ),
+        ((MOVE,), "holds no scan"),
+        ((FIRST, AGAIN), "no motion"),
+        ((FIRST, MOVE), "no landmark twice"),
+        ((FIRST, MOVE, NOT_FINITE), "readings must be finite"),
     ],
 )
 def test_a_log_that_says_nothing_is_refused_in_one_line(events, message):
@@ -568,18 +547,11 @@ def test_writing_keeps_line_ends_and_byte_order_mark(tmp_path):
     text = "\ufeff# format: slamlog 1\r\n# motion_std: 1,1,1\r\nodometry,1,1,0,1\r\n"
     path.write_bytes(text.encode())
     log = read_slamlog(path)
-    write_noise(
-        path,
-        settings_for(log, motion_std=(0.1, 0.2, 0.3), measurement_std=(0.01, 0.02)),
-    )
-    lines = path.read_bytes().decode().split("\r\n")
-    assert lines == [
-        "\ufeff# format: slamlog 1",
-        "# measurement_std: 0.01,0.02",
-        "# motion_std: 0.1,0.2,0.3",
-        "odometry,1,1,0,1",
-        "",
-    ]
+    noise = {"motion_std": (0.1, 0.2, 0.3), "measurement_std": (0.01, 0.02)}
+    write_noise(path, settings_for(log, **noise))
+    header = "\ufeff# format: slamlog 1\r\n# measurement_std: 0.01,0.02\r\n"
+    rest = "# motion_std: 0.1,0.2,0.3\r\nodometry,1,1,0,1\r\n"
+    assert path.read_bytes().decode() == header + rest
 
 
 def test_a_diverging_fit_is_one_line_of_the_command_and_writes_nothing(tmp_path):
@@ -601,7 +573,7 @@ def test_a_diverging_fit_is_one_line_of_the_command_and_writes_nothing(tmp_path)
 
 def test_bad_input_of_the_command_is_one_line_and_writes_nothing(tmp_path):
     path, out = tmp_path / "log.csv", tmp_path / "out"
-    write_slamlog(SlamLog("empty", events=(OdometryRow(1.0, 1.0, 0.1, 1.0),)), path)
+    write_slamlog(SlamLog("empty", events=(MOVE,)), path)
     result = slamgym("fit-noise", path, "--out", out, "--write")
     assert result.exit_code == 2
     assert result.stderr.splitlines()[-1].startswith("slamgym: empty holds no scan")
