@@ -359,11 +359,7 @@ def modules_of_the_package():
     """Yield the modules of the package, without those of libraries not installed."""
     optional = {peer.library for peer in list_peers()}
     for module in walk_packages(slamgym.__path__, "slamgym."):
-        if module.name.startswith(
-            tuple(
-                f"slamgym.{p}." for p in ("envs", "estimator", "evaluation", "agents")
-            )
-        ):
+        if module.name.split(".")[1] in ("envs", "estimator", "evaluation", "agents"):
             try:
                 yield import_module(module.name)
             except ModuleNotFoundError as missing:
@@ -374,9 +370,8 @@ def modules_of_the_package():
 def kernels_of_the_package():
     for module in modules_of_the_package():
         for value in vars(module).values():
-            if getattr(getattr(value, "py_func", None), "__module__", "") == (
-                module.__name__
-            ):
+            function = getattr(value, "py_func", None)
+            if getattr(function, "__module__", "") == module.__name__:
                 yield value
 
 

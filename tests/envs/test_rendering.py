@@ -48,12 +48,8 @@ def renderer():
     renderer.close()
 
 
-def drawing_of(renderer):
-    return renderer._drawing
-
-
 def scene_of(renderer):
-    return drawing_of(renderer).scene
+    return renderer._drawing.scene
 
 
 def moving_parts(renderer):
@@ -86,9 +82,8 @@ def test_frames_are_fresh_arrays(renderer):
 
 def test_frame_changes_with_the_pose(renderer):
     before = renderer.render(snapshot())
-    assert (
-        share_of_different_pixels(before, renderer.render(snapshot((6, 3, 2)))) > 0.01
-    )
+    after = renderer.render(snapshot((6, 3, 2)))
+    assert share_of_different_pixels(before, after) > 0.01
     np.testing.assert_array_equal(before, renderer.render(snapshot()))
 
 
@@ -132,7 +127,7 @@ def test_blitting_is_several_times_faster_than_drawing_everything(renderer):
             times.append(time.thread_time() - start)
         return min(times)
 
-    assert fastest(drawing_of(renderer).blitted.outdate) > 2.5 * fastest(lambda: None)
+    assert fastest(renderer._drawing.blitted.outdate) > 2.5 * fastest(lambda: None)
 
 
 def test_rays_of_exact_readings_end_at_the_landmarks(renderer):
@@ -352,18 +347,11 @@ def pyplot():
 @pytest.fixture
 def screen(pyplot, monkeypatch):
     """Pretend that Agg had windows, and record how long they were served."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    served = []
-    monkeypatch.setattr(FigureCanvasAgg, "required_interactive_framework", "test")
+    served, canvas = [], FigureCanvasAgg
+    monkeypatch.setattr(canvas, "required_interactive_framework", "test")
     monkeypatch.setattr(Figure, "show", lambda self: None)
-    monkeypatch.setattr(FigureCanvasAgg, "blit", lambda self, box: None)
-    monkeypatch.setattr(
-        FigureCanvasAgg,
-        "start_event_loop",
-        lambda self, seconds: served.append(seconds),
-    )
+    monkeypatch.setattr(canvas, "blit", lambda self, box: None)
+    monkeypatch.setattr(canvas, "start_event_loop", lambda _, time: served.append(time))
     return served
 
 
@@ -475,19 +463,17 @@ def test_a_large_world_is_shown_around_the_robot():
 
 
 def test_clutter_is_marked_apart_from_readings():
-    world = SIX.with_changes(
-        sensor={"identities": False, "max_range": 9.0, "clutter": 1.0, "max_clutter": 5}
-    )
+    hidden = {"identities": False, "clutter": 1.0, "max_clutter": 5}
+    world = SIX.with_changes(sensor={"max_range": 9.0, **hidden})
     renderer = WorldRenderer(world, LANDMARKS, "rgb_array", size_px=200)
     clutter = np.array([False, True, False, False, True])
     renderer.render(snapshot(clutter=clutter))
     moving = moving_parts(renderer)
-    np.testing.assert_allclose(
-        np.transpose(moving.clutter.get_data()), LANDMARKS[clutter]
-    )
-    np.testing.assert_allclose(
-        np.transpose(moving.readings.get_data()), LANDMARKS[~clutter]
-    )
+    for marks, places in (
+        (moving.clutter, LANDMARKS[clutter]),
+        (moving.readings, LANDMARKS[~clutter]),
+    ):
+        np.testing.assert_allclose(np.transpose(marks.get_data()), places)
     labels = [t.get_text() for t in figure_of(renderer).legends[0].get_texts()]
     assert "clutter" in labels
 

@@ -2,6 +2,7 @@
 
 import ast
 import html
+import itertools
 import json
 import re
 import tomllib
@@ -109,9 +110,8 @@ def test_numbers_on_the_page_are_those_of_the_summary():
     dataset = typical()
     page = page_of(dataset)
     rows = dict(re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', page))
-    nees = (
-        dataset["pose_nees_invariant"].isel(step=slice(1, None)).mean(("run", "step"))
-    )
+    later = dataset["pose_nees_invariant"].isel(step=slice(1, None))
+    nees = later.mean(("run", "step"))
     cells = re.findall(r"<td>(.*?)</td>", rows["NEES / 3, invariant frame"])
     assert [float(cell) for cell in cells] == pytest.approx(nees.values / 3, abs=0.005)
     std = np.sqrt((dataset["heading_std"].isel(step=-1) ** 2).mean("run"))
@@ -182,9 +182,8 @@ def test_the_scenario_can_be_taken_from_the_page():
 
 @pytest.mark.slow
 def test_runs_that_all_failed_leave_a_page_without_figures():
-    failures = [
-        (label, run, 3, "boom") for label in ("ekf", "invariant") for run in range(40)
-    ]
+    pairs = itertools.product(("ekf", "invariant"), range(40))
+    failures = [(*pair, 3, "boom") for pair in pairs]
     page = page_of(with_failures(typical(), failures))
     assert "<svg" not in page
     assert "nothing to draw" in page
@@ -251,15 +250,15 @@ def test_a_failure_leaves_the_old_report(report, tmp_path, monkeypatch):
     path = tmp_path / "report.html"
     path.write_text("old")
     summary = summarise_monte_carlo(typical())
+
+    def broken_disk(path):
+        raise OSError("disk full")
+
     monkeypatch.setattr(module, "replace_when_written", broken_disk)
     with pytest.raises(OSError, match="full"):
         write_html_report(typical(), summary, path)
     assert path.read_text() == "old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["report.html"]
-
-
-def broken_disk(path):
-    raise OSError("disk full")
 
 
 @pytest.mark.slow

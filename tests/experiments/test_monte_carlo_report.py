@@ -13,23 +13,12 @@ from monte_carlo_dataset import typical, with_failures
 from rich.console import Console
 from scipy.stats import chi2
 
+from slamgym import experiments
 from slamgym.evaluation.consistency_report import evaluate_consistency
 from slamgym.evaluation.hypothesis_tests import equivalence_test, family_band
-from slamgym.experiments import (
-    heading_figure,
-    nees_figure,
-    nis_figure,
-    rmse_figure,
-    runs_figure,
-)
-from slamgym.experiments.monte_carlo import monte_carlo
-from slamgym.experiments.monte_carlo.figures import (
-    look_of,
-    nis_autocorrelation,
-    pooled_nis,
-    report_figures,
-    thinned,
-)
+from slamgym.experiments import nees_figure
+from slamgym.experiments.monte_carlo import figures, monte_carlo
+from slamgym.experiments.monte_carlo.figures import report_figures, thinned
 from slamgym.experiments.monte_carlo.report import (
     html_report,
     measures,
@@ -229,9 +218,8 @@ def test_summary_and_page_of_very_few_runs_hold_no_absurd_number(runs, request):
         (row,) = re.findall(r"Time averages, bootstrap</th>(.*?)</tr>", page)
         if runs < 5:
             assert row.count("<td>–</td>") == 3
-        assert not re.findall(
-            r"\d{9}", html.unescape(re.sub(r"<svg.*?</svg>", "", row))
-        )
+        shown = html.unescape(re.sub(r"<svg.*?</svg>", "", row))
+        assert not re.findall(r"\d{9}", shown)
         assert "nan" not in row
         assert "None" not in row
 
@@ -253,10 +241,9 @@ def test_failed_runs_are_told_and_counted_nowhere_else():
         assert entry[name] == expected[name]
     assert entry["decisions"] == expected["decisions"]
     assert entry["good_runs"] == 38
-    assert entry["failed_runs"] == [
-        {"run": run, "step": step, "message": message}
-        for _, run, step, message in FAILURES
-    ]
+    names = ("run", "step", "message")
+    failures = [dict(zip(names, each[1:], strict=True)) for each in FAILURES]
+    assert entry["failed_runs"] == failures
     assert entry["verdict"] == "not shown"
     assert entry["reason"].startswith("2 of 40 runs failed; of the others, ")
 
@@ -460,15 +447,14 @@ def test_autocorrelations_are_those_of_the_whiteness_decision():
     dataset["nis_dof"][..., ::3] = 4  # else the normal scores' scale would not matter
     dataset["nis_dof"][..., ::7] = 0
     scores = scores_of(dataset, "ekf", "invariant")
-    correlations, pairs = nis_autocorrelation(scores)
+    correlations, pairs = figures.nis_autocorrelation(scores)
     statistic = (pairs * correlations**2).sum()
     entry = summarise_monte_carlo(dataset)["estimators"]["ekf"]
     assert statistic == pytest.approx(entry["decisions"]["whiteness"]["statistic"])
 
 
 def test_pooled_nis_adds_up_to_all_of_it():
-    scores = scores_of(typical(), "ekf", "invariant")
-    _, ratios, freedom = pooled_nis(scores)
+    _, ratios, freedom = figures.pooled_nis(scores_of(typical(), "ekf", "invariant"))
     nis = typical()["nis"].sel(estimator="ekf").values[:, 1:]
     assert (ratios * freedom).sum() == pytest.approx(nis.sum())
 
@@ -484,7 +470,7 @@ def test_thinned_lines_keep_ends_and_peaks():
 
 
 def test_no_two_of_many_estimators_look_alike():
-    looks = [look_of(place) for place in range(30)]
+    looks = [figures.look_of(place) for place in range(30)]
     assert len({(look.colour, str(look.dashes)) for look in looks}) == 30
     neighbours = itertools.pairwise(str(look.dashes) for look in looks)
     assert all(one != two for one, two in neighbours)
@@ -520,11 +506,9 @@ def test_readings_that_wait_are_not_called_unused():
 
 
 @pytest.mark.parametrize("width", [85.0, 170.0])
-@pytest.mark.parametrize(
-    "draw", [nees_figure, runs_figure, heading_figure, nis_figure, rmse_figure]
-)
-def test_a_figure_for_print_is_as_wide_as_asked_and_names_its_world(draw, width):
-    figure = draw(typical(), width)
+@pytest.mark.parametrize("name", ["nees", "runs", "heading", "nis", "rmse"])
+def test_a_figure_for_print_is_as_wide_as_asked_and_names_its_world(name, width):
+    figure = getattr(experiments, f"{name}_figure")(typical(), width)
     assert figure.get_figwidth() * 25.4 == pytest.approx(width)
     said = {text.get_text() for text in figure.findobj(Text)}
     assert "six_landmarks, 40 runs of 29 steps" in said

@@ -59,11 +59,17 @@ def told_of(log):
     return listener.calls
 
 
-def test_a_filter_is_never_told_the_true_ids():
-    hidden = Scan(0.0, [(0.1, 5.0), (0.2, 4.0)], true_ids=[7, -1])
-    assert told_of(SlamLog("drive", events=(hidden,))) == [
-        ("update", [[0.1, 5.0], [0.2, 4.0]], None)
-    ]
+def recorded(steps, seed=1, **options):
+    """Record a drive of six_landmarks."""
+    world = load_scenario("six_landmarks").with_changes(steps=steps, **options)
+    driver = make_controller("open_loop", world, np.random.default_rng(0))
+    return record_episode(world, driver, seed=seed)
+
+
+def summary_of(log, **options):
+    """Return the summary of a log by its own settings."""
+    settings = settings_for(log, **options)
+    return summarise(replay(log, settings.make(log.start)))
 
 
 def circles(clutter=0.5, steps=80):
@@ -95,16 +101,11 @@ def test_the_summary_scores_readings_without_identity(method):
 
 
 def test_a_known_log_whose_identities_are_hidden_is_scored():
-    world = load_scenario("six_landmarks").with_changes(steps=20)
-    driver = make_controller("open_loop", world, np.random.default_rng(0))
-    log = record_episode(world, driver, seed=1)
-    assert (
-        summarise(replay(log, settings_for(log).make(log.start)))["association"] is None
-    )
+    log = recorded(steps=20)
+    assert summary_of(log)["association"] is None
     hidden = without_identities(log)
-    settings = settings_for(hidden)
-    assert settings.options == {"management": True}
-    scores = summarise(replay(hidden, settings.make(log.start)))["association"]
+    assert settings_for(hidden).options == {"management": True}
+    scores = summary_of(hidden)["association"]
     assert scores["correct"] + scores["new_correct"] > 80
 
 
@@ -114,9 +115,7 @@ def test_without_true_ids_the_map_is_compared_with_all_landmarks():
         replace(event, true_ids=None) if isinstance(event, Scan) else event
         for event in log.events
     ]
-    plain = replace(log, events=plain)
-    settings = settings_for(plain)
-    summary = summarise(replay(plain, settings.make(plain.start)))["association"]
+    summary = summary_of(replace(log, events=plain))["association"]
     assert summary["correct"] is summary["precision"] is summary["map_size"] is None
     aligned = summary["gospa"]["aligned"]
     assert aligned["missed_count"] == 20 - aligned["pairs"] > 0
@@ -134,17 +133,13 @@ def test_a_lost_run_is_announced_without_the_truth():
     ]
     lost = replace(log, events=away, landmark_ids=(), landmarks=np.empty((0, 2)))
     for drive, is_lost in ((log, False), (lost, True)):
-        settings = settings_for(drive)
-        summary = summarise(replay(drive, settings.make(drive.start)))
+        summary = summary_of(drive)
         assert summary["probably_lost"] is is_lost
         assert (LOST in summary["warnings"]) == is_lost
 
 
 def test_with_known_identities_nothing_is_said_about_being_lost():
-    world = load_scenario("six_landmarks").with_changes(steps=5)
-    driver = make_controller("open_loop", world, np.random.default_rng(0))
-    drive = record_episode(world, driver, seed=1)
-    summary = summarise(replay(drive, settings_for(drive).make(drive.start)))
+    summary = summary_of(recorded(steps=5))
     assert summary["probably_lost"] is None
     assert LOST not in summary["warnings"]
 
@@ -174,12 +169,6 @@ def test_a_midpoint_row_is_exactly_two_turn_last_steps():
     assert told_of(log) == [("predict", (0.0, 0.3), 0.0), ("predict", (2.0, 0.3), 0.25)]
 
 
-def test_a_midpoint_row_moves_along_the_chord_of_its_arc():
-    log = SlamLog("arc", motion="midpoint", events=(OdometryRow(1.0, 2.0, 0.6, 1.0),))
-    x, y, heading = replay(log, ekf()).belief.pose
-    assert (x, y, heading) == pytest.approx((2 * math.cos(0.3), 2 * math.sin(0.3), 0.6))
-
-
 def test_turn_last_rows_and_scans_reach_the_estimator_as_they_are():
     assert told_of(short_drive())[:3] == [
         ("update", [[0.1, 5.0], [-0.4, 3.0]], [7, 3]),
@@ -188,9 +177,10 @@ def test_turn_last_rows_and_scans_reach_the_estimator_as_they_are():
     ]
 
 
-def test_a_scan_without_ids_is_left_to_the_estimator():
-    log = SlamLog("hidden", events=(scan(0.0, (0.1, 5.0)),))
-    assert told_of(log) == [("update", [[0.1, 5.0]], None)]
+def test_without_ids_a_filter_is_left_alone_and_never_told_the_true_ones():
+    hidden = Scan(0.0, [(0.1, 5.0), (0.2, 4.0)], true_ids=[7, -1])
+    expected = [("update", [[0.1, 5.0], [0.2, 4.0]], None)]
+    assert told_of(SlamLog("drive", events=(hidden,))) == expected
 
 
 def test_rows_that_end_together_are_one_step_with_the_scan_at_their_end():
@@ -232,14 +222,11 @@ def test_the_trace_holds_the_beliefs_before_and_after_every_scan():
         if step.scan is not None:
             by_hand.update(step.scan.measurements, step.scan.landmark_ids.tolist())
         after.append(by_hand.belief())
-    np.testing.assert_array_equal(trace.predicted_poses, [b.pose for b in before])
-    np.testing.assert_array_equal(trace.poses, [b.pose for b in after])
-    np.testing.assert_array_equal(
-        trace.predicted_pose_covariances, [b.pose_covariance for b in before]
-    )
-    np.testing.assert_array_equal(
-        trace.pose_covariances, [b.pose_covariance for b in after]
-    )
+    same = np.testing.assert_array_equal
+    same(trace.predicted_poses, [b.pose for b in before])
+    same(trace.poses, [b.pose for b in after])
+    same(trace.predicted_pose_covariances, [b.pose_covariance for b in before])
+    same(trace.pose_covariances, [b.pose_covariance for b in after])
     for kept, belief in zip(trace.landmark_history, after, strict=True):
         assert tuple(kept.ids) == belief.landmark_ids
         np.testing.assert_array_equal(kept.means, belief.landmarks)
@@ -404,13 +391,9 @@ def test_the_nis_of_a_summary_is_that_of_the_reports():
 
 
 def test_settings_come_from_the_caller_then_the_log():
-    header = {
-        "motion_std": "0.1,0.2,0.3",
-        "measurement_std": "0.01,0.1",
-        "start_sigma": "1,2,3",
-        "range_std_per_metre": "0.05",
-        "noise_at_rest": "true",
-    }
+    header = {"motion_std": "0.1,0.2,0.3", "measurement_std": "0.01,0.1"}
+    header |= {"start_sigma": "1,2,3", "range_std_per_metre": "0.05"}
+    header["noise_at_rest"] = "true"
     settings = settings_for(SlamLog("log", header), measurement_std=(0.5, 0.6))
     assert settings.motion_std == (0.1, 0.2, 0.3)
     assert settings.measurement_std == (0.5, 0.6)
@@ -419,12 +402,8 @@ def test_settings_come_from_the_caller_then_the_log():
 
 
 def test_noise_of_positions_in_the_header_is_taken_unless_the_user_gives_a_noise():
-    header = {
-        "motion_std": "0.1,0.2,0.3",
-        "measurement_std": "0,0.1",
-        "bearing_std_metres": "0.1",
-        "noise_at_rest": "true",
-    }
+    header = {"motion_std": "0.1,0.2,0.3", "measurement_std": "0,0.1"}
+    header |= {"bearing_std_metres": "0.1", "noise_at_rest": "true"}
     log = SlamLog("log", header)
     assert settings_for(log).options == {"bearing_std_metres": 0.1}
     assert settings_for(log, measurement_std=(0.01, 0.1)).options == {}
@@ -432,14 +411,10 @@ def test_noise_of_positions_in_the_header_is_taken_unless_the_user_gives_a_noise
         settings_for(log, estimator=f"{__name__}:Simple")
 
 
-def test_a_robot_that_reports_rest_is_taken_to_stand_still_unless_the_log_objects():
-    settings = settings_for(SlamLog("log"), **NOISE)
-    assert settings.options == {"noise_at_rest": False}
-
-
-def test_options_the_log_tells_are_kept_from_estimators_that_do_not_know_them():
-    settings = settings_for(SlamLog("log"), estimator=f"{__name__}:Simple", **NOISE)
-    assert settings.options == {}
+def test_a_robot_that_reports_rest_stands_still_unless_log_or_filter_object():
+    assert settings_for(SlamLog("log"), **NOISE).options == {"noise_at_rest": False}
+    simple = settings_for(SlamLog("log"), estimator=f"{__name__}:Simple", **NOISE)
+    assert simple.options == {}
 
 
 class Simple(EkfSlam):
@@ -465,22 +440,20 @@ def test_a_header_that_cannot_be_used_is_refused(header, message):
         settings_for(SlamLog("log", complete))
 
 
-def course_table(public_logs, **options):
+def on_the_course(public_logs, estimator="ekf", **options):
     log = read_log(public_logs / "raw" / "cmu16833" / "data.txt")
-    settings = settings_for(log, estimator="ekf", options=options)
-    return summarise(replay(log, settings.make(log.start)))["landmarks"]
+    return summary_of(log, estimator=estimator, options=options)
 
 
 def test_the_course_log_ends_at_the_published_distances(public_logs):
-    table = course_table(public_logs)
+    table = on_the_course(public_logs)["landmarks"]
     assert [row["id"] for row in table] == list(range(6))
-    assert [row["euclidean"] for row in table] == pytest.approx(
-        FULL_EUCLIDEAN, abs=1e-6
-    )
+    euclidean = [row["euclidean"] for row in table]
+    assert euclidean == pytest.approx(FULL_EUCLIDEAN, abs=1e-6)
 
 
 def test_independent_landmarks_reproduce_the_homeworks_table(public_logs):
-    table = course_table(public_logs, landmark_init="independent")
+    table = on_the_course(public_logs, landmark_init="independent")["landmarks"]
     euclidean = [row["euclidean"] for row in table]
     mahalanobis = [row["mahalanobis"] for row in table]
     assert euclidean == pytest.approx(INDEPENDENT_EUCLIDEAN, abs=1e-6)
@@ -490,15 +463,8 @@ def test_independent_landmarks_reproduce_the_homeworks_table(public_logs):
 
 
 def errors_on(path, motion_std, measurement_std, **options):
-    log = read_log(path)
-    settings = settings_for(
-        log,
-        estimator="ekf",
-        motion_std=motion_std,
-        measurement_std=measurement_std,
-        options=options,
-    )
-    summary = summarise(replay(log, settings.make(log.start)))
+    noise = {"motion_std": motion_std, "measurement_std": measurement_std}
+    summary = summary_of(read_log(path), estimator="ekf", **noise, options=options)
     ate = summary["ate"] or {"aligned": None, "raw": None}
     landmarks = summary["landmark_rmse"]
     return ate["aligned"], ate["raw"], landmarks["aligned"], landmarks["raw"]
@@ -555,15 +521,13 @@ def test_utias_is_no_worse_with_the_noise_at_the_expected_range(public_logs):
     assert expected[2] < 0.97 * as_read[2]
 
 
-def course_rmse(public_logs, estimator, **options):
-    log = read_log(public_logs / "raw" / "cmu16833" / "data.txt")
-    settings = settings_for(log, estimator=estimator, options=options)
-    return summarise(replay(log, settings.make(log.start)))["landmark_rmse"]["raw"]
-
-
 def test_on_the_course_log_the_invariant_filter_is_right(public_logs):
-    assert course_rmse(public_logs, "invariant") <= 0.003
-    assert course_rmse(public_logs, "ekf") == pytest.approx(0.0086, abs=1e-4)
+    invariant, ekf_ = (
+        on_the_course(public_logs, name)["landmark_rmse"]["raw"]
+        for name in ("invariant", "ekf")
+    )
+    assert invariant <= 0.003
+    assert ekf_ == pytest.approx(0.0086, abs=1e-4)
 
 
 def test_an_estimator_with_a_door_for_the_truth_is_told_it():
