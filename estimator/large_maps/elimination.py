@@ -24,14 +24,12 @@ from ...arrays import Array, BoolArray, IntArray
 from .multifrontal import (
     InformationMatrix,
     Node,
-    SchurComplement,
     add_update,
     eliminate,
     eliminate_in_place,
     marginal_covariance,
     pairs,
     substitute_back,
-    substitute_forward,
 )
 
 
@@ -89,24 +87,13 @@ class LandmarkElimination:
         for node in invalid:
             self._cache.pop(node, None)
 
-    def eliminate(
-        self, matrix: InformationMatrix, local: IntArray
-    ) -> tuple[list[Node], Array, IntArray]:
-        """Eliminate all landmarks except the local ones.
-
-        Returns
-        -------
-        nodes : list of Node
-            Children first.
-        update : ndarray
-            Of the root, whose ``rest`` are local landmarks.
-        slots : ndarray
-            The eliminated landmarks.
-        """
+    def eliminate(self, matrix: InformationMatrix, local: IntArray) -> RestFactor:
+        """Eliminate all landmarks except the local ones."""
         self.dissection.grow(len(matrix))
         nodes = self.dissection.nodes
-        is_local = np.zeros(len(nodes), dtype=bool)
-        is_local[local] = True
+        place = np.full(len(nodes), -1)
+        place[local] = np.arange(len(local))
+        is_local = place >= 0
         slots = np.flatnonzero((nodes > 0) & ~is_local)
         members = _by_node(slots, nodes)
         affected = with_ancestors(nodes[local])
@@ -122,9 +109,14 @@ class LandmarkElimination:
                 if node not in affected:
                     self._cache[node] = part
             done[node] = part
+        border = done[1].node.rest[::2] // 2
+        order = np.argsort(place[border])
+        columns = pairs(order)
         upper = np.triu(done[1].update)
-        update = upper + np.triu(upper, 1).T
-        return [part.node for part in done.values()], update, slots
+        C = -(upper + np.triu(upper, 1).T)[np.ix_(columns, columns)]
+        return RestFactor(
+            [part.node for part in done.values()], slots, border[order], C, len(nodes)
+        )
 
 
 def _by_node(slots: IntArray, nodes: IntArray) -> dict[int, IntArray]:
@@ -161,43 +153,29 @@ def _eliminate(
     return _Eliminated(node, remainder if below else None)
 
 
-class RestFactor:
-    """Factor of all landmarks except the local ones, made when it is first used."""
+class RestFactor(NamedTuple):
+    """All landmarks H except the local ones L, eliminated from a map.
 
-    def __init__(
-        self, order: LandmarkElimination, matrix: InformationMatrix, local: IntArray
-    ) -> None:
-        self._elimination, self._matrix, self._local = order, matrix, local
-        self._done: tuple[list[Node], Array, IntArray] | None = None
+    ::
 
-    def _eliminated(self) -> tuple[list[Node], Array, IntArray]:
-        if self._done is None:
-            self._done = self._elimination.eliminate(self._matrix, self._local)
-        return self._done
+        Λ_LL δ_L + Λ_LH δ_H = b_L,   Λ_HL δ_L + Λ_HH δ_H = 0
+        ⟹ (Λ_LL − C) δ_L = b_L,   δ_H = −T δ_B,   T = Λ_HH⁻¹ Λ_HB,   C = Λ_BH T
 
-    @property
-    def slots(self) -> IntArray:
-        """The eliminated landmarks, H."""
-        return self._eliminated()[2]
+    where B ⊂ L are the local landmarks linked with H.
+    """
 
-    def solve(self, right: Array) -> Array:
-        """Return Λ_HH⁻¹ b."""
-        nodes, _, slots = self._eliminated()
-        rows = pairs(slots)
-        values = np.zeros((2 * len(self._matrix), *right.shape[1:]))
-        values[rows] = right
-        substitute_forward(nodes, values)
-        values[pairs(self._local)] = 0.0
-        substitute_back(nodes, values)
-        return values[rows]
+    nodes: list[Node]  # children first
+    slots: IntArray  # H
+    border: IntArray  # B, in the order of L
+    complement: Array  # C, shape (2c, 2c), symmetric
+    size: int  # number of slots of the map
 
     def respond(self, shift: Array) -> Array:
         """Return T δ_B."""
-        nodes, _, slots = self._eliminated()
-        values = np.zeros(2 * len(self._matrix))
-        values[pairs(self._local)[self.border()[0]]] = shift
-        substitute_back(nodes, values)
-        return -values[pairs(slots)]
+        values = np.zeros(2 * self.size)
+        values[pairs(self.border)] = shift
+        substitute_back(self.nodes, values)
+        return -values[pairs(self.slots)]
 
     def covariance(self, slots: IntArray) -> tuple[Array, Array]:
         """Return blocks of Λ_HH⁻¹ and rows of T.
@@ -210,40 +188,17 @@ class RestFactor:
         Returns
         -------
         covariance : ndarray, shape (2v, 2v)
-        response : ndarray, shape (2v, c)
+        response : ndarray, shape (2v, 2c)
         """
-        nodes, _, _ = self._eliminated()
         columns = pairs(slots)
         size = len(columns)
         where = (np.arange(size), columns)
-        unit = csc_array((np.ones(size), where), (size, 2 * len(self._matrix)))
-        covariance, remainder = marginal_covariance(nodes, unit)
-        border = pairs(self._local)[self.border()[0]].tolist()
-        response = np.zeros((size, len(border)))
-        for column, unknown in enumerate(border):
-            if unknown in remainder:
-                response[:, column] = -remainder[unknown]
+        unit = csc_array((np.ones(size), where), (size, 2 * self.size))
+        covariance, remainder = marginal_covariance(self.nodes, unit)
+        response = np.zeros((size, 2 * len(self.border)))
+        for column, unknown in enumerate(pairs(self.border).tolist()):
+            response[:, column] = -remainder.get(unknown, 0.0)
         return covariance, response
-
-    def border(self) -> tuple[IntArray, IntArray]:
-        """Return the columns of B in the local map, and in the root's front."""
-        place = np.full(len(self._matrix), -1)
-        place[self._local] = np.arange(len(self._local))
-        rest = place[self._eliminated()[0][-1].rest[::2] // 2]
-        order = np.argsort(rest)
-        return pairs(rest[order]), pairs(order)
-
-    def complement(self) -> SchurComplement:
-        """Return the effect on the local map; T is not computed."""
-        border, columns = self.border()
-        C = -self._eliminated()[1][np.ix_(columns, columns)]
-        return SchurComplement(
-            self.slots, border, np.empty((0, len(border))), (C + C.T) / 2, self
-        )
-
-    def release(self) -> None:
-        """Free the memory of the factor that is not cached."""
-        self._done = None
 
 
 # --------------------------------------------------------------------------------------

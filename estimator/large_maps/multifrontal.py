@@ -8,7 +8,7 @@ front::
     front = [H_pp H_pr; · H_rr],   L Lᵀ = H_pp,   X = L⁻¹ H_pr,   update = H_rr − Xᵀ X
 
 The update is the Schur complement of H_pp, and is added to the parent's front.
-`eliminate_subset` eliminates landmarks around a local map from an `InformationMatrix`.
+`InformationMatrix` holds the sparse H of a map of landmarks.
 
 References
 ----------
@@ -20,12 +20,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, lapack
+from scipy.linalg import lapack
 from scipy.sparse import bsr_array, csc_array
-from scipy.sparse.linalg import splu
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit
@@ -201,129 +200,6 @@ def _solve(lower: Array, right: Array, *, transposed: bool = False) -> Array:
     return np.asarray(solved)
 
 
-# --------------------------------------------------------------------------------------
-# Elimination of the landmarks around a local map from a sparse information matrix.
-
-Solver = Callable[[Array], Array]
-
-# Up to this many landmarks, a dense Cholesky factor is faster than a sparse one.
-LARGEST_DENSE = 150
-
-
-class Factor(Protocol):
-    """Factor of Λ_HH, which is made when it is first used."""
-
-    def solve(self, right: Array) -> Array:
-        """Return Λ_HH⁻¹ b."""
-        ...
-
-    def respond(self, shift: Array) -> Array:
-        """Return T δ_B."""
-        ...
-
-    def release(self) -> None:
-        """Free the memory of the factor; the next use makes it again."""
-
-
-class SchurComplement(NamedTuple):
-    """Effect of eliminated landmarks H on a local map L.
-
-    ::
-
-        Λ_LL δ_L + Λ_LH δ_H = b_L,   Λ_HL δ_L + Λ_HH δ_H = 0
-        ⟹ (Λ_LL − C) δ_L = b_L,   δ_H = −T δ_B,   T = Λ_HH⁻¹ Λ_HB,   C = Λ_BH T
-
-    where B ⊂ L are the local landmarks linked with H.
-    """
-
-    slots: IntArray  # H
-    border: IntArray  # columns of B in L, shape (c,)
-    # T, shape (2h, c); not computed, (0, c), if H is the whole rest of the map.
-    response: Array
-    complement: Array  # C, shape (c, c), symmetric
-    factor: Factor
-
-
-class SubsetFactor:
-    """Factor of the rows and columns of some landmarks."""
-
-    def __init__(
-        self,
-        matrix: InformationMatrix,
-        slots: IntArray,
-        response: Array,
-        solve: Solver | None = None,
-    ) -> None:
-        self._matrix, self._slots = matrix, slots
-        self._response, self._solve = response, solve
-
-    def solve(self, right: Array) -> Array:
-        """Return Λ_HH⁻¹ b."""
-        if self._solve is None:
-            self._solve = solver(self._matrix, self._slots)
-        return self._solve(right)
-
-    def respond(self, shift: Array) -> Array:
-        """Return T δ_B."""
-        return np.asarray(self._response @ shift)
-
-    def release(self) -> None:
-        """Free the memory of the factor."""
-        self._solve = None
-
-
-def eliminate_subset(
-    matrix: InformationMatrix, local: IntArray, subset: IntArray
-) -> SchurComplement:
-    """Eliminate some landmarks around a local map.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If their information is not positive definite.
-    """
-    link = matrix.submatrix(subset, local).tocsc()
-    border = np.flatnonzero(np.diff(link.indptr))
-    right = link[:, border].toarray()
-    solve = solver(matrix, subset)
-    # One memory layout: BLAS must return the same bits after a state is reloaded.
-    response = np.ascontiguousarray(solve(right) if len(border) else right)
-    complement = right.T @ response
-    return SchurComplement(
-        subset,
-        border,
-        response,
-        (complement + complement.T) / 2,
-        SubsetFactor(matrix, subset, response, solve),
-    )
-
-
-def solver(matrix: InformationMatrix, slots: IntArray) -> Solver:
-    """Factorise the rows and columns of some landmarks."""
-    if not len(slots):
-        return np.copy
-    if len(slots) <= LARGEST_DENSE:
-        factor = cho_factor(matrix.dense(slots), lower=True, check_finite=False)
-        return lambda right: np.asarray(cho_solve(factor, right, check_finite=False))
-    return _sparse_solver(matrix.submatrix(slots, slots).tocsc())
-
-
-def _sparse_solver(information: csc_array) -> Solver:
-    """Factorise a sparse symmetric positive definite matrix."""
-    try:
-        factor = splu(
-            information,
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
-    except RuntimeError as error:
-        raise np.linalg.LinAlgError(
-            f"the information matrix is not positive definite: {error}"
-        ) from error
-    return lambda right: np.asarray(factor.solve(np.ascontiguousarray(right)))
-
-
 @jit
 def add_update(top: Array, rest: Array, at: IntArray, update: Array) -> None:
     """Add a child's update (r, r) to the rows and columns ``at`` (r,) of a front.
@@ -396,11 +272,6 @@ class InformationMatrix:
         """Return the rows and columns of a few landmarks, shape (2k, 2k)."""
         return np.asarray(self.submatrix(slots, slots).toarray())
 
-    def diagonal(self, slots: IntArray) -> Array:
-        """Return the diagonal blocks of landmarks, shape (k, 2, 2)."""
-        counts, links, blocks = self.rows(slots)
-        return np.asarray(blocks[links == np.repeat(slots, counts)])
-
     def submatrix(self, rows: IntArray, columns: IntArray) -> bsr_array:
         """Return the blocks of some rows and columns, shape (2r, 2c), sparse."""
         shape = (2 * len(rows), 2 * len(columns))
@@ -425,20 +296,6 @@ class InformationMatrix:
             self._blocks[slot] = np.concatenate(
                 [self._blocks[slot][kept], blocks[i, new]]
             )
-
-    def nearest_by_links(self, slots: IntArray, count: int) -> IntArray:
-        """Return up to ``count`` other landmarks, fewest links away first."""
-        found: list[IntArray] = []
-        missing, front = count, slots
-        is_found = np.zeros(len(self), dtype=bool)
-        is_found[slots] = True
-        while missing > 0 and len(front):
-            front = np.unique(self.rows(front)[1])
-            front = front[~is_found[front]][:missing]
-            is_found[front] = True
-            found.append(front)
-            missing -= len(front)
-        return np.concatenate([*found, np.empty(0, dtype=np.int64)])
 
     def _found(self, slots: IntArray, links: IntArray) -> tuple[IntArray, BoolArray]:
         """Return the places of links among slots, and which of them are among these.

@@ -6,6 +6,7 @@ import pytest
 from inner_parts import map_of
 
 from slamgym.estimator import list_estimators, make_estimator
+from slamgym.estimator.large_maps.sparse_information import sparse_information_slam
 from slamgym.estimator.large_maps.sparse_information.sparse_belief import SparseBelief
 from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.models.bearing_range import predict_measurement
@@ -155,11 +156,11 @@ def test_an_update_that_fails_after_the_local_map_changed_is_taken_back(
         if name == "compressed":
             patch.setattr(type(map_of(slam).filter), "update", fail)
         else:
-            patch.setattr(type(slam), "_process", fail)
+            patch.setattr(sparse_information_slam, "process_scan", fail)
             patch.setattr(
                 SparseBelief,
                 "choose_local_map",
-                lambda self, ids, exact: self.enlarge_elimination(),
+                lambda self, ids: self.remove(self.ids_of(self.local.slots)[:1]),
             )
         with pytest.raises(np.linalg.LinAlgError):
             slam.update(READINGS[: max(len(absent), 1)], absent or [0])

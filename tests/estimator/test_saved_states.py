@@ -218,8 +218,8 @@ def without_the_last(value):
             ("sparse_information", "pose_covariance"))),
         ("compressed", "far_progress", lambda v: v + np.inf,
          r"state\['far_progress'\] must be finite"),
-        ("sparse_information", "around_slots", lambda _: np.array([2.0**63]),
-         "around_slots'] must be whole numbers <= 2⁵³"),
+        ("sparse_information", "local_slots", lambda _: np.array([2.0**63]),
+         "local_slots'] must be whole numbers <= 2⁵³"),
         ("sparse_information", "local_slots", lambda v: v[:, None],
          r"state\['local_slots'\] must have shape"),
         *(("joint", f"landmarks.{key}", without_the_last, r"state\['landmarks")

@@ -1,15 +1,13 @@
 """The landmarks near the robot, conditioned on the rest of a sparse information map.
 
-`begin_local_map` eliminates the landmarks around the local map, and `LocalInformation`
-holds the result. `ConditionalPose` holds the pose given the map, and `choose_local`
-chooses the local landmarks.
+`LocalInformation` holds the local landmarks, after the elimination of all others.
+`ConditionalPose` holds the pose given the map, and `choose_local` chooses the local
+landmarks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -17,23 +15,19 @@ from scipy.linalg import cho_solve, lapack, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
 from ...models.motions import predict_pose
+from ...support.undo import Undo, contents, undo_all
 from ..elimination import LandmarkElimination, RestFactor
-from ..multifrontal import InformationMatrix, SchurComplement, eliminate_subset, pairs
+from ..multifrontal import InformationMatrix, pairs
 
 
 class SparseMap:
-    """Means and information of all landmarks, by slot.
-
-    The exact mean is m + Λ⁻¹ b, where ``residual`` b is the part of the corrections
-    that has not been applied yet.
-    """
+    """Means and information of all landmarks, by slot."""
 
     def __init__(self) -> None:
         self.information = InformationMatrix()
         self.elimination = LandmarkElimination()
         self.points = np.zeros(0)
         self.first = np.zeros(0)  # first estimates
-        self.residual = np.zeros(0)
 
     def grow(self, count: int) -> None:
         """Make room for ``count`` landmarks."""
@@ -42,40 +36,12 @@ class SparseMap:
             more = np.zeros(4 * count - len(self.points))
             self.points = np.append(self.points, more)
             self.first = np.append(self.first, more)
-            self.residual = np.append(self.residual, more)
 
-    def checkpoint(self) -> Callable[[], None]:
-        """Return a function that undoes later changes of means, information, order."""
-        arrays = {k: getattr(self, k).copy() for k in ("points", "first", "residual")}
-        undo_information = self.information.checkpoint()
-        undo_order = self.elimination.checkpoint()
-
-        def undo() -> None:
-            vars(self).update(arrays)
-            undo_information()
-            undo_order()
-
-        return undo
-
-
-@dataclass(frozen=True)
-class FixedLandmarks:
-    """Landmarks O linked with the eliminated ones, held at their means."""
-
-    slots: IntArray  # O
-    response: Array  # W = Λ_OH T, shape (2o, c): their residual is b + W δ_B
-    residual: Array  # b when the local map was chosen, shape (2o,)
-    scale: Array  # inverse Cholesky factors of their diagonal blocks, shape (o, 2, 2)
-
-    def residual_after(self, shift: Array) -> Array:
-        """Return the residual after the border moved by δ_B, shape (2o,)."""
-        return self.residual + self.response @ shift
-
-    def largest_residual(self, shift: Array) -> float:
-        """Return the largest residual in conditional standard deviations."""
-        left = self.residual_after(shift).reshape(-1, 2)
-        white = np.einsum("oij,oj->oi", self.scale, left)
-        return float(np.sqrt((white**2).sum(axis=1).max(initial=0.0)))
+    def checkpoint(self) -> Undo:
+        """Return what takes back later changes of means, information and order."""
+        return undo_all(
+            contents(self), self.information.checkpoint(), self.elimination.checkpoint()
+        )
 
 
 @dataclass(frozen=True)
@@ -91,20 +57,35 @@ class LocalInformation:
     points: Array  # means, shape (2k,) [m]
     first: Array  # first estimates, shape (2k,) [m]
     information: Array  # Λ_LL, shape (2k, 2k)
-    start: Array  # means of the border when L was chosen, shape (c,)
-    eliminated: SchurComplement
-    fixed: FixedLandmarks
+    rest: RestFactor  # all other landmarks H
+    border: IntArray  # columns of B in L, shape (2c,)
+    start: Array  # means of B when L was chosen, shape (2c,)
+
+    @classmethod
+    def of(cls, map_: SparseMap, slots: IntArray) -> LocalInformation:
+        """Choose local landmarks, and eliminate all others."""
+        rest, inside = map_.elimination.eliminate(map_.information, slots), pairs(slots)
+        place = np.full(rest.size, -1)
+        place[slots] = np.arange(len(slots))
+        return cls(
+            slots,
+            map_.points[inside],
+            map_.first[inside],
+            map_.information.dense(slots),
+            rest,
+            pairs(place[rest.border]),
+            map_.points[pairs(rest.border)],
+        )
 
     @property
     def shift(self) -> Array:
-        """Displacement of the border since L was chosen, δ_B, shape (c,)."""
-        return self.points[self.eliminated.border] - self.start
+        """Displacement of the border since L was chosen, δ_B, shape (2c,)."""
+        return self.points[self.border] - self.start
 
     def solver(self) -> tuple[Array, bool]:
         """Return the Cholesky factor of Λ_LL − C for :func:`scipy.linalg.cho_solve`."""
-        border = self.eliminated.border
         marginal = self.information.copy()
-        marginal[np.ix_(border, border)] -= self.eliminated.complement
+        marginal[np.ix_(self.border, self.border)] -= self.rest.complement
         factor, failed = lapack.dpotrf(marginal, lower=1, clean=1)
         if failed:
             raise np.linalg.LinAlgError(
@@ -151,81 +132,25 @@ class LocalInformation:
             points=self.points[rest],
             first=self.first[rest],
             information=information,
-            eliminated=self.eliminated._replace(border=place[self.eliminated.border]),
+            border=place[self.border],
         )
-
-
-def begin_local_map(
-    map_: SparseMap, pose: ConditionalPose, slots: IntArray, count: float
-) -> tuple[LocalInformation, ConditionalPose]:
-    """Choose local landmarks, and eliminate landmarks around them.
-
-    Parameters
-    ----------
-    map_ : SparseMap
-        Pending residuals of local and eliminated landmarks are applied to it.
-    pose : ConditionalPose
-        Its gain must be that of the local landmarks.
-    slots : ndarray
-        The local landmarks.
-    count : float
-        Number of landmarks to eliminate, nearest by links first.
-    """
-    matrix = map_.information
-    eliminated = _eliminate(map_, slots, count)
-    columns = pairs(eliminated.slots)
-    fixed = np.empty(0, dtype=np.int64)
-    if not isinstance(eliminated.factor, RestFactor):  # which leaves no others
-        fixed = np.setdiff1d(matrix.neighbours(eliminated.slots), slots)
-    pending = map_.residual[columns]
-    if pending.any():
-        pending = eliminated.factor.solve(pending)
-    map_.points[columns] += pending
-    map_.residual[columns] = 0.0
-    link = matrix.submatrix(fixed, eliminated.slots)
-    response = np.zeros((0, len(eliminated.border)))
-    if len(fixed):
-        response = np.ascontiguousarray(link @ eliminated.response)
-    outside, inside = pairs(fixed), pairs(slots)
-    map_.residual[outside] -= link @ pending
-    residual = map_.residual[inside].copy()
-    residual -= matrix.submatrix(slots, eliminated.slots) @ pending
-    map_.residual[inside] = 0.0
-    local = LocalInformation(
-        slots,
-        map_.points[inside],
-        map_.first[inside],
-        matrix.dense(slots),
-        map_.points[inside][eliminated.border],
-        eliminated,
-        FixedLandmarks(
-            fixed,
-            response,
-            map_.residual[outside],
-            np.linalg.inv(np.linalg.cholesky(matrix.diagonal(fixed))),
-        ),
-    )
-    return local.settle(pose, residual)
-
-
-def _eliminate(map_: SparseMap, slots: IntArray, count: float) -> SchurComplement:
-    """Eliminate the nearest landmarks by links, or the whole rest of the map."""
-    matrix = map_.information
-    if count >= len(matrix) - len(slots):
-        return RestFactor(map_.elimination, matrix, slots).complement()
-    return eliminate_subset(matrix, slots, matrix.nearest_by_links(slots, int(count)))
 
 
 def write_back(map_: SparseMap, local: LocalInformation) -> None:
     """Write the local map and its effect on the eliminated landmarks to the map."""
-    map_.points[pairs(local.slots)] = local.points
+    map_.points = means(map_, local)
     map_.first[pairs(local.slots)] = local.first
-    eliminated, shift = local.eliminated, local.shift
-    if shift.any():
-        map_.points[pairs(eliminated.slots)] -= eliminated.factor.respond(shift)
-    map_.residual[pairs(local.fixed.slots)] = local.fixed.residual_after(shift)
     map_.information.replace(local.slots, local.information)
     map_.elimination.revise(map_.information, map_.first, local.slots)
+
+
+def means(map_: SparseMap, local: LocalInformation) -> Array:
+    """Return the positions of all landmarks by slot, flat [m]."""
+    points = map_.points.copy()
+    if local.shift.any():
+        points[pairs(local.rest.slots)] -= local.rest.respond(local.shift)
+    points[pairs(local.slots)] = local.points
+    return points
 
 
 def link_count(map_: SparseMap, local: LocalInformation) -> int:
@@ -409,16 +334,9 @@ def cut_links(pose: ConditionalPose, matrix: Array, weak: BoolArray) -> Conditio
 
 
 # --------------------------------------------------------------------------------------
-# Choice of the local landmarks, and of how many to eliminate around them.
+# Choice of the local landmarks.
 
 SMALLEST_LOCAL_MAP = 50  # smallest number of landmarks in a new local map
-FIRST_COUNT = 100  # number of landmarks eliminated at first, if the tolerance allows it
-# Growth factor of that number when it is too small. The second step takes all.
-GROWTH = 16
-# Take all at once if the larger number exceeds a tenth of the map.
-#
-# The elimination of all reuses what is known, and is then as fast.
-SMALLEST_SHARE = 10
 # Size of the local map of a large map: 2 n^0.4.
 #
 # A change of the local map may eliminate the whole map, at a cost that grows with n; a
@@ -440,39 +358,6 @@ def choose_local(
     count = min(size, len(mapped))
     nearest = mapped[np.argpartition(distances, count - 1)[:count]]
     return union(required, np.sort(nearest))[: max(size, len(required))]
-
-
-def first_elimination_count(last: float, mapped: int, *, enlarged: bool) -> float:
-    """Return the number of landmarks to eliminate around a new local map.
-
-    This is the last number if it had to be enlarged, and a smaller one otherwise.
-
-    Examples
-    --------
-    >>> first_elimination_count(inf, 10_000, enlarged=False)
-    100
-    """
-    if enlarged:
-        return last
-    less = min(last, GROWTH**2 * FIRST_COUNT) / GROWTH
-    return less if _is_worthwhile(less, mapped) else FIRST_COUNT
-
-
-def larger_elimination_count(count: float, mapped: int) -> float:
-    """Return the number to eliminate if ``count`` was too small; finally infinity.
-
-    Examples
-    --------
-    >>> [larger_elimination_count(100, mapped) for mapped in (10_000, 100_000)]
-    [inf, 1600]
-    """
-    more = GROWTH * count
-    return more if count < more < inf and _is_worthwhile(more, mapped) else inf
-
-
-def _is_worthwhile(count: float, mapped: int) -> bool:
-    most = min(GROWTH * FIRST_COUNT, mapped / SMALLEST_SHARE)
-    return FIRST_COUNT < count <= most
 
 
 def union(first: IntArray, second: IntArray) -> IntArray:

@@ -47,11 +47,6 @@ class ScanResult(NamedTuple):
     report: UpdateReport
     added_slots: list[int]
 
-    @property
-    def largest_residual(self) -> float:
-        """Largest correction that has not reached the fixed landmarks, in their σ."""
-        return self.local.fixed.largest_residual(self.local.shift)
-
 
 def process_scan(
     state: State,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -15,19 +14,15 @@ from ....arrays import Array, BoolArray, IntArray
 from ...filters.ekf import EkfSlam
 from ...interface import UpdateReport
 from ...models.rigid_motion import as_covariance
-from ...support.undo import Undo, attributes, contents, undone_on_error
-from ..elimination import RestFactor
-from ..multifrontal import SchurComplement, pairs
+from ...support.undo import Undo, attributes, contents, undo_all, undone_on_error
+from ..multifrontal import pairs
 from .local_information import (
-    FIRST_COUNT,
     ConditionalPose,
     LocalInformation,
     SparseMap,
-    begin_local_map,
     choose_local,
-    first_elimination_count,
-    larger_elimination_count,
     local_map_size,
+    means,
     union,
     write_back,
 )
@@ -44,14 +39,10 @@ class SparseBelief:
     local: LocalInformation
     pose: ConditionalPose
     origin: Array  # position of the robot when the local map was chosen, shape (2,) [m]
-    count: float = FIRST_COUNT  # number of landmarks to eliminate around the local map
-    enlarged: bool = False  # whether the first number was too small
     steps: int = 0  # number of steps taken
     report: UpdateReport = field(default_factory=UpdateReport, repr=False)  # the last
     # What takes back the update under way: the last of these.
     saved: list[Undo] = field(default_factory=list, repr=False)
-    # Factor of all landmarks except the local ones, if known.
-    rest: RestFactor | None = field(default=None, repr=False)
 
     @classmethod
     def empty(cls, pose: Array, std: Array) -> SparseBelief:
@@ -60,8 +51,7 @@ class SparseBelief:
             pose.copy(), np.zeros((3, 0)), np.diag(std**2), pose[:2].copy()
         )
         map_ = SparseMap()
-        nothing = np.empty(0, dtype=np.int64)
-        local, start = begin_local_map(map_, start, nothing, FIRST_COUNT)
+        local = LocalInformation.of(map_, np.empty(0, dtype=np.int64))
         return cls({}, [], map_, local, start, pose[:2].copy())
 
     @classmethod
@@ -102,14 +92,7 @@ class SparseBelief:
 
     def checkpoint(self) -> Undo:
         """Return what takes back later changes."""
-        undo_own, undo_map = contents(self), self.map_.checkpoint()
-
-        def undo() -> None:
-            undo_map()
-            undo_own()
-            self.rest = None  # the map no longer keeps the nodes of a factor
-
-        return undo
+        return undo_all(contents(self), self.map_.checkpoint())
 
     @contextmanager
     def undone_on_error(self) -> Iterator[None]:
@@ -130,16 +113,8 @@ class SparseBelief:
         if len(self.saved) == 1:
             self.saved.append(self.checkpoint())
 
-    def choose_local_map(self, ids: Sequence[int], *, exact: bool) -> None:
-        """Choose a new local map if a scan needs it or the old one is too large.
-
-        Parameters
-        ----------
-        ids : sequence of int
-            Landmarks of the scan.
-        exact : bool
-            Whether to eliminate the whole rest of the map.
-        """
+    def choose_local_map(self, ids: Sequence[int]) -> None:
+        """Choose a new local map if a scan needs it or the old one is too large."""
         seen = np.array([self.slots[i] for i in ids if i in self.slots], dtype=int)
         local = self.local.slots
         required = union(seen, local[self.pose.is_linked])
@@ -151,26 +126,20 @@ class SparseBelief:
         mapped = np.array(list(self.slots.values()))
         points = self.map_.points.reshape(-1, 2)
         chosen = choose_local(mapped, points, ahead, required, size)
-        self._change_local_map(chosen, self._first_count(exact=exact))
-        self.origin, self.enlarged = here.copy(), False
+        self._change_local_map(chosen)
+        self.origin = here.copy()
 
-    def enlarge_elimination(self) -> None:
-        """Keep the local map, and eliminate more landmarks around it."""
-        count = larger_elimination_count(self.count, len(self.slots))
-        self._change_local_map(self.local.slots, count)
-        self.enlarged = True
-
-    def remove(self, ids: Sequence[int], *, exact: bool) -> None:
+    def remove(self, ids: Sequence[int]) -> None:
         """Marginalise landmarks."""
         with undone_on_error(self.checkpoint()):
-            gone = self._include_links(ids, exact=exact)
+            gone = self._include_links(ids)
             rest = marginalise(self.local, self.pose, gone)
             self._drop(ids, gone, rest)
 
-    def merge(self, kept: int, gone: int, *, exact: bool) -> None:
+    def merge(self, kept: int, gone: int) -> None:
         """Condition on two landmarks being the same, and drop the second."""
         with undone_on_error(self.checkpoint()):
-            dropped = self._include_links([gone, kept], exact=exact)
+            dropped = self._include_links([gone, kept])
             place = int(np.flatnonzero(self.local.slots == self.slots[kept])[0])
             dropped[place] = False
             merged = merge_landmarks(self.local, self.pose, place, dropped)
@@ -178,11 +147,8 @@ class SparseBelief:
 
     def marginal(self, ids: Sequence[int]) -> Marginal:
         """Return the marginal of the pose and some landmarks."""
-        if self.rest is None:
-            map_ = self.map_
-            self.rest = RestFactor(map_.elimination, map_.information, self.local.slots)
         slots = np.array([self.slots[i] for i in ids], dtype=np.int64)
-        return marginal(self.map_, self.local, self.rest, self.pose, slots)
+        return marginal(self.map_, self.local, self.pose, slots)
 
     def landmarks(self) -> Array:
         """Return the positions of all landmarks, shape (n, 2) [m]."""
@@ -198,23 +164,16 @@ class SparseBelief:
     def nbytes(self) -> int:
         """Memory of the belief [bytes]."""
         local, map_ = self.local, self.map_
-        arrays = (
-            map_.points,
-            map_.first,
-            map_.residual,
-            local.information,
-            local.eliminated.response,
-            local.fixed.response,
-        )
+        arrays = (map_.points, map_.first, local.information)
         stored = map_.information.nbytes + map_.elimination.nbytes
         return stored + sum(array.nbytes for array in arrays)
 
-    def _include_links(self, ids: Sequence[int], *, exact: bool) -> BoolArray:
+    def _include_links(self, ids: Sequence[int]) -> BoolArray:
         """Add landmarks and all their links to the local map; return their flags."""
         slots = np.array([self.slots[i] for i in ids])
         linked = np.append(slots, self.map_.information.neighbours(slots))
         chosen = union(self.local.slots, linked)
-        self._change_local_map(chosen, self._first_count(exact=exact))
+        self._change_local_map(chosen)
         return np.isin(self.local.slots, slots)
 
     def _drop(self, ids: Sequence[int], gone: BoolArray, rest: State) -> None:
@@ -223,33 +182,19 @@ class SparseBelief:
         information = np.where(stays & stays[:, None], self.local.information, 0.0)
         self.map_.information.replace(self.local.slots, information)
         self.local, self.pose = rest
-        self.rest = None
         slots = [self.slots.pop(i) for i in ids]
         self.map_.elimination.dissection.nodes[slots] = 0
         self.free += slots
 
-    def _first_count(self, *, exact: bool) -> float:
-        if exact:
-            return inf
-        return first_elimination_count(
-            self.count, len(self.slots), enlarged=self.enlarged
-        )
-
-    def _change_local_map(self, slots: IntArray, count: float) -> None:
+    def _change_local_map(self, slots: IntArray) -> None:
         """Write the local map back, and begin another one."""
         self._save()
-        old, pose = self.local.slots, self.pose
         write_back(self.map_, self.local)
-        self.rest = None
-        self.local.eliminated.factor.release()  # it may be large
         gain = np.zeros((3, 2 * len(slots)))
-        _, before, after = np.intersect1d(old, slots, return_indices=True)
-        gain[:, pairs(after)] = pose.gain[:, pairs(before)]
-        pose = pose._replace(gain=gain)
-        self.local, self.pose = begin_local_map(self.map_, pose, slots, count)
-        self.count = count
-        factor = self.local.eliminated.factor
-        self.rest = factor if isinstance(factor, RestFactor) else None
+        _, before, after = np.intersect1d(self.local.slots, slots, return_indices=True)
+        gain[:, pairs(after)] = self.pose.gain[:, pairs(before)]
+        self.pose = self.pose._replace(gain=gain)
+        self.local = LocalInformation.of(self.map_, slots)
 
 
 class Marginal(NamedTuple):
@@ -260,11 +205,7 @@ class Marginal(NamedTuple):
 
 
 def marginal(
-    map_: SparseMap,
-    local: LocalInformation,
-    rest: RestFactor,
-    pose: ConditionalPose,
-    slots: IntArray,
+    map_: SparseMap, local: LocalInformation, pose: ConditionalPose, slots: IntArray
 ) -> Marginal:
     """Return the marginal of the pose and some landmarks.
 
@@ -280,8 +221,6 @@ def marginal(
     ----------
     map_ : SparseMap
     local : LocalInformation
-    rest : RestFactor
-        Of all landmarks except the local ones.
     pose : ConditionalPose
     slots : ndarray, shape (n,)
         The landmarks.
@@ -292,13 +231,12 @@ def marginal(
     inside = np.append([True] * 3, np.repeat(is_near, 2))
     outside = np.flatnonzero(~inside)
     here = np.append([0, 1, 2], 3 + pairs(place[slots[is_near]]))
-    whole = rest.complement()
-    near = _near(local, whole, pose)  # its bits do not depend on the slots
+    near = _near(local, pose)  # its bits do not depend on the slots
     covariance = np.empty((len(inside), len(inside)))
     covariance[np.ix_(inside, inside)] = near[np.ix_(here, here)]
     if len(outside):
-        own, T = rest.covariance(slots[~is_near])
-        border = 3 + whole.border
+        own, T = local.rest.covariance(slots[~is_near])
+        border = 3 + local.border
         own += T @ near[np.ix_(border, border)] @ T.T
         covariance[np.ix_(outside, outside)] = (own + own.T) / 2
         cross = -T @ near[np.ix_(border, here)]
@@ -308,24 +246,10 @@ def marginal(
     return Marginal(mean, covariance)
 
 
-def _near(
-    local: LocalInformation, whole: SchurComplement, pose: ConditionalPose
-) -> Array:
+def _near(local: LocalInformation, pose: ConditionalPose) -> Array:
     """Return the covariance of the pose and all local landmarks."""
-    exact = replace(local, eliminated=whole)
     rows = np.vstack([pose.gain, np.eye(len(local.points))])
-    root = solve_triangular(exact.solver()[0], rows.T, lower=True, check_finite=False)
+    root = solve_triangular(local.solver()[0], rows.T, lower=True, check_finite=False)
     covariance = root.T @ root
     covariance[:3, :3] += pose.covariance
     return np.asarray(covariance)
-
-
-def means(map_: SparseMap, local: LocalInformation) -> Array:
-    """Return the positions of all landmarks by slot, flat [m]."""
-    points = map_.points.copy()
-    shift = local.shift
-    if shift.any():
-        eliminated = local.eliminated
-        points[pairs(eliminated.slots)] -= eliminated.factor.respond(shift)
-    points[pairs(local.slots)] = local.points
-    return points

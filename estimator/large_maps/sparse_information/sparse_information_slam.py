@@ -7,6 +7,7 @@ its belief to a saved state and back.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import inf
 from typing import Any
 
@@ -22,11 +23,10 @@ from ...support import argument_checks, saved_states
 from ...support.argument_checks import LandmarkIds
 from ...support.saved_states import with_prefix, without_prefix
 from ...support.undo import Undo, attributes, undo_all
-from ..elimination import RestFactor
-from ..multifrontal import PLACES, ROWS, Factor, SchurComplement, SubsetFactor
+from ..multifrontal import PLACES, ROWS
 from . import local_information
 from .local_information import link_count
-from .scan_update import ESTIMATE, ScanResult, ScanRules, Sparsity, process_scan
+from .scan_update import ESTIMATE, ScanRules, Sparsity, process_scan
 from .sparse_belief import SparseBelief
 
 
@@ -46,7 +46,7 @@ class SparseInformationSlam:
     As long as the map holds no more landmarks than ``active_bound``, and at most 50,
     no link is ever cut: the filter is then the EKF, and stores its dense covariance.
     Later, means and covariances near the robot follow from a small dense matrix, from
-    which the surrounding landmarks have been eliminated.  This matrix is valid until
+    which all other landmarks have been eliminated.  This matrix is valid until
     the robot leaves its local map.  The elimination then repeats only the branches of
     the map that the robot left or entered.
 
@@ -66,11 +66,6 @@ gate_probability, noise_at_rest, min_range
     sparsify : {"relocate", "prune"}
         "prune" cuts the weakest links between pose and landmarks instead, as the SEIF
         does [2]_.  This makes the filter overconfident; it is meant for comparisons.
-    tolerance : float
-        Corrections of distant landmarks are deferred while they are smaller than this
-        fraction of the landmark's standard deviation given its neighbours.  No
-        correction is lost.  With 0 every mean is exact, and the filter eliminates the
-        whole map whenever the robot leaves its local map.
     belief_limit : int
         Largest number of landmarks for which ``belief`` computes a dense covariance.
 
@@ -109,7 +104,6 @@ gate_probability, noise_at_rest, min_range
         base: str = "ekf",
         active_bound: int | None = 20,
         sparsify: str = "relocate",
-        tolerance: float = 1e-3,
         belief_limit: int = 5000,
         **settings: Any,
     ) -> None:
@@ -120,7 +114,6 @@ gate_probability, noise_at_rest, min_range
         kind = argument_checks.one_of("sparsify", sparsify, ("relocate", "prune"))
         self._sparsity = Sparsity(bound, kind == "prune")
         self._largest_dense = min(bound, local_information.SMALLEST_LOCAL_MAP)
-        self._tolerance = argument_checks.at_least("tolerance", tolerance, 0.0)
         self.belief_limit = argument_checks.whole("belief_limit", belief_limit, 1)
         self.reset(initial_pose, initial_pose_std)
 
@@ -171,11 +164,15 @@ gate_probability, noise_at_rest, min_range
             vars(belief).update(report=UpdateReport(), steps=belief.steps + 1)
         else:
             with belief.undone_on_error():
-                belief.choose_local_map(ids, exact=self._is_exact)
-                result = self._process(belief, readings, ids)
-                while result.largest_residual > self._tolerance:
-                    belief.enlarge_elimination()
-                    result = self._process(belief, readings, ids)
+                belief.choose_local_map(ids)
+                result = process_scan(
+                    (belief.local, belief.pose),
+                    self._scan_rules,
+                    self._sparsity,
+                    (readings, ids),
+                    belief.slots,
+                    belief.free_slots(len(ids)),
+                )
                 belief.add(result.report.added_ids, result.added_slots)
                 belief.pose, belief.local = result.pose, result.local
                 belief.report = result.report
@@ -218,10 +215,8 @@ gate_probability, noise_at_rest, min_range
             If one is not in the map; no landmark is then removed.
         """
         ids = argument_checks.mapped_identities(landmark_ids, self._slots)
-        if isinstance(self._held, EkfSlam):
+        if ids:
             self._held.remove(ids)
-        elif ids:
-            self._held.remove(ids, exact=self._is_exact)
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two landmarks being the same, and remove the second.
@@ -238,7 +233,7 @@ gate_probability, noise_at_rest, min_range
         """
         argument_checks.two_landmarks(kept, gone, self._slots)
         belief = self._belief
-        belief.merge(kept, gone, exact=self._is_exact)
+        belief.merge(kept, gone)
         self._held = belief
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
@@ -248,9 +243,8 @@ gate_probability, noise_at_rest, min_range
         ----------
         landmark_ids : sequence of int, optional
             Return the marginal of the pose and these landmarks, in this order.
-            ``belief([])`` is that of the pose.  The first call after a change of the
-            local map factorises the rest of the map.  Later calls are cheap if they
-            ask for landmarks near the robot.
+            ``belief([])`` is that of the pose.  The cost is low for landmarks near the
+            robot.
 
         Raises
         ------
@@ -353,34 +347,9 @@ gate_probability, noise_at_rest, min_range
         held = self._held
         return held.report() if isinstance(held, EkfSlam) else held.report
 
-    @property
-    def _is_exact(self) -> bool:
-        """Whether every correction must reach the whole map at once."""
-        return not self._tolerance
-
-    def _process(
-        self, belief: SparseBelief, readings: Array, ids: list[int]
-    ) -> ScanResult:
-        return process_scan(
-            (belief.local, belief.pose),
-            self._scan_rules,
-            self._sparsity,
-            (readings, ids),
-            belief.slots,
-            belief.free_slots(len(ids)),
-        )
-
 
 # --------------------------------------------------------------------------------------
 # Conversion of a sparse belief to arrays, and checks of such arrays.
-
-
-def _reach(name: str, value: Any, _: tuple[int, ...]) -> float:
-    """Return a number > 0, which may be infinite."""
-    reach = argument_checks.as_floats(f"state[{name!r}]", value)
-    if reach.shape != (1,) or not reach[0] > 0:
-        raise ValueError(f"state[{name!r}] must be a number > 0, got {value!r}")
-    return float(reach[0])
 
 
 NUMBERS, COUNTS = saved_states.NUMBERS, saved_states.COUNTS
@@ -391,25 +360,13 @@ STATE: saved_states.Table = {
     "nodes": (COUNTS, "m"),
     "parted": (COUNTS,),
     "origin": (NUMBERS, 2),
-    "reach": (saved_states.Kind(np.float64, _reach),),
-    "widened": (saved_states.FLAG,),
     "points": (NUMBERS, "2m"),
     "first": (NUMBERS, "2m"),
-    "residual": (NUMBERS, "2m"),
     **with_prefix("matrix", ROWS, "_"),
     "local_slots": (PLACES, "k"),
     "local_points": (NUMBERS, "2k"),
     "local_first": (NUMBERS, "2k"),
     "local_information": (NUMBERS, "2k", "2k"),
-    "local_start": (NUMBERS, "c"),
-    "around_slots": (PLACES, -1),
-    "around_border": (PLACES, "c"),
-    "around_response": (NUMBERS, -1, "c"),
-    "around_complement": (NUMBERS, "c", "c"),
-    "outer_slots": (PLACES, "o"),
-    "outer_response": (NUMBERS, "2o", "c"),
-    "outer_residual": (NUMBERS, "2o"),
-    "outer_scale": (NUMBERS, "o", 2, 2),
     "pose_mean": (NUMBERS, 3),
     "pose_gain": (NUMBERS, 3, "2k"),
     "pose_covariance": (NUMBERS, 3, 3),
@@ -422,12 +379,7 @@ def as_arrays(belief: SparseBelief, name: str, base: str) -> dict[str, Any]:
     map_, local = belief.map_, belief.local
     dissection, size = map_.elimination.dissection, 2 * len(map_.information)
     dissection.grow(len(map_.information))
-    parts = {
-        "local": local,
-        "around": local.eliminated,
-        "outer": local.fixed,
-        "pose": belief.pose,
-    }
+    parts = {"local": local, "pose": belief.pose}
     found = {
         "landmark_ids": list(belief.slots),
         "slots": list(belief.slots.values()),
@@ -435,11 +387,8 @@ def as_arrays(belief: SparseBelief, name: str, base: str) -> dict[str, Any]:
         "nodes": dissection.nodes,
         "parted": dissection.dissected,
         "origin": belief.origin,
-        "reach": belief.count,
-        "widened": belief.enlarged,
         "points": map_.points[:size],
         "first": map_.first[:size],
-        "residual": map_.residual[:size],
         **with_prefix("matrix", map_.information.state_dict(), "_"),
     }
     for key in STATE.keys() - found.keys():
@@ -460,62 +409,38 @@ def checked_state(state: Mapping[str, Any], name: str, base: str) -> SparseBelie
     table = dict(sorted(STATE.items(), key=lambda item: item[1][0].dtype is np.float64))
     # Whole numbers are read first, because the shapes of the others follow from them.
     saved = saved_states.read(state, table, of={"estimator": name, "base": base})
-    matrix, local, around, outer, pose = (
-        without_prefix(saved, part, "_")
-        for part in ("matrix", "local", "around", "outer", "pose")
+    matrix, local, pose = (
+        without_prefix(saved, part, "_") for part in ("matrix", "local", "pose")
     )
     map_ = local_information.SparseMap()
     map_.information.load_state_dict(matrix)
-    count = len(map_.information)
+    count, places = len(map_.information), local["slots"]
     slots, free = _slots(saved, count)
     map_.points, map_.first = saved["points"], saved["first"]
-    map_.residual = saved["residual"]
-    rows, wanted = len(around["response"]), 2 * len(around["slots"])
-    if rows not in (0, wanted):
+    if len(places) and not 0 <= places.min() <= places.max() < count:
         raise ValueError(
-            f"state['around_response'] must have 0 or {wanted} rows, got {rows}"
+            f"state['local_slots'] must lie in [0, {count}), got {places.min()} to "
+            f"{places.max()}"
         )
-    for key, end in (
-        ("local_slots", count),
-        ("around_slots", count),
-        ("outer_slots", count),
-        ("around_border", 2 * len(local["slots"])),
-    ):
-        places = saved[key]
-        if len(places) and not 0 <= places.min() <= places.max() < end:
-            raise ValueError(
-                f"state[{key!r}] must lie in [0, {end}), got {places.min()} to "
-                f"{places.max()}"
-            )
-    _load_order(saved, map_, local["slots"])
-    belief = SparseBelief(
-        slots,
-        free,
-        map_,
-        local_information.LocalInformation(
-            **local,
-            eliminated=_eliminated(map_, local["slots"], around),
-            fixed=local_information.FixedLandmarks(**outer),
-        ),
-        local_information.ConditionalPose(**pose),
-        saved["origin"],
-        saved["reach"],
-        saved["widened"],
-    )
-    _check_definite(belief)
-    return belief
-
-
-def _check_definite(belief: SparseBelief) -> None:
-    """Raise a ValueError where pose or map have no positive definite covariance."""
-    saved_states.refuse_indefinite("state['pose_covariance']", belief.pose.covariance)
+    _load_order(saved, map_, places)
+    saved_states.refuse_indefinite("state['pose_covariance']", pose["covariance"])
     try:
-        pose = belief.marginal([]).covariance
+        chosen = local_information.LocalInformation.of(map_, places)
+        belief = SparseBelief(
+            slots,
+            free,
+            map_,
+            replace(chosen, **local),
+            local_information.ConditionalPose(**pose),
+            saved["origin"],
+        )
+        covariance = belief.marginal([]).covariance
     except np.linalg.LinAlgError:
         raise ValueError(
             "state['matrix_blocks'] must be a positive definite information matrix"
         ) from None
-    saved_states.refuse_indefinite("the covariance of the pose of state", pose)
+    saved_states.refuse_indefinite("the covariance of the pose of state", covariance)
+    return belief
 
 
 def _slots(saved: Mapping[str, Any], count: int) -> tuple[dict[int, int], list[int]]:
@@ -527,17 +452,6 @@ def _slots(saved: Mapping[str, Any], count: int) -> tuple[dict[int, int], list[i
             f"matrix among {len(ids)} landmarks, got {len(slots)} and {len(free)}"
         )
     return dict(zip(ids, slots, strict=True)), free
-
-
-def _eliminated(
-    map_: local_information.SparseMap, local: IntArray, around: dict[str, Any]
-) -> SchurComplement:
-    """Return the saved complement; its factor is made when it is first used."""
-    slots, response = around["slots"], around["response"]
-    factor: Factor = SubsetFactor(map_.information, slots, response)
-    if len(slots) and not len(response):
-        factor = RestFactor(map_.elimination, map_.information, local)
-    return SchurComplement(**around, factor=factor)
 
 
 def _load_order(
