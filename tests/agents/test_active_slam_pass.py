@@ -51,9 +51,8 @@ def play(level, settings, steps, worlds=16):
 def same_observations(observations, expected):
     assert set(observations) == set(expected)
     for key, rows in expected.items():
-        np.testing.assert_allclose(
-            observations[key], rows, rtol=0, atol=1e-12, err_msg=key
-        )
+        found = observations[key]
+        np.testing.assert_allclose(found, rows, rtol=0, atol=1e-12, err_msg=key)
 
 
 def begun_anew(now, fresh, ended):
@@ -76,11 +75,8 @@ def test_rewards_ends_and_observations_are_those_of_the_slow_definition(
 def test_ends_of_every_kind_are_those_of_the_slow_definition():
     kinds = play("active_easy", NEAR, steps=800)
     kinds |= play("active_easy", {"steps": 30}, steps=1600)
-    success, crash, timeout = (
-        (True, False, True),
-        (True, False, False),
-        (False, True, False),
-    )
+    success, crash = (True, False, True), (True, False, False)
+    timeout = (False, True, False)
     assert kinds >= {success, crash, timeout}
 
 

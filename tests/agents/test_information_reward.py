@@ -183,16 +183,6 @@ def test_what_the_uncertainty_of_many_worlds_falls_by_is_the_reward_of_each():
     assert max(rewards) > 0
 
 
-def test_an_unknown_criterion_is_refused():
-    with pytest.raises(ValueError, match="criterion must be one of D, A, E, got 'T'"):
-        wrapped("T")
-
-
-def test_a_world_without_beliefs_is_refused():
-    with pytest.raises(ValueError, match="env must have a BeliefObservation"):
-        InformationReward(gym.make(ID))
-
-
 def test_the_wrapper_survives_a_spec_written_as_json():
     env = wrapped("A", collision_cost=2.0)
     rebuilt = gym.make(EnvSpec.from_json(env.spec.to_json()))
@@ -203,18 +193,17 @@ def test_the_wrapper_survives_a_spec_written_as_json():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [
-        ("prior_std", 0),
-        ("prior_std", np.nan),
-        ("collision_cost", -1),
-        ("effort_cost", np.nan),
-        ("gain", np.inf),
-    ],
-)
+    [("prior_std", 0), ("prior_std", np.nan), ("collision_cost", -1),
+     ("effort_cost", np.nan), ("gain", np.inf)],
+)  # fmt: skip
 def test_nonsense_is_refused(name, value):
-    env = BeliefObservation(gym.make("slamgym/LandmarkWorld-v0"), "ekf")
+    env = BeliefObservation(gym.make(ID), "ekf")
     with pytest.raises(ValueError, match=f"{name} must be finite"):
         InformationReward(env, **{name: value})
+    with pytest.raises(ValueError, match="criterion must be one of D, A, E, got 'T'"):
+        wrapped("T")
+    with pytest.raises(ValueError, match="env must have a BeliefObservation"):
+        InformationReward(gym.make(ID))
 
 
 def test_the_gain_adds_up_where_the_filter_associates():

@@ -101,9 +101,8 @@ def test_the_main_job_writes_what_the_documents_promise(first_run):
     section = START.split("## What a run writes")[1].split("\n## ")[0]
     table = [line for line in section.splitlines() if line.startswith("| `")]
     promised = {name for line in table for name in re.findall(r"`([^`]+)`", line)}
-    assert promised == {
-        entry.name + "/" * entry.is_dir() for entry in first_run.iterdir()
-    }
+    found = {entry.name + "/" * entry.is_dir() for entry in first_run.iterdir()}
+    assert promised == found
 
 
 def known_commands():
@@ -240,11 +239,9 @@ def test_the_remaining_tests_are_those_that_have_not_passed(workers, tmp_path):
 def test_contributing_lists_the_checks_of_ci():
     ci = (ROOT / ".ci" / "run").read_text().splitlines()
     checks = next(blocks((ROOT / "CONTRIBUTING.md").read_text(), "bash"))[0]
-    assert checks.splitlines() == [
-        line
-        for line in ci
-        if line in {"ruff check", "ruff format --check", "codespell", "mypy"}
-    ] + ["pytest -n auto"]
+    named = {"ruff check", "ruff format --check", "codespell", "mypy"}
+    shown = [line for line in ci if line in named]
+    assert checks.splitlines() == [*shown, "pytest -n auto"]
 
 
 def test_version_licence_and_python_agree_everywhere():

@@ -3,6 +3,7 @@
 import importlib
 import re
 import sys
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -42,9 +43,8 @@ def test_another_autoreset_mode_is_refused():
 def dummy(count=3, **changes):
     from stable_baselines3.common.vec_env import DummyVecEnv
 
-    return DummyVecEnv(
-        [lambda: gym.make(ID, disable_env_checker=True, **changes)] * count
-    )
+    make = partial(gym.make, ID, disable_env_checker=True, **changes)
+    return DummyVecEnv([make] * count)
 
 
 @pytest.mark.slow

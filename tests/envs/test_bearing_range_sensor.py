@@ -59,15 +59,12 @@ def scan(scenario, landmarks, pose, noise):
 def true_readings(landmarks, pose):
     """Bearing and range by trigonometry, landmark by landmark."""
     x, y, theta = pose
-    return np.array(
-        [
-            (
-                math.remainder(math.atan2(to.imag - y, to.real - x) - theta, math.tau),
-                math.hypot(to.real - x, to.imag - y),
-            )
-            for to in landmarks.tolist()
-        ]
-    ).T
+    rows = []
+    for to in landmarks.tolist():
+        dx, dy = to.real - x, to.imag - y
+        bearing = math.remainder(math.atan2(dy, dx) - theta, math.tau)
+        rows.append((bearing, math.hypot(dx, dy)))
+    return np.transpose(rows)
 
 
 def angle_gap(a, b):
@@ -245,13 +242,10 @@ def test_occlusion_is_the_exact_crossing_of_segments():
         walls = rng.integers(-6, 7, (5, 4)).tolist()
         walls = [wall for wall in walls if wall[:2] != wall[2:]]
         grid, robot = rng.integers(-8, 9, (COUNT, 2)), rng.integers(-8, 9, 2).tolist()
-        blocked = LineOfSight(walls).blocked(
-            grid[:, 0] + 1j * grid[:, 1], np.array(complex(*robot))
-        )
-        expected = [
-            any(crosses(robot, to, wall) for wall in walls) for to in grid.tolist()
-        ]
-        assert blocked.tolist() == expected
+        places, eye = grid @ np.array([1, 1j]), np.array(complex(*robot))
+        blocked = LineOfSight(walls).blocked(places, eye)
+        for to, found in zip(grid.tolist(), blocked, strict=True):
+            assert found == any(crosses(robot, to, wall) for wall in walls)
         hidden += blocked.sum()
     assert hidden > 1000
 

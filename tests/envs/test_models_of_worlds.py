@@ -18,15 +18,11 @@ from slamgym.sim_configs import ScenarioError, load_scenario
 LOOP = load_scenario("loop").with_changes(
     motion={"noise_in": "motion", "std": (0.02, 0.01, 0.02)}
 )
+CAR = {"wheelbase": 0.4, "max_steering": 0.6, "reference": (0.3, 0.1)}
 ROBOTS = {
     "unicycle": {},
     "differential": {"drive": "differential", "track_width": 0.4},
-    "bicycle": {
-        "drive": "bicycle",
-        "wheelbase": 0.4,
-        "max_steering": 0.6,
-        "reference": (0.3, 0.1),
-    },
+    "bicycle": {"drive": "bicycle", **CAR},
 }
 STDS = {
     "bearing_range": (0.03, 0.1),
@@ -66,12 +62,10 @@ def test_a_world_alone_equals_one_among_many_and_its_space_holds_it(drive, kind)
         for k, env in enumerate(envs):
             observation, _, _, _, info = env.step(each[k])
             assert env.observation_space.contains(observation)
-            np.testing.assert_array_equal(
-                observation["landmarks"], worlds.measurements[k]
-            )
-            np.testing.assert_array_equal(observation["mask"], worlds.mask[k])
-            np.testing.assert_array_equal(observation["odometry"], worlds.odometry[k])
-            np.testing.assert_array_equal(info["pose"], worlds.poses[k])
+            found = observation | {"poses": info["pose"]}
+            found["measurements"] = found.pop("landmarks")
+            for name, value in found.items():
+                np.testing.assert_array_equal(value, getattr(worlds, name)[k])
 
 
 @pytest.mark.parametrize("drive", ["differential", "bicycle"])
@@ -153,45 +147,30 @@ def test_faults_of_the_odometry_pass_through_the_drive():
     assert (right - left) / 0.4 == pytest.approx(0.22)
 
 
+ENCODERS = {"noise_in": "odometry", "std": (0.1, 0, 0.1)}
+SQUARE = {"sequence": "square", "side": 4.0, "speed": 1.0, "turn_steps": 3}
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"robot": {"drive": "differential"}}, "robot.track_width must be given"),
         ({"robot": {"wheelbase": 0.4}}, "robot.wheelbase must not be given"),
         ({"robot": ROBOTS["bicycle"], "walls": WALLS}, "walls must be empty"),
-        (
-            {
-                "robot": ROBOTS["differential"],
-                "motion": {"noise_in": "odometry", "std": (0.1, 0, 0.1)},
-            },
-            "motion.noise_in must be 'motion'",
-        ),
-        (
-            {
-                "robot": ROBOTS["bicycle"],
-                "controls": {
-                    "sequence": "square",
-                    "side": 4.0,
-                    "speed": 1.0,
-                    "turn_steps": 3,
-                },
-            },
-            "controls must turn by at most",
-        ),
+        ({"robot": ROBOTS["differential"], "motion": ENCODERS},
+         "motion.noise_in must be 'motion'"),
+        ({"robot": ROBOTS["bicycle"], "controls": SQUARE},
+         "controls must turn by at most"),
         ({"sensor": {"kind": "sonar"}}, "or 'module:SENSOR', got 'sonar'"),
         ({"sensor": {"kind": "sonar:SONAR"}}, "sensor.std must be given"),
         ({"sensor": {"kind": "bearing"}}, r"sensor.std must be \(σ, 0\)"),
         ({"sensor": {"kind": "position", "identities": False}}, "identities must be"),
-        (
-            {"sensor": {"kind": "position", "range_std_per_metre": 0.1}},
-            "range_std_per_metre must be 0",
-        ),
-        (
-            {"sensor": {"kind": "position"}, "faults": {"range_bias": 0.1}},
-            "faults.range_bias must be 0",
-        ),
+        ({"sensor": {"kind": "position", "range_std_per_metre": 0.1}},
+         "range_std_per_metre must be 0"),
+        ({"sensor": {"kind": "position"}, "faults": {"range_bias": 0.1}},
+         "faults.range_bias must be 0"),
     ],
-)
+)  # fmt: skip
 def test_what_a_model_does_not_have_is_refused(changes, message):
     with pytest.raises(ScenarioError, match=message):
         LOOP.with_changes(**changes)
@@ -248,12 +227,8 @@ def test_a_world_simulates_a_sensor_of_the_user(tmp_path, monkeypatch):
         for sensor in ({"kind": "bearing_range", "std": (0.02, 0.15)}, own)
     )
     world = load_scenario("six_landmarks").with_changes(sensor=own)
-    slam = make_estimator(
-        "invariant",
-        motion_std=world.motion.std,
-        measurement_std=world.sensor.std,
-        **world.models,
-    )
+    noise = {"motion_std": world.motion.std, "measurement_std": world.sensor.std}
+    slam = make_estimator("invariant", **noise, **world.models)
     assert slam.sensor is find_sensor("sonar:ECHO")
     first, second = plain.reset(seed=3)[0], echoes.reset(seed=3)[0]
     for _ in range(20):

@@ -35,25 +35,17 @@ FAULTS = {
     "sensor_dof": 4.5,
 }
 RANGES = {
-    "motion_std": [0.2, 5.0],
-    "measurement_std": [0.2, 5.0],
-    "start_std": [0.5, 2.0],
-    "dropout": [0.0, 0.6],
-    "clutter": [0.0, 3.0],
-    "max_range": [3.0, 9.0],
-    "field_of_view": [1.0, 6.0],
-    "start_x": [-2.0, 2.0],
-    "start_y": [-1.0, 1.0],
-    "start_heading": [-3.0, 3.0],
-    "map_scale": [0.5, 1.5],
+    **{"motion_std": [0.2, 5.0], "measurement_std": [0.2, 5.0]},
+    **{"dropout": [0.0, 0.6], "clutter": [0.0, 3.0]},
+    **{"max_range": [3.0, 9.0], "field_of_view": [1.0, 6.0]},
+    **{"start_x": [-2.0, 2.0], "start_y": [-1.0, 1.0], "start_heading": [-3.0, 3.0]},
+    **{"start_std": [0.5, 2.0], "map_scale": [0.5, 1.5]},
 }
 SHIFTED = {"layout": "points", "points": [[1.0, 2.0], [-4.0, 3.0], [5.0, -1.0]]}
 VARIANTS = {
     "drawn anew": {
-        "randomise": RANGES,
-        "walls": WALLS,
         "sensor": {**HALF_BLIND, **HIDDEN, "range_std_per_metre": 0.1},
-        "start": {"std": [0.1, 0.1, 0.1]},
+        **{"randomise": RANGES, "walls": WALLS, "start": {"std": [0.1, 0.1, 0.1]}},
     },
     "drawn anew, by id": {
         "randomise": {**RANGES, "clutter": None},
@@ -82,16 +74,8 @@ SCENARIOS = {name: load_scenario(name) for name in (*KINDS, "city")} | {
     name: ROAMING.with_changes(**changes) for name, changes in VARIANTS.items()
 }
 
-NAMES = (
-    "measurements",
-    "mask",
-    "odometry",
-    "poses",
-    "collisions",
-    "landmark_ids",
-    "landmarks",
-    "start_estimates",
-)
+NAMES = ("measurements", "mask", "odometry", "poses", "collisions", "landmark_ids")
+NAMES += ("landmarks", "start_estimates")
 
 
 def generators(count=WORLDS, seed=SEED):
@@ -129,17 +113,13 @@ def of_single(env, observation, info):
     }
 
 
-def of_batch(batch, world):
-    names = [name for name in NAMES if getattr(batch, name) is not None]
-    values = {name: getattr(batch, name)[world] for name in names}
-    return {"landmark_ids": None, **values}
-
-
 def assert_equal_worlds(batch, singles):
     for world, moment in enumerate(singles):
-        of_this = of_batch(batch, world)
         for name, value in of_single(*moment).items():
-            assert bits(value) == bits(of_this[name]), (name, world)
+            rows = getattr(batch, name)
+            assert (rows is None) == (value is None)
+            if rows is not None:
+                assert bits(value) == bits(rows[world]), (name, world)
 
 
 @pytest.mark.slow
@@ -215,11 +195,9 @@ def handed_out(batch):
     return [getattr(batch, name) for name in NAMES if name != "landmark_ids"]
 
 
-def pickled(batch):
-    return pickle.loads(pickle.dumps(batch))
-
-
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, pickled])
+@pytest.mark.parametrize(
+    "duplicate", [copy.deepcopy, lambda batch: pickle.loads(pickle.dumps(batch))]
+)
 def test_a_copy_goes_on_as_the_original_would(duplicate):
     batch = begun(SCENARIOS["everything"])
     rng = np.random.default_rng(0)

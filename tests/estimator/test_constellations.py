@@ -147,9 +147,27 @@ def test_a_turned_and_shifted_place_is_recognised(angle):
     assert matched(local, older, drift=30.0) == {i: 8 - i for i in range(7)}
 
 
-def test_a_mirrored_place_is_not_recognised():
-    assert matched(noisy(GROUP), GROUP) is not None
-    assert matched(noisy(GROUP * (-1.0, 1.0)), GROUP, drift=30.0) is None
+ALL = {i: i for i in range(7)}
+SIX_LEAST = Constellations(least=6, margin=1)
+FEW_NODES = Constellations(least=5, search_nodes=20)
+NOT_THE_THIRD = np.arange(7)[:, None].repeat(7, axis=1) != 2
+
+
+@pytest.mark.parametrize(
+    ("local", "changes", "expected"),
+    [
+        (GROUP, {}, ALL),
+        (GROUP * (-1.0, 1.0), {"drift": 30.0}, None),  # mirrored
+        (shifted(GROUP, 7.0), {"drift": 3.0}, ALL),
+        (shifted(GROUP, 20.0), {"drift": 3.0}, None),  # beyond the drift
+        (GROUP, {"feasible": NOT_THE_THIRD}, ALL),  # added once others are matched
+        (GROUP[:6], {"rules": SIX_LEAST}, {i: i for i in range(6)}),
+        (GROUP[:5], {"rules": SIX_LEAST}, None),  # too few
+        (GROUP, {"rules": FEW_NODES}, None),  # the search has a limit
+    ],
+)
+def test_a_group_is_recognised_within_the_rules(local, changes, expected):
+    assert matched(noisy(local), GROUP, **changes) == expected
 
 
 def test_a_place_seen_twice_before_is_not_recognised():
@@ -178,35 +196,12 @@ def test_a_regular_grid_is_not_recognised():
     assert matched(noisy(grid), grid, feasible=near) == {i: i for i in range(30)}
 
 
-def test_a_displacement_beyond_the_drift_is_refused():
-    assert matched(noisy(shifted(GROUP, 7.0)), GROUP, drift=3.0) is not None
-    assert matched(noisy(shifted(GROUP, 20.0)), GROUP, drift=3.0) is None
-
-
 def test_landmarks_without_a_partner_in_the_middle_refuse_a_match():
     rng = np.random.default_rng(1)
     others = rng.uniform(1, 8, (7, 2))
     assert matched(noisy(GROUP), np.concatenate([GROUP, others])) is None
     far = np.concatenate([GROUP, shifted(others, 30.0)])
     assert matched(noisy(GROUP), far) is not None
-
-
-def test_a_pair_that_is_not_feasible_is_not_matched():
-    feasible = np.full((7, 7), True)
-    feasible[2] = False
-    found = matched(noisy(GROUP), GROUP, feasible=feasible)
-    assert found == {i: i for i in range(7)}  # added once the others are matched
-
-
-def test_too_few_landmarks_are_no_constellation():
-    rules = Constellations(least=6, margin=1)
-    assert matched(noisy(GROUP[:6]), GROUP, rules) == {i: i for i in range(6)}
-    assert matched(noisy(GROUP[:5]), GROUP, rules) is None
-
-
-def test_a_search_beyond_its_limit_recognises_nothing():
-    rules = Constellations(least=5, search_nodes=20)
-    assert matched(noisy(GROUP), GROUP, rules) is None
 
 
 def test_the_order_of_the_landmarks_does_not_matter():

@@ -189,15 +189,14 @@ def scan_at(pose):
     return np.column_stack([np.arctan2(dy, dx) - pose[2], np.hypot(dx, dy)])
 
 
+def of_a_circle(association):
+    noise = {"motion_std": (0.01, 0.0, 0.01), "measurement_std": (0.02, 0.05)}
+    return make_estimator("invariant", **noise, management={"association": association})
+
+
 def circling(association, kidnapped_at=None, steps=50):
     """Follow a robot on a circle; from one step on, its odometry misses 1.5 m."""
-    slam = make_estimator(
-        "invariant",
-        motion_std=(0.01, 0.0, 0.01),
-        measurement_std=(0.02, 0.05),
-        management={"association": association},
-    )
-    pose = np.zeros(3)
+    slam, pose = of_a_circle(association), np.zeros(3)
     for step in range(steps):
         if step == kidnapped_at:
             pose += np.array([1.5, 1.5, 0.8])
@@ -212,12 +211,7 @@ def test_a_kidnapped_robot_is_probably_lost(association):
     slam = circling(association, kidnapped_at=30)
     assert slam.probably_lost
     assert slam.lost_score > LOST_SCORE
-    kept = make_estimator(
-        "invariant",
-        motion_std=(0.01, 0.0, 0.01),
-        measurement_std=(0.02, 0.05),
-        management={"association": association},
-    )
+    kept = of_a_circle(association)
     kept.load_state_dict(slam.state_dict())
     assert kept.lost_score == slam.lost_score
     assert pickle.loads(pickle.dumps(slam)).lost_score == slam.lost_score

@@ -135,15 +135,21 @@ def test_squared_mahalanobis_distance_of_true_deviates_averages_two():
     assert np.mean(distances.mahalanobis**2) == pytest.approx(2, abs=0.13)
 
 
-@pytest.mark.parametrize("P", [np.zeros((2, 2)), np.diag([1, -1]), np.ones((2, 2))])
-def test_covariance_that_is_not_positive_definite_is_refused(P):
-    with pytest.raises(ValueError, match="covariances must be positive definite"):
-        landmark_distances([[1, 2]], [P], [[0, 0]])
-
-
-def test_covariance_of_the_wrong_shape_is_refused():
-    with pytest.raises(ValueError, match=r"covariances must be shape \(2, 2, 2\)"):
-        landmark_distances(np.zeros((2, 2)), np.eye(2), np.zeros((2, 2)))
+@pytest.mark.parametrize(
+    ("estimate", "covariances", "message"),
+    [
+        ([[1, 2]], [np.zeros((2, 2))], "covariances must be positive definite"),
+        ([[1, 2]], [np.diag([1, -1])], "covariances must be positive definite"),
+        ([[1, 2]], [np.ones((2, 2))], "covariances must be positive definite"),
+        (np.zeros((2, 2)), np.eye(2), r"covariances must be shape \(2, 2, 2\)"),
+        ([[math.inf, 0]], [np.eye(2)], "landmarks must be finite"),
+    ],
+)
+def test_landmarks_and_covariances_that_cannot_be_are_refused(
+    estimate, covariances, message
+):
+    with pytest.raises(ValueError, match=message):
+        landmark_distances(estimate, covariances, np.zeros(np.shape(estimate)))
 
 
 def test_landmark_covariances_are_the_blocks_behind_the_pose():
@@ -192,17 +198,14 @@ def test_unknown_headings_stay_unknown_and_spoil_no_others():
 @pytest.mark.parametrize(
     ("estimate", "truth", "message"),
     [
-        (
-            [[1, 2, 3]],
-            [[1, 2]],
-            r"estimate must have shape \(n, 2\), n >= 1, got \(1, 3\)",
-        ),
+        ([[1, 2, 3]], [[1, 2]],
+         r"estimate must have shape \(n, 2\), n >= 1, got \(1, 3\)"),
         (np.empty((0, 2)), np.empty((0, 2)), "estimate must have shape"),
         ([[1, 2]], [[1, math.nan]], "truth must be finite"),
         ([[1, 2]], [[1, 2], [3, 4]], "equally many positions, got 1 and 2"),
         ([["a", "b"]], [[1, 2]], "estimate must be numbers"),
     ],
-)
+)  # fmt: skip
 def test_positions_that_do_not_fit_are_refused(estimate, truth, message):
     with pytest.raises(ValueError, match=message):
         position_accuracy(estimate, truth)
@@ -212,11 +215,6 @@ def test_positions_that_do_not_fit_are_refused(estimate, truth, message):
 def test_a_true_path_must_have_a_time_and_a_pose_in_each_row(path):
     with pytest.raises(ValueError, match=r"ground_truth must be shape \(n, 4\), got"):
         poses_at([0.5], path)
-
-
-def test_error_speaks_of_landmarks_where_the_caller_does():
-    with pytest.raises(ValueError, match="landmarks must be finite"):
-        landmark_distances([[math.inf, 0]], [np.eye(2)], [[0, 0]])
 
 
 def test_an_ellipse_of_three_deviations_has_the_area_of_its_axes():

@@ -31,11 +31,8 @@ def beliefs_by_hand(drive, slam, ids_of):
 
 
 def noise(scenario):
-    return {
-        "motion_std": scenario.motion.std,
-        "measurement_std": scenario.sensor.std,
-        "initial_pose_std": scenario.start.std,
-    }
+    noise = {"motion_std": scenario.motion.std, "measurement_std": scenario.sensor.std}
+    return noise | {"initial_pose_std": scenario.start.std}
 
 
 def test_row_i_is_what_a_filter_driven_by_hand_believes_of_landmark_i():
@@ -45,20 +42,15 @@ def test_row_i_is_what_a_filter_driven_by_hand_believes_of_landmark_i():
     for step, belief in enumerate(beliefs_by_hand(drive, slam, np.flatnonzero)):
         ids = list(belief.landmark_ids)
         empty = np.setdiff1d(np.arange(len(drive.landmarks)), ids)
-        np.testing.assert_array_equal(found.belief_poses[step], belief.pose)
-        np.testing.assert_array_equal(
-            found.belief_pose_covariances[step], belief.covariance[:3, :3]
-        )
-        np.testing.assert_array_equal(
-            found.belief_landmarks[step, ids], belief.landmarks
-        )
+        P, blocks = belief.covariance, found.belief_landmark_covariances[step]
+        same = np.testing.assert_array_equal
+        same(found.belief_poses[step], belief.pose)
+        same(found.belief_pose_covariances[step], P[:3, :3])
+        same(found.belief_landmarks[step, ids], belief.landmarks)
         for place, row in enumerate(ids):
             block = slice(3 + 2 * place, 5 + 2 * place)
-            np.testing.assert_array_equal(
-                found.belief_landmark_covariances[step, row],
-                belief.covariance[block, block],
-            )
-        np.testing.assert_array_equal(found.belief_landmark_ids[step, ids], ids)
+            same(blocks[row], P[block, block])
+        same(found.belief_landmark_ids[step, ids], ids)
         assert (found.belief_landmark_ids[step, empty] == -1).all()
         assert not found.belief_landmarks[step, empty].any()
     assert 0 < len(ids) < len(drive.landmarks)

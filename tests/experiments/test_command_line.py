@@ -878,6 +878,7 @@ def test_an_error_without_text_has_a_message():
     assert program.message_of(MemoryError()) == "there is not enough memory"
 
 
+@pytest.mark.slow
 def test_a_run_whose_association_failed_names_the_command_that_repairs_it(
     here, without_pictures
 ):

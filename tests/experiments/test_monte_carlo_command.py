@@ -74,11 +74,9 @@ def test_a_world_without_identities_is_scored_by_places(here):
     estimator = 'ekf[management={association="joint"}]'
     result = slamgym("monte-carlo", *world, "-e", estimator, "--out", "out")
     assert result.exit_code == 0, result.stderr
-    rows = [line.split() for line in result.stdout.splitlines()]
-    assert ["bad", "runs", "of", "2", "0", "0"] in rows
-    assert rows[
-        next(k for k, row in enumerate(rows) if row[:2] == ["landmarks", "in"])
-    ][:5] == ["landmarks", "in", "the", "map", "1.00"]
+    rows = [" ".join(line.split()) for line in result.stdout.splitlines()]
+    assert "bad runs of 2 0 0" in rows
+    assert any(row.startswith("landmarks in the map 1.00") for row in rows)
     summary = json.loads((here / "out" / "summary.json").read_text())
     (entry,) = summary["estimators"].values()
     assert entry["association"]["resolution"] == summary["resolution"] == 100.0

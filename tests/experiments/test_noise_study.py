@@ -82,15 +82,13 @@ def test_a_filter_that_trusts_its_range_less_ends_with_larger_ellipses(of_log):
 
 def test_areas_are_those_of_the_final_3_sigma_ellipses(of_log):
     reference = of_log[0]
-    covariances = reference.trace.landmark_covariances
-    areas = [
-        math.pi * math.prod(3 * np.sqrt(np.linalg.eigvalsh(P))) for P in covariances
-    ]
-    assert reference.row.landmark_area == pytest.approx(np.mean(areas))
-    P = reference.trace.pose_covariances[-1, :2, :2]
-    assert reference.row.pose_area == pytest.approx(
+    trace, row = reference.trace, reference.row
+    *areas, of_pose = (
         math.pi * math.prod(3 * np.sqrt(np.linalg.eigvalsh(P)))
+        for P in (*trace.landmark_covariances, trace.pose_covariances[-1, :2, :2])
     )
+    assert row.landmark_area == pytest.approx(np.mean(areas))
+    assert row.pose_area == pytest.approx(of_pose)
 
 
 def scans(log):
@@ -133,12 +131,8 @@ def test_progress_is_told_after_every_run(log):
 
 
 def test_without_truth_the_errors_are_unknown(log):
-    blind = replace(
-        log,
-        ground_truth=np.empty((0, 4)),
-        landmark_ids=np.empty(0),
-        landmarks=np.empty((0, 2)),
-    )
+    nothing = {"landmark_ids": np.empty(0), "landmarks": np.empty((0, 2))}
+    blind = replace(log, ground_truth=np.empty((0, 4)), **nothing)
     row = study_log(blind, settings_for(blind))[0].row
     assert (row.landmark_rmse, row.ate, row.nees_per_degree) == (None, None, None)
     assert row.landmark_area > 0

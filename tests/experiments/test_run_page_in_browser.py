@@ -24,13 +24,9 @@ def written_page(path, preset="loop", filters=("ekf", "invariant"), **options):
     log, runs = record_episode(world, controller, 0), []
     for name in filters:
         frames = RunFrames(log)
-        slam = make_estimator(
-            "invariant" if name == HOSTILE else name,
-            motion_std=world.motion.std,
-            measurement_std=world.sensor.std,
-            initial_pose=log.start,
-            **options,
-        )
+        label = "invariant" if name == HOSTILE else name
+        noise = {"motion_std": world.motion.std, "measurement_std": world.sensor.std}
+        slam = make_estimator(label, **noise, initial_pose=log.start, **options)
         trace = replay(log, slam, name=name, watch=frames.watch).trace
         runs.append(ViewedRun(trace, frames))
     write_run_page(path, log, runs, walls=world.walls)
@@ -116,13 +112,8 @@ def test_play_runs_to_the_end_and_pause_stops(page):
 
 
 def test_keys_step_jump_and_play(page):
-    for key, expected in (
-        ("ArrowRight", 1),
-        ("End", 120),
-        ("ArrowLeft", 119),
-        ("Home", 0),
-        ("ArrowLeft", 0),
-    ):
+    keys = {"ArrowRight": 1, "End": 120, "ArrowLeft": 119, "Home": 0}
+    for key, expected in (*keys.items(), ("ArrowLeft", 0)):
         page.press(key)
         assert step_of(page) == expected
     page.press(" ", text=" ")
