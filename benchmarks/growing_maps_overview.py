@@ -200,7 +200,7 @@ PANELS = (
     ("asking", "Pose and covariance", "CPU time when asked for [ms]"),
     ("megabytes", "Memory", "of the filter [MB]"),
     ("error", "Position error", "at the end of the drive [m]"),
-    ("nees", "Honesty", "pose NEES / 3; grey: 95 % of honest means"),
+    ("nees", "Pose NEES / 3", "grey: 95 % of the means of a consistent filter"),
 )
 
 

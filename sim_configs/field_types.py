@@ -39,7 +39,7 @@ class Part(BaseModel):
         if isinstance(table, dict):
             for key in table:
                 if key not in cls.model_fields:
-                    suggestion = closest(str(key), cls.model_fields)
+                    suggestion = closest(str(key), cls.model_fields, else_all=True)
                     raise PydanticCustomError(
                         "unknown_key",
                         "unknown key '{key}'{suggestion}",

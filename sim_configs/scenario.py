@@ -534,7 +534,7 @@ class Scenario(Part):
             if key not in fields:
                 raise UnknownKeywordError(
                     f"unexpected keyword argument '{key}': unknown key '{key}' in the "
-                    f"scenario{closest(key, fields)}"
+                    f"scenario{closest(key, fields, else_all=True)}"
                 )
         return self.from_table(_merge(self.model_dump(), changes))
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw
 from sphinx.util.display import status_iterator
 
 from slamgym.agents import BeliefObservation, make_baseline
@@ -51,7 +51,11 @@ def draw(scenario: Scenario, path: Path) -> None:
         options = {} if scenario.sensor.identities else {"management": True}
         env = BeliefObservation(env, "ekf", estimator_options=options)
     steps = min(scenario.steps // 2, 400)
-    _frames(env, _open_loop(env), {steps})[-1].save(path)
+    picture = _frames(env, _open_loop(env), {steps})[-1]
+    if faults := scenario.model_dump(exclude_defaults=True).get("faults"):
+        text = "\n".join(f"faults.{name} = {value}" for name, value in faults.items())
+        ImageDraw.Draw(picture).text((60, 40), text, "#b42318", font_size=20)
+    picture.save(path)
 
 
 def film(name: str, preset: str, path: Path) -> None:

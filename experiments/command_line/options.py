@@ -279,6 +279,28 @@ be 2 numbers >= 0 with commas between, got '0.2,-1'
             if getattr(self, name) is not None
         }
 
+    def noise_arguments(self) -> list[str]:
+        """Return the arguments of the noise that the user gave, for another command.
+
+        Examples
+        --------
+        >>> given = Options(range_std_per_metre=1.0, noise_at_rest=False)
+        >>> given.noise_arguments()
+        ['--range-std-per-metre=1.0', '--no-noise-at-rest']
+        """
+        names = (
+            *("motion_std", "measurement_std", "initial_pose_std"),
+            *("range_std_per_metre", "noise_at_rest"),
+        )
+        given = {name.replace("_", "-"): getattr(self, name) for name in names}
+        return [
+            f"--{'' if value else 'no-'}{name}"
+            if isinstance(value, bool)
+            else f"--{name}={value}"
+            for name, value in given.items()
+            if value is not None
+        ]
+
     def named_options(self) -> dict[str, Any]:
         """Return the options of filters that the user gave by their own names.
 

@@ -87,7 +87,7 @@ def replay(
         summary = filter_and_write(drive, filters, folder, given, reporter)
     chosen = {*stds, *given.named_options()}
     options.note_noise(drive, next(iter(filters.values())), chosen, reporter)
-    show_run(summary, place, reporter)
+    show_run(summary, place, given, reporter)
 
 
 @program.command

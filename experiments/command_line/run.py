@@ -46,7 +46,7 @@ def run(scenario: ScenarioName, *, given: Options) -> None:
         summary = filter_and_write(
             log, filters, folder, given, reporter, walls=world.walls
         )
-    show_run(summary, place, reporter)
+    show_run(summary, place, given, reporter)
     changed = [f"--set={change}" for change in given.set_ or ()]
     if given.steps is not None:
         changed.append(f"--steps={given.steps}")

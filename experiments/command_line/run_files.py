@@ -169,7 +169,9 @@ def write_figures(
     progress(count, count)
 
 
-def show_run(summary: dict[str, Any], place: Path, reporter: Reporter) -> None:
+def show_run(
+    summary: dict[str, Any], place: Path, given: options.Options, reporter: Reporter
+) -> None:
     """Print a run's landmarks, key figures and files."""
     title = tables.heading("", summary["log"], " filtered by ", summary["estimator"])
     reporter.show(
@@ -184,7 +186,8 @@ def show_run(summary: dict[str, Any], place: Path, reporter: Reporter) -> None:
         warnings = (Text(f"Warning: {text}", "yellow") for text in summary["warnings"])
         reporter.show(*warnings, "")
     if association_failed(summary):
-        repair = ["slamgym", "smooth", str(place / "log.csv"), "--associate"]
+        log = str(place / "log.csv")
+        repair = ["slamgym", "smooth", log, "--associate", *given.noise_arguments()]
         reporter.show_verbatim(f"Repair the association: {shlex.join(repair)}\n")
     reporter.show(tables.written(str(place), summary["files"]))
     reporter.finish({**summary, "out": str(place)})

@@ -19,6 +19,7 @@ _FATES = {
     "skipped": "with range ≤ 0 or too near",
     "tentative": "of unconfirmed ones",
     "ambiguous": "ambiguous",
+    "waiting": "of ones not placed yet",
 }
 _CHANGES = {name: name for name in ("confirmed", "removed", "merged")}
 _MOST_ROWS = 10  # landmarks; larger maps show the worst ones

@@ -250,6 +250,10 @@ class _SlamlogParser:
         self.ground_truth.append((t, x, y, heading))
 
 
+#: Keys of the header whose values must be numbers.
+_NOISES = {"motion_std", "measurement_std", "start_sigma", "range_std_per_metre"}
+
+
 def _parse(lines: list[LogLine], default_name: str) -> SlamLog:
     if "".join(lines[0].text.split()) != "".join(FORMAT_LINE.split()):
         raise lines[0].error(FORMAT_LINE, shown(lines[0].text))
@@ -257,6 +261,9 @@ def _parse(lines: list[LogLine], default_name: str) -> SlamLog:
     for line in lines[1:]:
         parser.take(line)
     notes = {key: _value(line) for key, line in parser.header.items()}
+    for key in _NOISES & notes.keys():
+        for number in notes[key].split(","):
+            parser.header[key].to_real(number)
     known = ("name", "motion", "start")
     return SlamLog(
         name=notes.get("name", default_name),

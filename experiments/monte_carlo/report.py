@@ -69,7 +69,7 @@ def html_report(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
         "described": "; ".join(_described(*entry) for entry in entries.items()),
         "files": _files(summary),
         "measures": measures(summary),
-        "bad_run": _bad_run(summary),
+        "bad_run": _no_bound(summary) + _bad_run(summary),
         "figures": report_figures(dataset, summary),
         "prints": [file for file in summary.get("files", ()) if "mm." in file],
         "good_runs": max(entry["good_runs"] for entry in entries.values()),
@@ -207,7 +207,7 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
             f"{summary['scenario']}: {summary['runs']} runs of {summary['steps']} "
             f"steps, seed {summary['seed']}"
         ),
-        caption=Text(f"{key}\n{note}{_bad_run(summary)}".strip()),
+        caption=Text(f"{key}\n{note}{_no_bound(summary)}{_bad_run(summary)}".strip()),
         caption_justify="left",
         pad_edge=False,
         box=None,
@@ -222,6 +222,18 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
         cells = [Text(measure.of(entry)) for entry in entries.values()]
         table.add_row(Text(measure.name), Text(measure.right), *cells)
     return table
+
+
+def _no_bound(summary: dict[str, Any]) -> str:
+    """Write why an efficiency is unknown, after a space; empty if none is."""
+    found = [entry["efficiency"] or {} for entry in summary["estimators"].values()]
+    if all(value for efficiencies in found for value in efficiencies.values()):
+        return ""
+    return (
+        " An efficiency is – where no bound is known: for a sensor whose single "
+        "reading does not place a landmark, for the poses of a smoother, and if no "
+        "run succeeded."
+    )
 
 
 def _bad_run(summary: dict[str, Any]) -> str:

@@ -149,7 +149,8 @@ def replay(
                     taking = interface.taking_poses(estimator)
                     fix = taking.observe_pose(*fix_row.arguments)
                     report = interface.with_fix(report or UpdateReport(), fix)
-                recorder.add(predicted, report)
+                seen = () if step.scan is None else _ids(step.scan) or ()
+                recorder.add(predicted, report, seen)
             watch(number, estimator, report)
             progress(number + 1, len(steps))
     hidden = ground_truth.hides_identities(log)
@@ -234,6 +235,8 @@ class ReadingCounts(NamedTuple):
     tentative: int = 0
     #: Fitted more than one landmark.
     ambiguous: int = 0
+    #: Of landmarks that were not placed in the map when they were read.
+    waiting: int = 0
 
 
 _PREDICTED, _UPDATED = 0, 1
@@ -258,8 +261,10 @@ class RunRecorder:
         #: The step of the last reading of each landmark.
         self.last_seen: dict[int, int] = {}
 
-    def add(self, predicted: Belief, report: UpdateReport | None) -> None:
-        """Record one step, after the scan at its end."""
+    def add(
+        self, predicted: Belief, report: UpdateReport | None, named: Sequence[int] = ()
+    ) -> None:
+        """Record one step, after the scan at its end, which names some landmarks."""
         step = len(self._history)
         self._put(_PREDICTED, step, predicted)
         updated = predicted
@@ -271,6 +276,9 @@ class RunRecorder:
             seen = (*report.associated_ids, *report.added_ids)
             self.last_seen |= dict.fromkeys(seen, step)
             self._keep_new(interface.mapped_ids(self._slam))
+            if waiting := set(named).difference(seen, report.rejected_ids):
+                waiting -= {*report.skipped_ids, *self._ids}
+                self.readings["waiting"] += len(waiting)
         self._put(_UPDATED, step, updated)
         is_last = step == self._steps - 1
         if is_last:

@@ -263,7 +263,7 @@ def _inline_json(value: Any) -> Markup:
 #: What became of a reading; its code is the place in this list.
 OUTCOMES = (
     *("not used", "used", "new", "rejected"),
-    *("too close", "tentative", "ambiguous"),
+    *("too close to be used", "tentative", "ambiguous"),
 )
 #: In place of the landmark of a reading that was given to none.
 NO_ID = -1

@@ -10,11 +10,12 @@ from typing import Any
 _SIMILAR = 0.6  # of at most 1
 
 
-def closest(word: str, words: Iterable[str]) -> str:
+def closest(word: str, words: Iterable[str], *, else_all: bool = False) -> str:
     """Return the suggestion that ends an error message, empty if no word is similar.
 
     Upper and lower case count as equal, and a word is similar to what it begins. Words
-    that are equally similar are all suggested.
+    that are equally similar are all suggested. If none is similar, ``else_all`` lists
+    all words, the most similar ones first.
 
     Examples
     --------
@@ -28,6 +29,8 @@ def closest(word: str, words: Iterable[str]) -> str:
     "; did you mean 'gate_probability'?"
     >>> closest("zzz", ["min_range", "max_range"])
     ''
+    >>> closest("fov", ["kind", "std", "field_of_view"], else_all=True)
+    '; known are field_of_view, kind, std'
     """
     known = {name.lower(): name for name in words}
     matcher = SequenceMatcher(b=word.lower())
@@ -42,7 +45,10 @@ def closest(word: str, words: Iterable[str]) -> str:
         beginning = (name for name in known if word and name.startswith(word.lower()))
         nearest = list(islice(beginning, 1))
     suggested = " or ".join(f"'{known[name]}'" for name in nearest)
-    return f"; did you mean {suggested}?" if nearest else ""
+    if nearest or not else_all:
+        return f"; did you mean {suggested}?" if nearest else ""
+    ranked = sorted(known, key=lambda name: -likeness[name])
+    return f"; known are {', '.join(known[name] for name in ranked)}"
 
 
 def imported(path: str, refusal: str, *, kind: bool = False) -> Any:

@@ -892,6 +892,9 @@ def test_a_run_whose_association_failed_names_the_command_that_repairs_it(
     words = " ".join(shown.split())
     assert "a filter that knew pose and map would assign 0.3% wrongly" in words
     assert slamgym("smooth", "a b/log.csv", "--associate").exit_code == 0
+    noise = "--measurement-std=0.0349,0.1"
+    shown = slamgym("replay", "a b/log.csv", *wrong[:2], noise, "--out", "c").stdout
+    assert f"slamgym smooth c/log.csv --associate {noise}\n" in shown
 
 
 def test_skipped_readings_are_explained():
@@ -909,4 +912,10 @@ def test_landmarks_that_were_never_placed_are_named(here, without_pictures):
     assert never
     assert summary["never_placed"] == never
     text = f"never placed {len(never)} landmarks: {', '.join(map(str, never[:10]))}"
-    assert text in " ".join(shown.split())
+    words = " ".join(shown.split())
+    assert text in words
+    counts = summary["readings"]
+    waiting = sum(len(scan.landmark_ids) for scan in scans)
+    waiting -= counts["associated"] + counts["added"]
+    assert counts["waiting"] == waiting > 0
+    assert f"{waiting} of ones not placed yet" in words

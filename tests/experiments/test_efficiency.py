@@ -5,7 +5,11 @@ import pytest
 
 from slamgym.evaluation.error_bound import posterior_bound
 from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
-from slamgym.experiments.monte_carlo.report import html_report, measures
+from slamgym.experiments.monte_carlo.report import (
+    html_report,
+    measures,
+    monte_carlo_table,
+)
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
@@ -68,7 +72,13 @@ def test_table_and_report_show_the_efficiency(results, summary):
     value = summary["estimators"]["ekf"]["efficiency"]["pose"]["value"]
     assert cell(summary["estimators"]["ekf"]).startswith(f"{value:.2f} ± ")
     assert cell(summary["estimators"]["smoother"]) == "–"
-    assert "bound of any filter" in html_report(results, summary)
+    page = html_report(results, summary)
+    assert "bound of any filter" in page
+    reason = "An efficiency is – where no bound is known"
+    assert reason in page
+    assert reason in monte_carlo_table(summary).caption.plain
+    del summary["estimators"]["smoother"]
+    assert reason not in monte_carlo_table(summary).caption.plain
 
 
 def test_results_without_bounds_have_no_efficiency(results):

@@ -219,7 +219,7 @@ def test_outcomes_of_readings_with_identity():
     report = slam.update(scan.measurements, scan.landmark_ids.tolist())
     codes, ids = row_outcomes(scan, report)
     names = [run_frames.OUTCOMES[code] for code in codes]
-    assert names == ["used", "rejected", "new", "too close"]
+    assert names == ["used", "rejected", "new", "too close to be used"]
     assert ids.tolist() == [4, 6, 9, 2]
 
 

@@ -200,6 +200,7 @@ def test_every_float_survives_the_round_trip(tmp_path_factory, numbers, dt):
         ("# a note", "expected # key: value, got '# a note'"),
         ("# unit: m", "expected each key of the header once, got unit again"),
         ("# motion: arc", "expected turn-last, midpoint or a drive, got 'arc'"),
+        ("# motion_std: 0.1,oops,0", "expected a finite number, got 'oops'"),
         ("# start: 0,0", "expected # start: x,y,theta, got 2 fields"),
         ("# start: 0,0,north", "expected a finite number, got 'north'"),
     ],

@@ -54,16 +54,18 @@ def mistake_of(**changes):
         ({"landmarks": {"layout": "ring", "raduis": 3.0, "count": 3}},
          "unknown key 'raduis' in landmarks; did you mean 'radius'?"),
         ({"zzz": 3}, "unexpected keyword argument 'zzz': "
-         "unknown key 'zzz' in the scenario"),
+         "unknown key 'zzz' in the scenario; known are "),
+        ({"sensor": {"fov": 1}},
+         "unknown key 'fov' in sensor; known are field_of_view, dropout, "),
     ],
 )  # fmt: skip
 def test_an_unknown_key_is_refused_with_a_suggestion(changes, message):
-    assert mistake_of(**changes) == message
+    assert mistake_of(**changes).startswith(message)
 
 
 def test_of_many_unknown_keys_the_first_is_named():
     wrong = {f"zzz{i}": 0 for i in range(50)}
-    assert mistake_of(dt=0.5, **wrong).endswith("unknown key 'zzz0' in the scenario")
+    assert "unknown key 'zzz0' in the scenario; known" in mistake_of(dt=0.5, **wrong)
 
 
 @pytest.mark.parametrize("std", [[-1, 0.1], [0.1], [0.1, 0.1, 0.1], 0.1, ["0.1", 0.1]])

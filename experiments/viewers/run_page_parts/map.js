@@ -409,7 +409,7 @@ function describePose(pose, chosen, rho) {
 }
 
 function describeReading({ bearing, range, outcome, id, trueId }) {
-  const lines = [`reading, ${outcome}`, `bearing ${wrapped(bearing).toFixed(3)} rad, range ${range.toFixed(3)} m`];
+  const lines = [`This reading is ${outcome}.`, `bearing ${wrapped(bearing).toFixed(3)} rad, range ${range.toFixed(3)} m`];
   if (id >= 0) lines.push(`given to landmark ${id}`);
   if (trueId === -1) lines.push("in truth clutter");
   else if (trueId >= 0 && trueId !== id) lines.push(`in truth of landmark ${trueId}`);
