@@ -62,8 +62,6 @@ def write_pages(app: Sphinx, config: Config) -> None:
     _write(folder / "api" / "index.rst", api_index(listed))
     for name in ("CONVENTIONS", "CHANGELOG", "CONTRIBUTING"):
         text = (ROOT / f"{name}.md").read_text()
-        if name == "CONTRIBUTING":
-            text += "\n```{toctree}\n:hidden:\n\n../kernels\n```\n"
         _write(folder / f"{name.lower()}.md", text)
 
 
