@@ -230,9 +230,9 @@ def _no_bound(summary: dict[str, Any]) -> str:
     if all(value for efficiencies in found for value in efficiencies.values()):
         return ""
     return (
-        " An efficiency is – where no bound is known: for a sensor whose single "
-        "reading does not place a landmark, for the poses of a smoother, and if no "
-        "run succeeded."
+        " An efficiency is – where no bound is known: for sensors other than "
+        "bearing_range and position, for the poses of a smoother, and if no run "
+        "succeeded."
     )
 
 

@@ -81,6 +81,14 @@ def test_table_and_report_show_the_efficiency(results, summary):
     assert reason not in monte_carlo_table(summary).caption.plain
 
 
+def test_the_table_states_why_a_sensor_has_no_efficiency():
+    world = load_scenario("bearing").with_changes(steps=20)
+    summary = summarise_monte_carlo(monte_carlo(world, "ekf", 2))
+    assert set(summary["estimators"]["ekf"]["efficiency"].values()) == {None}
+    caption = monte_carlo_table(summary).caption.plain
+    assert "for sensors other than bearing_range and position" in caption
+
+
 def test_results_without_bounds_have_no_efficiency(results):
     older = results.drop_vars("position_bound")
     entry = summarise_monte_carlo(older)["estimators"]["ekf"]
