@@ -269,12 +269,8 @@ def test_hidden_identities_are_found_out():
     for seed in range(3):
         env = LandmarkWorldEnv(world)
         observation, info = env.reset(seed=seed)
-        slam = make_estimator(
-            "invariant",
-            motion_std=world.motion.std,
-            measurement_std=world.sensor.std,
-            management=True,
-        )
+        noise = {"motion_std": world.motion.std, "measurement_std": world.sensor.std}
+        slam = make_estimator("invariant", **noise, management=True)
         true_ids = {}
         for action in [*action_sequence(world), None]:
             seen = observation["mask"]

@@ -49,12 +49,8 @@ def drive(world, seed=0, steps=STEPS):
 
 
 def make(world, name="invariant", **management):
-    return make_estimator(
-        name,
-        motion_std=world.motion.std,
-        measurement_std=world.sensor.std,
-        management=management or None,
-    )
+    noise = {"motion_std": world.motion.std, "measurement_std": world.sensor.std}
+    return make_estimator(name, **noise, management=management or None)
 
 
 def follow(slam, scans):

@@ -206,22 +206,6 @@ def test_horizons_tell_what_shorter_plans_tell(name):
     np.testing.assert_array_equal(several.poses, one.poses)
 
 
-@pytest.mark.parametrize(
-    ("horizons", "message"),
-    [
-        ((), "horizons must be whole numbers of steps"),
-        (3, "horizons must be whole numbers of steps"),
-        ((2.5,), "horizons must be whole numbers of steps"),
-        ((0, 3), "horizons must increase from 1 to at most 7"),
-        ((3, 3), "horizons must increase from 1 to at most 7"),
-        ((5, 8), "horizons must increase from 1 to at most 7"),
-    ],
-)
-def test_wrong_horizons_are_refused(horizons, message):
-    with pytest.raises(ValueError, match=message):
-        imagine(driven("ekf"), PLANS, sensor(), horizons=horizons)
-
-
 def test_a_point_is_hidden_as_in_the_world():
     rng, hidden = np.random.default_rng(4), 0
     kernel = getattr(is_hidden, "py_func", is_hidden)  # only kernels call it
@@ -245,40 +229,33 @@ def test_a_robot_at_rest_has_noise_as_in_the_filter():
         )
 
 
-@pytest.mark.parametrize(
-    ("plans", "message"),
-    [
-        (np.zeros((0, 5, 2)), "with at least one plan of one step"),
-        (np.zeros((3, 0, 2)), "with at least one plan of one step"),
-        (np.zeros((3, 5, 3)), r"plans must have shape \(K, T, 2\)"),
-        (np.zeros(2), r"plans must have shape \(K, T, 2\)"),
-        (np.zeros((2, 3, 5, 2)), "plans must be those of 1 filters"),
-        (np.full((1, 1, 2), np.nan), "plans must be finite"),
-    ],
-)
-def test_wrong_plans_are_refused(plans, message):
+WHOLE = "horizons must be whole numbers of steps"
+RISING = "horizons must increase from 1 to at most 7"
+WRONG = [
+    *(({"horizons": each}, WHOLE) for each in ((), 3, (2.5,))),
+    *(({"horizons": each}, RISING) for each in ((0, 3), (3, 3), (5, 8))),
+    ({"plans": np.zeros((0, 5, 2))}, "with at least one plan of one step"),
+    ({"plans": np.zeros((3, 0, 2))}, "with at least one plan of one step"),
+    ({"plans": np.zeros((3, 5, 3))}, r"plans must have shape \(K, T, 2\)"),
+    ({"plans": np.zeros(2)}, r"plans must have shape \(K, T, 2\)"),
+    ({"plans": np.zeros((2, 3, 5, 2))}, "plans must be those of 1 filters"),
+    ({"plans": np.full((1, 1, 2), np.nan)}, "plans must be finite"),
+    ({"density": ([(0.0, 0.0)], [1.0, 2.0])}, "density must be points"),
+    ({"density": ([0.0, 0.0], [1.0])}, "density must be points"),
+    ({"density": ([(0.0, np.nan)], [1.0])}, "density must be finite"),
+    ({"density": ([(0.0, 0.0)], [-1.0])}, "density must be finite points and finite c"),
+    ({"walls": [[0, 1, 2]]}, r"walls must have shape \(W, 4\)"),
+    ({"walls": [0, 1, 2, 3]}, r"walls must have shape \(W, 4\)"),
+    ({"walls": [[0, 1, 2, np.nan]]}, "walls must be finite"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), WRONG)
+def test_wrong_arguments_are_refused(arguments, message):
+    arguments = {"plans": PLANS} | arguments
+    plans = arguments.pop("plans")
     with pytest.raises(ValueError, match=message):
-        imagine(driven("ekf"), plans, sensor())
-
-
-@pytest.mark.parametrize(
-    ("density", "message"),
-    [
-        (([(0.0, 0.0)], [1.0, 2.0]), "density must be points"),
-        (([0.0, 0.0], [1.0]), "density must be points"),
-        (([(0.0, np.nan)], [1.0]), "density must be finite"),
-        (([(0.0, 0.0)], [-1.0]), "density must be finite points and finite counts"),
-    ],
-)
-def test_wrong_densities_are_refused(density, message):
-    with pytest.raises(ValueError, match=message):
-        imagine(driven("ekf"), PLANS, sensor(), density=density)
-
-
-@pytest.mark.parametrize("walls", [[[0, 1, 2]], [0, 1, 2, 3], [[0, 1, 2, np.nan]]])
-def test_wrong_walls_are_refused(walls):
-    with pytest.raises(ValueError, match=r"walls must (have shape \(W, 4\)|be finite)"):
-        imagine(driven("ekf"), PLANS, sensor(), walls=walls)
+        imagine(driven("ekf"), plans, sensor(), **arguments)
 
 
 def test_other_filters_and_keywords_are_refused():

@@ -12,13 +12,8 @@ def drive_around(seed):
     rng = np.random.default_rng(seed)
     motion, sensor = 10 ** rng.uniform(-2.5, -0.5, 3), 10 ** rng.uniform(-2.5, -0.7, 2)
     size, base = int(rng.integers(2, 9)), str(rng.choice(["ekf", "invariant"]))
-    slam = make_estimator(
-        "submaps",
-        motion_std=motion,
-        measurement_std=sensor,
-        submap_size=size,
-        base=base,
-    )
+    noise = {"motion_std": motion, "measurement_std": sensor}
+    slam = make_estimator("submaps", **noise, submap_size=size, base=base)
     landmarks = rng.uniform(-10, 10, (int(rng.integers(3, 15)), 2))
     x, y, heading = np.zeros(3)
     rng.integers(3)

@@ -39,13 +39,8 @@ def lap():
 
 def made(name="invariant", **changes):
     world = load_scenario("lost_loop")
-    return make_estimator(
-        name,
-        motion_std=world.motion.std,
-        measurement_std=world.sensor.std,
-        management=POLICY | changes,
-        **OPTIONS[name],
-    )
+    noise = {"motion_std": world.motion.std, "measurement_std": world.sensor.std}
+    return make_estimator(name, **noise, management=POLICY | changes, **OPTIONS[name])
 
 
 def run(slam, steps, owners):

@@ -20,14 +20,14 @@ from slamgym.estimator.models.sensors import (
 from slamgym.estimator.smoother import Drive, SmoothingSlam, reassociate, smooth
 from slamgym.estimator.smoother.optimiser import start_of
 
+NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
 START_STD = (0.1, 0.2, 0.05)
 RANGE = 7.0  # of the sensor [m]
 
 
 def recorded(seed=3, steps=12, start_std=START_STD, **settings):
     """Return a drive, and its moves and scans as plain lists."""
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD} | settings
-    result = Drive(**noise, initial_pose_std=start_std)
+    result = Drive(**NOISE | settings, initial_pose_std=start_std)
     result.end_motion()
     moves, scans = [], [(np.empty((0, 2)), np.empty(0, dtype=int))]
     for odometry, readings, _ in drive(seed, steps):
@@ -56,12 +56,17 @@ def example():
     return smooth(result), moves, scans
 
 
-def test_poses_and_landmarks_are_those_of_dense_least_squares(example):
+def test_solution_cost_and_covariances_are_those_of_dense_least_squares(example):
     made, moves, scans = example
-    twin, state, _ = dense_twin(made, moves, scans)
+    twin, state, order = dense_twin(made, moves, scans)
     rng = np.random.default_rng(0)
     found, _ = twin.solve(state + 0.01 * rng.standard_normal(len(state)))
     assert found == pytest.approx(state, abs=1e-7)  # differences are good to that
+    assert made.cost == pytest.approx((twin.residual(state) ** 2).sum() / 2)
+    assert made.cost < made.first_cost
+    _, expected = twin.solve(state, iterations=1)
+    joint = made.covariance(range(len(made.poses)), order)
+    assert joint == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -104,8 +109,7 @@ def test_other_sensors_are_smoothed_as_by_dense_least_squares(sensor, std):
 
 def test_readings_of_poses_are_those_of_dense_least_squares():
     """Compass and GPS, one of them turned by 2π, and several at one pose."""
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
-    result, fixes = Drive(**noise, initial_pose_std=START_STD), []
+    result, fixes = Drive(**NOISE, initial_pose_std=START_STD), []
     result.end_motion()
     moves, scans = [], [(np.empty((0, 2)), np.empty(0, dtype=int))]
     rng = np.random.default_rng(8)
@@ -135,9 +139,8 @@ def test_readings_of_poses_are_those_of_dense_least_squares():
 
 
 def test_a_recorded_filter_smooths_its_readings_of_poses():
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
-    slam = SmoothingSlam(**noise, initial_pose_std=START_STD, gate_probability=0.99)
-    direct = Drive(**noise, initial_pose_std=START_STD)
+    slam = SmoothingSlam(**NOISE, initial_pose_std=START_STD, gate_probability=0.99)
+    direct = Drive(**NOISE, initial_pose_std=START_STD)
     for odometry, readings, pose in drive(3, 12):
         for each in (slam, direct):
             each.predict(odometry)
@@ -148,21 +151,6 @@ def test_a_recorded_filter_smooths_its_readings_of_poses():
     found, expected = slam.smoothed(), smooth(direct)
     assert found.poses == pytest.approx(expected.poses, abs=1e-8)
     assert (found.pose_covariances[1:, 2, 2] < 1e-4).all()
-
-
-def test_cost_is_half_the_sum_of_squares(example):
-    made, moves, scans = example
-    twin, state, _ = dense_twin(made, moves, scans)
-    assert made.cost == pytest.approx((twin.residual(state) ** 2).sum() / 2)
-    assert made.cost < made.first_cost
-
-
-def test_every_covariance_is_that_of_dense_least_squares(example):
-    made, moves, scans = example
-    twin, state, order = dense_twin(made, moves, scans)
-    _, expected = twin.solve(state, iterations=1)
-    joint = made.covariance(range(len(made.poses)), order)
-    assert joint == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
 def test_marginals_are_parts_of_the_joint_covariance(example):
@@ -298,12 +286,8 @@ def test_composed_odometry_is_one_motion():
 
 def test_odometry_over_several_readings_has_the_noise_of_a_filter():
     made = Drive((0.1, 0.05, 0.03), (0.02, 0.1), initial_pose=(1.0, 2.0, 0.5))
-    slam = make_estimator(
-        "ekf",
-        motion_std=(0.1, 0.05, 0.03),
-        measurement_std=(0.02, 0.1),
-        initial_pose=(1.0, 2.0, 0.5),
-    )
+    noise = {"motion_std": (0.1, 0.05, 0.03), "measurement_std": (0.02, 0.1)}
+    slam = make_estimator("ekf", **noise, initial_pose=(1.0, 2.0, 0.5))
     for odometry, dt in (((1.0, 0.3), 1.0), ((0.5, -0.6), 2.0), ((2.0, 0.1), 0.5)):
         made.predict(odometry, dt)
         slam.predict(odometry, dt)
@@ -425,25 +409,20 @@ def test_the_start_does_not_change_the_solution():
     assert again.landmarks == pytest.approx(found.landmarks, abs=1e-8)
 
 
-def test_a_drive_without_readings_is_refused():
-    made = Drive(MOTION_STD, MEASUREMENT_STD)
-    made.predict((1.0, 0.0))
-    with pytest.raises(ValueError, match="must hold readings of landmarks, got none"):
-        smooth(made)
-
-
-def test_a_landmark_without_a_reading_is_refused():
+def test_what_cannot_be_smoothed_is_refused():
     made, *_ = recorded()
+    with pytest.raises(np.linalg.LinAlgError, match="did not converge in 1 iteration"):
+        smooth(made, iterations=1)
     with pytest.raises(ValueError, match="landmark 77 has no reading in the drive"):
         smooth(made, landmarks={77: (1.0, 2.0)})
     with pytest.raises(ValueError, match="landmark 77 has no reading in the drive"):
         smooth(made).belief(landmark_ids=[77])
-
-
-def test_a_solution_that_is_not_found_is_an_error():
-    made, *_ = recorded()
-    with pytest.raises(np.linalg.LinAlgError, match="did not converge in 1 iteration"):
-        smooth(made, iterations=1)
+    blind = Drive(**NOISE)
+    blind.predict((1.0, 0.0))
+    with pytest.raises(ValueError, match="must hold readings of landmarks, got none"):
+        smooth(blind)
+    with pytest.raises(ValueError, match=r"measurement_std must be > 0 to smooth"):
+        Drive(MOTION_STD, (0.1, 0.0))
 
 
 def test_a_cost_that_no_longer_falls_significantly_is_a_solution():
@@ -473,11 +452,6 @@ def test_wrong_arguments_are_named(arguments, message):
         smooth(made, **arguments)
 
 
-def test_a_sensor_without_noise_is_refused():
-    with pytest.raises(ValueError, match=r"measurement_std must be > 0 to smooth"):
-        Drive(MOTION_STD, (0.1, 0.0))
-
-
 @pytest.mark.parametrize(
     ("scan", "ids"),
     [([(0.0, np.nan)], [0]), ([(0.0, 1.0)], [0, 1]), ([(0, 1), (0, 2)], [3, 3])],
@@ -500,10 +474,9 @@ def test_readings_below_the_minimum_range_are_skipped():
 
 @pytest.mark.parametrize("backdate", [False, True])
 def test_management_gives_its_associations_to_the_drive(backdate):
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
     policy = {"confirm": [3, 5], "backdate": backdate}
-    slam = ManagedSlam(SmoothingSlam, management=policy, **noise)
-    plain = Drive(**noise)
+    slam = ManagedSlam(SmoothingSlam, management=policy, **NOISE)
+    plain = Drive(**NOISE)
     for odometry, readings, _ in drive(5, 40, landmarks=SIX):
         slam.predict(odometry)
         slam.update(readings)
@@ -520,8 +493,7 @@ def test_management_gives_its_associations_to_the_drive(backdate):
 
 
 def test_merged_and_removed_landmarks_leave_the_drive():
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
-    slam = SmoothingSlam(**noise)
+    slam = SmoothingSlam(**NOISE)
     slam.update([(0.1, 2.0), (0.4, 3.0)], [0, 1])
     slam.predict((0.5, 0.0))
     slam.update([(0.15, 1.6), (1.0, 2.0)], [2, 3])
@@ -531,8 +503,7 @@ def test_merged_and_removed_landmarks_leave_the_drive():
 
 
 def test_a_filter_that_goes_back_takes_its_drive_back():
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
-    slam = SmoothingSlam(**noise)
+    slam = SmoothingSlam(**NOISE)
     slam.update([(0.1, 2.0)], [0])
     before, expected = slam.state_dict(), slam.smoothed()
     slam.predict((0.5, 0.0))
@@ -540,15 +511,14 @@ def test_a_filter_that_goes_back_takes_its_drive_back():
     slam.load_state_dict(before)
     assert repr(slam.smoothed()) == repr(expected)
     with pytest.raises(ValueError, match="state must hold 'recorded_events'"):
-        slam.load_state_dict(make_estimator("invariant", **noise).state_dict())
+        slam.load_state_dict(make_estimator("invariant", **NOISE).state_dict())
     slam.reset((1.0, 0, 0), (0, 0, 0))
     slam.update([(0.1, 2.0)], [0])
     assert slam.smoothed().poses.tolist() == [[1.0, 0.0, 0.0]]
 
 
 def test_recording_does_not_change_the_filter():
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
-    alone, slam = make_estimator("invariant", **noise), SmoothingSlam(**noise)
+    alone, slam = make_estimator("invariant", **NOISE), SmoothingSlam(**NOISE)
     for odometry, readings, _ in drive(6, 5):
         for each in (alone, slam):
             each.predict(odometry)
@@ -559,13 +529,12 @@ def test_recording_does_not_change_the_filter():
 
 
 def test_the_smoother_follows_any_filter_and_refuses_what_it_cannot_take():
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
-    gated = SmoothingSlam(follow="ekf", gate_probability=0.99, **noise)
+    gated = SmoothingSlam(follow="ekf", gate_probability=0.99, **NOISE)
     gated.update([(0.1, 2.0)], [0])
     for reading in ((0.1, 2.0), (0.1, 9.0)):
         gated.update([reading], [0])
     assert gated.recorded().readings == 2
     with pytest.raises(TypeError, match="gate_probabilty"):
-        SmoothingSlam(gate_probabilty=0.99, **noise)
+        SmoothingSlam(gate_probabilty=0.99, **NOISE)
     with pytest.raises(ValueError, match="robust must be"):
-        SmoothingSlam(robust="tukey", **noise)
+        SmoothingSlam(robust="tukey", **NOISE)
