@@ -97,16 +97,10 @@ def test_without_ranges_the_scenario_is_its_own_draw():
 
 @pytest.mark.parametrize("max_range", [None, [2.0, 6.0]])
 def test_observations_of_all_draws_are_in_one_space(max_range):
-    ranges = {
-        "motion_std": [0.1, 20.0],
-        "measurement_std": [0.1, 30.0],
-        "start_x": [-60.0, 40.0],
-        "landmark_shift": 3.0,
-        "max_range": max_range,
-    }
-    worlds = gym.make_vec(
-        "slamgym/LandmarkWorld-v0", 40, scenario="six_landmarks", randomise=ranges
-    )
+    ranges = {"motion_std": [0.1, 20.0], "measurement_std": [0.1, 30.0]}
+    ranges |= {"start_x": [-60.0, 40.0], "landmark_shift": 3.0, "max_range": max_range}
+    world = {"scenario": "six_landmarks", "randomise": ranges}
+    worlds = gym.make_vec("slamgym/LandmarkWorld-v0", 40, **world)
     assert isinstance(worlds.unwrapped, LandmarkWorldVectorEnv)
     observations, _ = worlds.reset(seed=0)
     for _ in range(40):

@@ -54,11 +54,6 @@ def first_contact(start, move, wall):
     return min((share for share in shares if 0 <= share <= 1), default=1.0)
 
 
-def turned(body):
-    heading = body.pose[2]
-    return complex(math.cos(heading), math.sin(heading))
-
-
 def test_a_step_is_the_turn_last_model_to_the_last_bit():
     rng = np.random.default_rng(0)
     body = UnicycleBody(RADIUS)
@@ -101,13 +96,9 @@ def test_the_round_end_of_a_wall_is_met_from_the_side(side):
     wall = (2.0, 0.0, 6.0, 0.0)
     body = UnicycleBody(RADIUS, [wall])
     body.place((0.0, side * 0.2, -side * 0.05))
-    share = body.drive((4.0, 0.0))
-    assert share == pytest.approx(
-        first_contact(
-            0.2j * side, 4 * complex(math.cos(0.05), -side * math.sin(0.05)), wall
-        ),
-        abs=1e-6,
-    )
+    share, move = body.drive((4.0, 0.0)), 4 * np.exp(-0.05j * side)
+    expected = first_contact(0.2j * side, move, wall)
+    assert share == pytest.approx(expected, abs=1e-6)
     assert share < 0.5
 
 
@@ -146,7 +137,7 @@ def test_random_driving_agrees_with_a_closed_form_and_never_touches_a_wall():
     body.place((-3.0, 0.0, 0.3))
     hits = 0
     for d, alpha in rng.normal([0.3, 0.0], [0.4, 0.8], size=(4000, 2)).tolist():
-        start, move = complex(body.position), d * turned(body)
+        start, move = complex(body.position), d * np.exp(1j * body.pose[2])
         share = body.drive((d, alpha))
         contact = min(first_contact(start, move, wall) for wall in ARENA)
         assert share <= contact + 1e-9

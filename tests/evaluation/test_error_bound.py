@@ -35,25 +35,21 @@ def exact_drive(steps=25):
     return np.array(poses), visible
 
 
+def bound_of(poses, visible, landmarks=PLACES, **changes):
+    """Return the bound of one run."""
+    settings = {"dt": np.ones(len(poses)), "start_std": START_STD, **NOISE} | changes
+    return posterior_bound(poses[None], landmarks[None], visible[None], **settings)
+
+
 @pytest.mark.parametrize("fixes", [False, True])
 def test_the_bound_is_the_invariant_filter_where_it_linearises_at_the_truth(fixes):
     poses, visible = exact_drive()
-    dt = np.ones(len(poses))
     pose_std = np.full((len(poses), 3), np.inf)
     if fixes:
         pose_std[3::3, :2], pose_std[1::2, 2] = (0.2, 0.1), 0.05
-    bound = posterior_bound(
-        poses[None],
-        PLACES[None],
-        visible[None],
-        dt,
-        start_std=START_STD,
-        pose_std=pose_std,
-        **NOISE,
-    )
-    slam = make_estimator(
-        "invariant", initial_pose=poses[0], initial_pose_std=START_STD, **NOISE
-    )
+    bound = bound_of(poses, visible, pose_std=pose_std)
+    start = {"initial_pose": poses[0], "initial_pose_std": START_STD}
+    slam = make_estimator("invariant", **start, **NOISE)
     for t, pose in enumerate(poses):
         if t:
             slam.predict((0.3, 0.2))
@@ -78,15 +74,13 @@ def test_the_bound_of_a_linear_drive_is_the_covariance_of_kalman():
     steps, place = 12, np.array([[30.0, 0.0]])
     poses = np.zeros((steps, 3))
     poses[:, 0] = 0.5 * np.arange(steps)
-    bound = posterior_bound(
-        poses[None],
-        place[None],
-        np.ones((1, steps, 1), dtype=bool),
-        np.ones(steps),
-        motion_std=(0.3, 0, 0),
-        measurement_std=(0.1, 0.2),
-        start_std=(0.4, 0, 0),
-    )
+    noise = {
+        "motion_std": (0.3, 0, 0),
+        "measurement_std": (0.1, 0.2),
+        "sensor": BEARING_RANGE,
+    }
+    visible = np.ones((steps, 1), dtype=bool)
+    bound = bound_of(poses, visible, place, start_std=(0.4, 0, 0), **noise)
     P = np.array([[0.16, 0.16], [0.16, 0.16 + 0.04]])
     H = np.array([-1.0, 1.0])
     for k in range(steps):
@@ -101,15 +95,8 @@ def test_the_bound_of_a_linear_drive_is_the_covariance_of_kalman():
 
 
 def test_a_robot_that_stands_cannot_learn_its_heading():
-    poses = np.tile([2.0, 1.0, 0.3], (1, 50, 1))
-    bound = posterior_bound(
-        poses,
-        PLACES[None],
-        np.ones((1, 50, 4), dtype=bool),
-        np.zeros(50),
-        start_std=(0, 0, 0.3),
-        **NOISE,
-    )
+    poses, visible = np.tile([2.0, 1.0, 0.3], (50, 1)), np.ones((50, 4), dtype=bool)
+    bound = bound_of(poses, visible, dt=np.zeros(50), start_std=(0, 0, 0.3))
     assert bound.heading[0] == pytest.approx(0.09, rel=1e-12)
 
 
@@ -146,14 +133,7 @@ def test_landmarks_that_are_never_read_do_not_change_a_bit_and_take_no_memory():
 
 def test_no_landmark_leaves_dead_reckoning():
     poses, visible = exact_drive()
-    bound = posterior_bound(
-        poses[None],
-        PLACES[None],
-        np.zeros_like(visible)[None],
-        np.ones(len(poses)),
-        start_std=START_STD,
-        **NOISE,
-    )
+    bound = bound_of(poses, np.zeros_like(visible))
     turned = 0.05**2 + 0.03**2 * np.arange(len(poses))
     assert bound.heading[0] == pytest.approx(turned)
     assert np.isnan(bound.map[0])
@@ -170,14 +150,7 @@ def test_squares_are_those_of_the_invariant_error():
 def test_the_map_is_bounded_about_its_centre():
     poses, visible = exact_drive()
     visible[:, 1] = False
-    bound = posterior_bound(
-        poses[None],
-        PLACES[None],
-        visible[None],
-        np.ones(len(poses)),
-        start_std=START_STD,
-        **NOISE,
-    )
+    bound = bound_of(poses, visible)
     P, centre = bound.covariances[0], np.eye(3) - 1 / 3
     assert len(P) == 3 + 2 * 3
     about = [np.trace(centre @ P[axis::2, axis::2] @ centre) / 3 for axis in (3, 4)]
@@ -211,13 +184,8 @@ def test_the_interval_of_the_efficiency_covers_the_true_ratio():
 )
 def test_wrong_arguments_are_named(change, message):
     poses, visible = exact_drive()
-    arguments = {
-        "true_poses": poses[None],
-        "landmarks": PLACES[None],
-        "visible": visible[None],
-        "dt": np.ones(len(poses)),
-        "start_std": START_STD,
-        **NOISE,
-    }
+    arguments = {"true_poses": poses[None], "landmarks": PLACES[None]}
+    arguments |= {"visible": visible[None], "dt": np.ones(len(poses))}
+    arguments |= {"start_std": START_STD, **NOISE}
     with pytest.raises(ValueError, match=message):
         posterior_bound(**arguments | change)
