@@ -232,6 +232,7 @@ def wall_clearance(
 
 
 __all__ = ["SECTORS", "CoverageGrid"]
+__dir__ = __all__.copy
 
 _CELLS_PER_SIDE = 24  # at most
 _SMALLEST_CELL = 0.75  # [m]

@@ -38,6 +38,7 @@ __all__ = [
     "make_vector_controller",
     "planned_path",
 ]
+__dir__ = __all__.copy
 
 #: The names that :func:`make_controller` accepts.
 CONTROLLERS = ("open_loop", "waypoints", "random")

@@ -23,6 +23,7 @@ from .models.bearing_range import predict_measurement, wrap_angle
 from .models.motions import predict_pose
 
 __all__ = ["EstimatorContractError", "Finding", "check_estimator"]
+__dir__ = __all__.copy
 
 Factory = Callable[..., Any]
 Level = Literal["required", "correct", "recommended"]

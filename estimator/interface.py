@@ -41,6 +41,7 @@ __all__ = [
     "taking_poses",
     "with_fix",
 ]
+__dir__ = __all__.copy
 
 
 Result = TypeVar("Result")

@@ -15,6 +15,7 @@ from .program import command, main
 from .program import Reporter
 
 __all__ = ["main"]
+__dir__ = __all__.copy
 
 
 @command

@@ -45,6 +45,7 @@ __all__ = [
     "read_slamlog",
     "write_slamlog",
 ]
+__dir__ = __all__.copy
 
 #: Meanings of the odometry of a unicycle.
 UNICYCLES = ("turn-last", "midpoint")

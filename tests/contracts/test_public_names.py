@@ -21,6 +21,12 @@ PACKAGES = ["slamgym"] + [
     for init in sorted((ROOT / folder).rglob("__init__.py"))
     if "attach(__name__)" in init.read_text()
 ]
+MODULES = [
+    ".".join(["slamgym", *file.relative_to(ROOT).with_suffix("").parts])
+    for folder in FOLDERS
+    for file in sorted((ROOT / folder).rglob("*.py"))
+    if file.stem != "__init__" and "\n__all__ = [" in file.read_text()
+]
 PROMISED = {
     *("EkfSlam", "InvariantEkfSlam", "LandmarkWorldEnv", "Waypoints", "Scenario"),
     *("Belief", "UpdateReport", "LandmarkPolicy", "smooth", "fit_noise"),
@@ -55,6 +61,12 @@ def documented_imports(code):
 def test_the_main_names_are_at_the_top():
     assert PROMISED | set(FOLDERS) <= set(dir(slamgym))
     assert all(hasattr(slamgym, name) for name in PROMISED)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_module_with_public_names_lists_no_others(name):
+    module = importlib.import_module(name)
+    assert dir(module) == sorted(module.__all__)
 
 
 @pytest.mark.parametrize("name", PACKAGES)
