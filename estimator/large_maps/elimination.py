@@ -26,10 +26,10 @@ from .multifrontal import (
     Node,
     add_update,
     eliminate,
-    eliminate_in_place,
     marginal_covariance,
     pairs,
     substitute_back,
+    substitute_forward,
 )
 
 
@@ -149,7 +149,7 @@ def _eliminate(
     quads[row, :, here[here >= 0], :] = blocks[here >= 0]
     for child, slots in zip(below, inherited, strict=True):
         add_update(top, remainder, pairs(place[slots]), child.update)
-    node = eliminate_in_place(top, remainder, pairs(own), pairs(rest))
+    node = eliminate(top, remainder, pairs(own), pairs(rest))
     return _Eliminated(node, remainder if below else None)
 
 
@@ -432,34 +432,25 @@ class SubmapElimination:
         self.cost = 0.0
         self._nodes: list[Node] = []
         self._solved = np.zeros(size)  # L⁻¹ g
-        updates: list[tuple[Array, Array]] = []
+        updates: list[Array] = []
         for part in parts:
+            count, r = len(part.interior), len(part.border)
+            top, rest = np.zeros((count, count + r)), np.zeros((r, r))
             if part.submap >= 0:
                 H, g, cost = quadratic(part.submap)
                 self.cost += cost
-                pieces = [(H, g)]
+                unknowns = np.append(part.interior, part.border)
+                self._solved[unknowns[part.places[0]]] += g
+                pieces = [H]
             else:
                 pieces = [updates.pop(-2), updates.pop()]
-            updates.append(self._eliminate(part, pieces))
-
-    def _eliminate(
-        self, part: Part, pieces: list[tuple[Array, Array]]
-    ) -> tuple[Array, Array]:
-        """Add (H, g) of the pieces of a part; return the update of its border."""
-        count = len(part.interior)
-        total = count + len(part.border)
-        front = np.zeros((total, total + 1))
-        for places, (H, g) in zip(part.places, pieces, strict=True):
-            front[places[:, None], places] += H
-            front[places, -1] += g
-        rest, right = front[count:, count:-1], front[count:, -1]
-        if not count:
-            return rest, right
-        node, solved = eliminate(front, part.interior, part.border)
-        response, y = solved[:, :-1], solved[:, -1]
-        self._nodes.append(node)
-        self._solved[part.interior] = y
-        return rest - response.T @ response, right - response.T @ y
+            for places, piece in zip(part.places, pieces, strict=True):
+                add_update(top, rest, places, piece)
+            if count:
+                node = eliminate(top, rest, part.interior, part.border)
+                self._nodes.append(node)
+            updates.append(rest)
+        substitute_forward(self._nodes, self._solved)
 
     def solution(self) -> Array:
         """Return x = H⁻¹ g, shape (N,)."""

@@ -45,38 +45,8 @@ class Node(NamedTuple):
         return sum(array.nbytes for array in self)
 
 
-def eliminate(front: Array, own: IntArray, rest: IntArray) -> tuple[Node, Array]:
-    """Eliminate the first unknowns of a front.
-
-    Parameters
-    ----------
-    front : ndarray, shape (p + r, p + r + k)
-        Rows and columns of the unknowns ``own``, then ``rest``; then k right sides.
-
-    Returns
-    -------
-    node : Node
-    solved : ndarray, shape (p, r + k)
-        X, then L⁻¹ b_p of the right sides b; by columns in memory.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If H_pp is not positive definite.
-    """
-    p, r = len(own), len(rest)
-    lower = _cholesky(front[:p, :p])
-    solved = _solve(lower, front[:p, p:])
-    response = np.ascontiguousarray(solved[:, :r])
-    return Node(own, rest, lower, response), solved
-
-
-def eliminate_in_place(
-    top: Array, remainder: Array, own: IntArray, rest: IntArray
-) -> Node:
+def eliminate(top: Array, remainder: Array, own: IntArray, rest: IntArray) -> Node:
     """Eliminate the first unknowns of a front, which becomes the update.
-
-    This takes half the work of :func:`eliminate` followed by the product Xᵀ X.
 
     Parameters
     ----------

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
 from ...filters.ekf import EkfSlam
-from ...interface import UpdateReport
+from ...interface import Belief, UpdateReport
 from ...models.rigid_motion import as_covariance
-from ...support.undo import Undo, attributes, contents, undo_all, undone_on_error
+from ...support.undo import Undo, contents, undo_all, undone_on_error
 from ..multifrontal import pairs
 from .local_information import (
     ConditionalPose,
@@ -41,8 +39,6 @@ class SparseBelief:
     origin: Array  # position of the robot when the local map was chosen, shape (2,) [m]
     steps: int = 0  # number of steps taken
     report: UpdateReport = field(default_factory=UpdateReport, repr=False)  # the last
-    # What takes back the update under way: the last of these.
-    saved: list[Undo] = field(default_factory=list, repr=False)
 
     @classmethod
     def empty(cls, pose: Array, std: Array) -> SparseBelief:
@@ -85,7 +81,6 @@ class SparseBelief:
         """Assign slots to new landmarks."""
         if not ids:
             return
-        self._save()
         self.slots.update(zip(ids, slots, strict=True))
         self.free = [slot for slot in self.free if slot not in slots]
         self.map_.grow(len(self.slots) + len(self.free))
@@ -94,40 +89,31 @@ class SparseBelief:
         """Return what takes back later changes."""
         return undo_all(contents(self), self.map_.checkpoint())
 
-    @contextmanager
-    def undone_on_error(self) -> Iterator[None]:
-        """Take back an update that fails; save the map only where it changes."""
-        saved = self.saved = [attributes(self)]
+    def new_local_map(self, ids: Sequence[int]) -> IntArray | None:
+        """Return the slots of a new local map; None if the present one is adequate.
 
-        def undo() -> None:
-            saved[-1]()
-
-        try:
-            with undone_on_error(undo):
-                yield
-        finally:
-            self.saved = []
-
-    def _save(self) -> None:
-        """Make a checkpoint before the first change of the map in an update."""
-        if len(self.saved) == 1:
-            self.saved.append(self.checkpoint())
-
-    def choose_local_map(self, ids: Sequence[int]) -> None:
-        """Choose a new local map if a scan needs it or the old one is too large."""
+        It must hold all mapped landmarks of a scan, and not be too large.
+        """
         seen = np.array([self.slots[i] for i in ids if i in self.slots], dtype=int)
         local = self.local.slots
         required = union(seen, local[self.pose.is_linked])
         size = local_map_size(len(self.slots), len(ids), len(required))
         if np.isin(seen, local).all() and 2 * len(local) <= 3 * size:
-            return
+            return None
         here = self.pose.mean[:2]
         ahead = here + (here - self.origin) / 2  # likely direction of motion
         mapped = np.array(list(self.slots.values()))
         points = self.map_.points.reshape(-1, 2)
-        chosen = choose_local(mapped, points, ahead, required, size)
-        self._change_local_map(chosen)
-        self.origin = here.copy()
+        return choose_local(mapped, points, ahead, required, size)
+
+    def change_local_map(self, slots: IntArray) -> None:
+        """Write the local map back, and begin another one."""
+        write_back(self.map_, self.local)
+        gain = np.zeros((3, 2 * len(slots)))
+        _, before, after = np.intersect1d(self.local.slots, slots, return_indices=True)
+        gain[:, pairs(after)] = self.pose.gain[:, pairs(before)]
+        self.pose = self.pose._replace(gain=gain)
+        self.local = LocalInformation.of(self.map_, slots)
 
     def remove(self, ids: Sequence[int]) -> None:
         """Marginalise landmarks."""
@@ -145,10 +131,47 @@ class SparseBelief:
             merged = merge_landmarks(self.local, self.pose, place, dropped)
             self._drop([gone], dropped, merged)
 
-    def marginal(self, ids: Sequence[int]) -> Marginal:
-        """Return the marginal of the pose and some landmarks."""
-        slots = np.array([self.slots[i] for i in ids], dtype=np.int64)
-        return marginal(self.map_, self.local, self.pose, slots)
+    def marginal(self, ids: Sequence[int]) -> Belief:
+        """Return the marginal of the pose and some landmarks.
+
+        With L the local map and H all other landmarks::
+
+            p = K m_L + ω,   m_H = −T m_B + h,   cov ω = Ω,  cov h = Λ_HH⁻¹
+            Σ_LL = (Λ_LL − C)⁻¹
+
+        With G = [K; E; −T], the covariance is G Σ_LL Gᵀ plus Ω and blocks of Λ_HH⁻¹.
+        Only the requested rows of T and Λ_HH⁻¹ are computed.
+        """
+        slots, local = np.array([self.slots[i] for i in ids], dtype=int), self.local
+        place = np.full(len(self.map_.points) // 2, -1)
+        place[local.slots] = np.arange(len(local.slots))
+        is_near = place[slots] >= 0
+        inside = np.append([True] * 3, np.repeat(is_near, 2))
+        outside = np.flatnonzero(~inside)
+        here = np.append([0, 1, 2], 3 + pairs(place[slots[is_near]]))
+        near = self._near()  # its bits do not depend on the slots
+        covariance = np.empty((len(inside), len(inside)))
+        covariance[np.ix_(inside, inside)] = near[np.ix_(here, here)]
+        if len(outside):
+            own, T = local.rest.covariance(slots[~is_near])
+            border = 3 + local.border
+            own += T @ near[np.ix_(border, border)] @ T.T
+            covariance[np.ix_(outside, outside)] = (own + own.T) / 2
+            cross = -T @ near[np.ix_(border, here)]
+            covariance[np.ix_(outside, inside)] = cross
+            covariance[np.ix_(inside, outside)] = cross.T
+        points = means(self.map_, local)[pairs(slots)]
+        mean = np.concatenate([self.pose.mean, points])
+        return Belief(mean, covariance, tuple(ids), "additive")
+
+    def _near(self) -> Array:
+        """Return the covariance of the pose and all local landmarks."""
+        lower, size = self.local.solver()[0], len(self.local.points)
+        rows = np.vstack([self.pose.gain, np.eye(size)])
+        root = solve_triangular(lower, rows.T, lower=True, check_finite=False)
+        covariance = root.T @ root
+        covariance[:3, :3] += self.pose.covariance
+        return np.asarray(covariance)
 
     def landmarks(self) -> Array:
         """Return the positions of all landmarks, shape (n, 2) [m]."""
@@ -173,7 +196,7 @@ class SparseBelief:
         slots = np.array([self.slots[i] for i in ids])
         linked = np.append(slots, self.map_.information.neighbours(slots))
         chosen = union(self.local.slots, linked)
-        self._change_local_map(chosen)
+        self.change_local_map(chosen)
         return np.isin(self.local.slots, slots)
 
     def _drop(self, ids: Sequence[int], gone: BoolArray, rest: State) -> None:
@@ -185,71 +208,3 @@ class SparseBelief:
         slots = [self.slots.pop(i) for i in ids]
         self.map_.elimination.dissection.nodes[slots] = 0
         self.free += slots
-
-    def _change_local_map(self, slots: IntArray) -> None:
-        """Write the local map back, and begin another one."""
-        self._save()
-        write_back(self.map_, self.local)
-        gain = np.zeros((3, 2 * len(slots)))
-        _, before, after = np.intersect1d(self.local.slots, slots, return_indices=True)
-        gain[:, pairs(after)] = self.pose.gain[:, pairs(before)]
-        self.pose = self.pose._replace(gain=gain)
-        self.local = LocalInformation.of(self.map_, slots)
-
-
-class Marginal(NamedTuple):
-    """Gaussian of the pose and n landmarks."""
-
-    mean: Array  # (3 + 2n,)
-    covariance: Array  # (3 + 2n, 3 + 2n)
-
-
-def marginal(
-    map_: SparseMap, local: LocalInformation, pose: ConditionalPose, slots: IntArray
-) -> Marginal:
-    """Return the marginal of the pose and some landmarks.
-
-    With L the local map and H all other landmarks::
-
-        p = K m_L + ω,   m_H = −T m_B + h,   cov ω = Ω,  cov h = Λ_HH⁻¹
-        Σ_LL = (Λ_LL − C)⁻¹
-
-    With G = [K; E; −T], the covariance is G Σ_LL Gᵀ plus Ω and blocks of Λ_HH⁻¹.  Only
-    the requested rows of T and Λ_HH⁻¹ are computed.
-
-    Parameters
-    ----------
-    map_ : SparseMap
-    local : LocalInformation
-    pose : ConditionalPose
-    slots : ndarray, shape (n,)
-        The landmarks.
-    """
-    place = np.full(len(map_.points) // 2, -1)
-    place[local.slots] = np.arange(len(local.slots))
-    is_near = place[slots] >= 0
-    inside = np.append([True] * 3, np.repeat(is_near, 2))
-    outside = np.flatnonzero(~inside)
-    here = np.append([0, 1, 2], 3 + pairs(place[slots[is_near]]))
-    near = _near(local, pose)  # its bits do not depend on the slots
-    covariance = np.empty((len(inside), len(inside)))
-    covariance[np.ix_(inside, inside)] = near[np.ix_(here, here)]
-    if len(outside):
-        own, T = local.rest.covariance(slots[~is_near])
-        border = 3 + local.border
-        own += T @ near[np.ix_(border, border)] @ T.T
-        covariance[np.ix_(outside, outside)] = (own + own.T) / 2
-        cross = -T @ near[np.ix_(border, here)]
-        covariance[np.ix_(outside, inside)] = cross
-        covariance[np.ix_(inside, outside)] = cross.T
-    mean = np.concatenate([pose.mean, means(map_, local)[pairs(slots)]])
-    return Marginal(mean, covariance)
-
-
-def _near(local: LocalInformation, pose: ConditionalPose) -> Array:
-    """Return the covariance of the pose and all local landmarks."""
-    rows = np.vstack([pose.gain, np.eye(len(local.points))])
-    root = solve_triangular(local.solver()[0], rows.T, lower=True, check_finite=False)
-    covariance = root.T @ root
-    covariance[:3, :3] += pose.covariance
-    return np.asarray(covariance)

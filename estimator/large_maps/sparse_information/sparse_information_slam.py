@@ -22,7 +22,7 @@ from ...models.sensors import former_noise
 from ...support import argument_checks, saved_states
 from ...support.argument_checks import LandmarkIds
 from ...support.saved_states import with_prefix, without_prefix
-from ...support.undo import Undo, attributes, undo_all
+from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from ..multifrontal import PLACES, ROWS
 from . import local_information
 from .local_information import link_count
@@ -163,8 +163,13 @@ gate_probability, noise_at_rest, min_range
         if not ids:
             vars(belief).update(report=UpdateReport(), steps=belief.steps + 1)
         else:
-            with belief.undone_on_error():
-                belief.choose_local_map(ids)
+            chosen = belief.new_local_map(ids)
+            changes = chosen is not None or not belief.slots.keys() >= set(ids)
+            undo = belief.checkpoint() if changes else attributes(belief)
+            with undone_on_error(undo):
+                if chosen is not None:
+                    belief.change_local_map(chosen)
+                    belief.origin = belief.pose.mean[:2].copy()
                 result = process_scan(
                     (belief.local, belief.pose),
                     self._scan_rules,
@@ -257,8 +262,7 @@ gate_probability, noise_at_rest, min_range
         )
         if isinstance(self._held, EkfSlam):
             return self._held.belief(ids)
-        answer = self._held.marginal(ids)
-        return Belief(answer.mean, answer.covariance, tuple(ids), "additive")
+        return self._held.marginal(ids)
 
     def local_view(self, within: float) -> MapView:
         """Return the pose and the landmarks within a distance of it [m].
@@ -434,7 +438,7 @@ def checked_state(state: Mapping[str, Any], name: str, base: str) -> SparseBelie
             local_information.ConditionalPose(**pose),
             saved["origin"],
         )
-        covariance = belief.marginal([]).covariance
+        covariance = belief.marginal([]).pose_covariance
     except np.linalg.LinAlgError:
         raise ValueError(
             "state['matrix_blocks'] must be a positive definite information matrix"
