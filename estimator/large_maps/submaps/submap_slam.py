@@ -1,6 +1,7 @@
 """SLAM in submaps: a map of any size as many small ones, joined on demand.
 
-`SubmapSlam` is the public filter. `SubmapQueries` is the part of it that only reads.
+`SubmapSlam` is the public filter; `as_arrays` and `saved_graph` convert a run to a
+saved state and back.
 """
 
 from __future__ import annotations
@@ -37,76 +38,7 @@ from .store import (
 BASES: dict[str, type[EkfSlam]] = {"ekf": EkfSlam, "invariant": InvariantEkfSlam}
 
 
-class SubmapQueries:
-    """Base class of :class:`SubmapSlam`: the part that does not change the belief."""
-
-    belief_limit: int
-    _graph: SubmapGraph
-    _neighbourhood: Neighbourhood
-
-    def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
-        """Join the submaps, and return a snapshot of the belief.
-
-        Parameters
-        ----------
-        landmark_ids : sequence of int, optional
-            Return the marginal of the pose and these landmarks, in this order; by
-            default, of the whole map.  The join is cached until a submap is closed.
-
-        Raises
-        ------
-        ValueError
-            If one is not in the map, more than ``belief_limit`` are asked for, or the
-            file of a submap is lost.
-        numpy.linalg.LinAlgError
-            If the submaps contradict each other so that they cannot be joined, or if
-            their covariances are degenerate.
-        """
-        ids = argument_checks.asked_identities(landmark_ids, self._graph.index)
-        instead = "give landmark_ids, call local_belief()"
-        argument_checks.refuse_large_belief(len(ids), self.belief_limit, instead)
-        return self._graph.belief(tuple(ids), remember=landmark_ids is None)
-
-    def local_belief(self) -> Belief:
-        """Return pose and landmarks of the active submap in the world, without a join.
-
-        The frame of the submap is the composition of all submaps since the last
-        :meth:`join`.  The cost does not depend on the size of the map.
-        """
-        return self._graph.local_belief()
-
-    def __repr__(self) -> str:
-        pose = self.local_belief()
-        found = describe_map(len(self.landmark_ids), pose.pose, pose.pose_covariance)
-        return f"{type(self).__name__} of {found}"
-
-    @property
-    def pose(self) -> Array:
-        """(x, y, θ), shape (3,) [m, m, rad], as in :meth:`local_belief`."""
-        return self._graph.pose
-
-    @property
-    def landmark_ids(self) -> tuple[int, ...]:
-        """The mapped landmarks, in the order of the belief."""
-        return tuple(self._graph.index)
-
-    @property
-    def local_ids(self) -> tuple[int, ...]:
-        """The landmarks of the active submap."""
-        return self._graph.active_ids()
-
-    @property
-    def closed_count(self) -> int:
-        """Number of closed submaps."""
-        return len(self._graph.closed)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of submaps and joined map [bytes]."""
-        return self._graph.closed.nbytes + self._neighbourhood.nbytes
-
-
-class SubmapSlam(SubmapQueries):
+class SubmapSlam:
     """SLAM in submaps: small independent local maps, joined on demand.
 
     A filter starts at the origin of its own frame, where it knows its pose exactly, and
@@ -364,6 +296,67 @@ class SubmapSlam(SubmapQueries):
         reach = argument_checks.distance("within", within)
         return self._neighbourhood.view(reach)._replace(whole=self.landmark_ids)
 
+    def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
+        """Join the submaps, and return a snapshot of the belief.
+
+        Parameters
+        ----------
+        landmark_ids : sequence of int, optional
+            Return the marginal of the pose and these landmarks, in this order; by
+            default, of the whole map.  The join is cached until a submap is closed.
+
+        Raises
+        ------
+        ValueError
+            If one is not in the map, more than ``belief_limit`` are asked for, or the
+            file of a submap is lost.
+        numpy.linalg.LinAlgError
+            If the submaps contradict each other so that they cannot be joined, or if
+            their covariances are degenerate.
+        """
+        ids = argument_checks.asked_identities(landmark_ids, self._graph.index)
+        instead = "give landmark_ids, call local_belief()"
+        argument_checks.refuse_large_belief(len(ids), self.belief_limit, instead)
+        return self._graph.belief(tuple(ids), remember=landmark_ids is None)
+
+    def local_belief(self) -> Belief:
+        """Return pose and landmarks of the active submap in the world, without a join.
+
+        The frame of the submap is the composition of all submaps since the last
+        :meth:`join`.  The cost does not depend on the size of the map.
+        """
+        return self._graph.local_belief()
+
+    def __repr__(self) -> str:
+        pose = self.local_belief()
+        found = describe_map(len(self.landmark_ids), pose.pose, pose.pose_covariance)
+        return f"{type(self).__name__} of {found}"
+
+    @property
+    def pose(self) -> Array:
+        """(x, y, θ), shape (3,) [m, m, rad], as in :meth:`local_belief`."""
+        return self._graph.pose
+
+    @property
+    def landmark_ids(self) -> tuple[int, ...]:
+        """The mapped landmarks, in the order of the belief."""
+        return tuple(self._graph.index)
+
+    @property
+    def local_ids(self) -> tuple[int, ...]:
+        """The landmarks of the active submap."""
+        return self._graph.active_ids()
+
+    @property
+    def closed_count(self) -> int:
+        """Number of closed submaps."""
+        return len(self._graph.closed)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of submaps and joined map [bytes]."""
+        return self._graph.closed.nbytes + self._neighbourhood.nbytes
+
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
         return undo_all(
@@ -430,6 +423,11 @@ STATE: saved_states.Table = {
     "chain_present": (saved_states.NUMBERS, 4, 3),
     "chain_joined": (saved_states.NUMBERS, -1, 3),
 }
+SUBMAP: saved_states.Table = {
+    "slots": (saved_states.COUNTS, "n"),
+    "mean": (saved_states.NUMBERS, "3+2n"),
+    "covariance": (saved_states.NUMBERS, "3+2n", "3+2n"),
+}
 
 
 def as_arrays(name: str, graph: SubmapGraph, near: Mapping[str, Any]) -> dict[str, Any]:
@@ -495,18 +493,20 @@ def saved_graph(
     for key in ("chain_start", "chain_present"):
         P = (saved[key][1:] + saved[key][1:].T) / 2
         saved_states.refuse_indefinite(f"state[{key!r}]", P)
-    store = _store(state, count, folder)
-    pairs = _numbers(state, "renamed", index.count).reshape(-1, 2)
-    renamed = dict(zip(*pairs.T.tolist(), strict=True))
-    summaries = []
-    for k in range(count):
-        submap = store.load(k)
-        _check(submap, k, index.count)
-        summaries.append(summarise(merged(submap, renamed, active.frame)))
-    closed = ClosedSubmaps(store, active.frame, renamed, summaries)
     names = saved_states.landmark_ids(
         "local_landmark_ids", state.get("local_landmark_ids", ())
     )
+    pairs = _numbers(state, "renamed", index.count).reshape(-1, 2)
+    renamed = dict(zip(*pairs.T.tolist(), strict=True))
+    store, summaries = _store(state, count, folder), []
+    for k in range(count):
+        if isinstance(store, FolderStore):
+            state = with_prefix(f"submap_{k}", store.load(k)._asdict(), "_")
+        submap = _submap(state, k, index.count)
+        if isinstance(store, MemoryStore):
+            store.append(submap)
+        summaries.append(summarise(merged(submap, renamed, active.frame)))
+    closed = ClosedSubmaps(store, active.frame, renamed, summaries)
     links = index.links(names)
     if unknown := {i for i in links if slot_of_link(i) not in closed.slots}:
         raise ValueError(
@@ -538,55 +538,34 @@ def _index(state: Mapping[str, Any], ids: list[int], count: int) -> LandmarkInde
 def _store(
     state: Mapping[str, Any], count: int, folder: FolderStore | None
 ) -> SubmapStore:
+    """Return the store of a run: its folder, or an empty one in memory."""
     run = str(state["run"])
-    if run:
-        return _continued_folder(state, count, folder)
     if folder is None:
-        return _memory_store(state, count)
-    if count:
+        if run:
+            raise ValueError(
+                f"state was saved with a folder of submaps (run {run}): make the "
+                "estimator with that folder"
+            )
+        return MemoryStore()
+    if count and not run:
         raise ValueError(
             "state holds its submaps itself: make the estimator without folder"
         )
-    return folder.continued("", [])
+    sums = np.asarray(state.get("digests", ())).tolist()
+    if len(sums) != count:
+        raise ValueError(f"state['digests'] must have {count} entries, got {len(sums)}")
+    return folder.continued(run, sums)
 
 
-def _continued_folder(
-    state: Mapping[str, Any], count: int, folder: FolderStore | None
-) -> FolderStore:
-    run = str(state["run"])
-    if folder is None:
+def _submap(state: Mapping[str, Any], index: int, landmarks: int) -> Submap:
+    """Return a submap of a state; its slots must be below a number of landmarks."""
+    name = f"submap_{index}"
+    saved = saved_states.read(state, with_prefix(name, SUBMAP, "_"))
+    submap = Submap(*saved.values())
+    if (submap.slots >= landmarks).any():
         raise ValueError(
-            f"state was saved with a folder of submaps (run {run}): make the "
-            "estimator with that folder"
+            f"state['{name}_slots'] must be below {landmarks}, got {submap.slots.max()}"
         )
-    digests = np.asarray(state.get("digests", ())).tolist()
-    if len(digests) != count:
-        raise ValueError(
-            f"state['digests'] must have {count} entries, got {len(digests)}"
-        )
-    return folder.continued(run, digests)
-
-
-def _memory_store(state: Mapping[str, Any], count: int) -> MemoryStore:
-    store = MemoryStore()
-    for k in range(count):
-        keys = [f"submap_{k}_{key}" for key in Submap._fields]
-        if not set(keys) <= set(state):
-            raise ValueError(f"state must hold {keys}")
-        slots, mean, covariance = (np.array(state[key]) for key in keys)
-        store.append(Submap(slots, mean, covariance))
-    return store
-
-
-def _check(submap: Submap, index: int, landmarks: int) -> None:
-    slots, mean, covariance = submap
-    if slots.ndim != 1 or slots.dtype.kind != "i":
-        raise ValueError(f"state['submap_{index}_slots'] must be whole numbers")
-    size = 3 + 2 * len(slots)
-    fits = mean.shape == (size,) and covariance.shape == (size, size)
-    inside = all(0 <= s < landmarks for s in slots.tolist())
-    if not (fits and inside):
-        raise ValueError(f"submap {index} of the state does not fit the rest of it")
-    saved_states.array(f"submap_{index}_mean", mean, (size,))
-    P = saved_states.array(f"submap_{index}_covariance", covariance, (size, size))
-    saved_states.refuse_indefinite(f"state['submap_{index}_covariance']", (P + P.T) / 2)
+    P = (submap.covariance + submap.covariance.T) / 2
+    saved_states.refuse_indefinite(f"state['{name}_covariance']", P)
+    return submap
