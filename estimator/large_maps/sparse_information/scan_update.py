@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
+from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,30 +33,13 @@ from .local_information import (
 )
 
 
-class Sparsity(NamedTuple):
-    """Limit of the links of the pose."""
-
-    bound: float  # Γ, the largest number of active landmarks, or infinity
-    prunes: bool  # whether to cut weak links instead of relocating the pose
-
-
-class ScanResult(NamedTuple):
-    """Belief and report after a scan."""
-
-    local: LocalInformation
-    pose: ConditionalPose
-    report: UpdateReport
-    added_slots: list[int]
-
-
 def process_scan(
     state: State,
     rules: ScanRules,
-    sparsity: Sparsity,
     scan: tuple[Array, list[int]],
     slots: Mapping[int, int],
     free_slots: IntArray,
-) -> ScanResult:
+) -> tuple[State, UpdateReport]:
     """Return belief and report after a scan, without changing the old belief.
 
     Parameters
@@ -67,7 +51,7 @@ def process_scan(
     slots : mapping
         Slots of the mapped landmarks by identity.
     free_slots : ndarray, shape (>= m,)
-        Slots for new landmarks.
+        Slots for new landmarks, which take the first ones.
     """
     (local, pose), (readings, ids) = state, scan
     far = readings[:, 1] >= rules.rules.min_range
@@ -79,19 +63,18 @@ def process_scan(
     names = [ids[k] for k in mapped]
     screened = rules.screen(pose, local, places, readings[mapped], names)
     used = mapped[~(screened.skipped | screened.gated)]
-    exceeds = not sparsity.prunes and _exceeds_bound(
-        pose, screened.scan.landmarks, len(new), sparsity
-    )
+    seen = screened.scan.landmarks
+    exceeds = not rules.prunes and _exceeds_bound(pose, seen, len(new), rules.bound)
     state = _absorb(rules.base, state, screened, readings[used], relocates=exceeds)
     local, pose = state
-    seen, added = screened.scan.landmarks, free_slots[: len(new)]
     if len(new):
         variance = ekf.reading_variances(rules.rules, readings[new, 1], rules.sensor)
+        added = free_slots[: len(new)]
         local, pose = add_landmarks(rules.base, state, added, readings[new], variance)
         count = len(local.slots)
         seen = np.append(seen, np.arange(count - len(new), count))
-    if sparsity.prunes:
-        pose = prune(local, pose, seen, sparsity.bound)
+    if rules.prunes:
+        pose = prune(local, pose, seen, rules.bound)
     close = np.sort(np.append(np.flatnonzero(~far), mapped[screened.skipped]))
 
     def of(rows: IntArray) -> tuple[int, ...]:
@@ -108,7 +91,7 @@ def process_scan(
         innovation=screened.scan.innovation,
         factor=screened.factor,
     )
-    return ScanResult(local, pose, report, added.tolist())
+    return (local, pose), report
 
 
 def _absorb(
@@ -126,7 +109,7 @@ def _absorb(
 
 
 def _exceeds_bound(
-    pose: ConditionalPose, seen: IntArray, new: int, sparsity: Sparsity
+    pose: ConditionalPose, seen: IntArray, new: int, bound: float
 ) -> bool:
     """Return whether a scan makes too many landmarks active and can give a new pose.
 
@@ -138,9 +121,9 @@ def _exceeds_bound(
     linked = pose.is_linked
     linked[seen] = True
     count, enough = linked.sum() + new, 3
-    if count > 2 * sparsity.bound:
+    if count > 2 * bound:
         enough = 2
-    return bool(count > sparsity.bound and len(seen) >= enough)
+    return bool(count > bound and len(seen) >= enough)
 
 
 class Screened(NamedTuple):
@@ -155,7 +138,7 @@ class Screened(NamedTuple):
 
 
 class ScanRules:
-    """Noise and acceptance rules of measurements, checked by :class:`EkfSlam`."""
+    """Noise, acceptance rules and limit of links, checked."""
 
     def __init__(
         self,
@@ -163,6 +146,8 @@ class ScanRules:
         measurement_std: ArrayLike,
         *,
         base: str,
+        active_bound: int | None,
+        sparsify: str,
         **settings: Any,
     ) -> None:
         self.base = argument_checks.one_of("base", base, tuple(BASES))
@@ -189,6 +174,13 @@ class ScanRules:
                 "measurement_std must be 2 finite numbers > 0, because an exact "
                 f"measurement has infinite information, got {measurement_std!r}"
             )
+        #: Γ, the largest number of active landmarks, or infinity.
+        self.bound: float = inf
+        if active_bound is not None:
+            self.bound = argument_checks.whole("active_bound", active_bound, 2)
+        kinds = ("relocate", "prune")
+        #: Whether to cut weak links instead of relocating the pose.
+        self.prunes = argument_checks.one_of("sparsify", sparsify, kinds) == "prune"
 
     def screen(
         self,

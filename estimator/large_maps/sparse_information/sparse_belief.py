@@ -56,7 +56,7 @@ class SparseBelief:
         (mean, P, reference), n = slam.map.arrays, slam.map.size
         slots = np.arange(len(slam.map.slots))
         belief = cls.empty(mean[:3], np.zeros(3))
-        belief.add(list(slam.map.slots), slots.tolist())
+        belief.add(list(slam.map.slots))
         inverse = cho_solve(cho_factor(P[3:n, 3:n], lower=True), np.eye(n - 3))
         gain, rest = P[:3, 3:n] @ inverse, P[:3, :3].copy()
         rest -= gain @ P[3:n, :3]
@@ -77,12 +77,11 @@ class SparseBelief:
         slots = self.free[::-1] + list(range(fresh, fresh + count))
         return np.array(slots[:count], dtype=np.int64)
 
-    def add(self, ids: Sequence[int], slots: Sequence[int]) -> None:
-        """Assign slots to new landmarks."""
-        if not ids:
-            return
+    def add(self, ids: Sequence[int]) -> None:
+        """Assign the first free slots to new landmarks."""
+        slots = self.free_slots(len(ids)).tolist()
         self.slots.update(zip(ids, slots, strict=True))
-        self.free = [slot for slot in self.free if slot not in slots]
+        self.free = self.free[: max(len(self.free) - len(ids), 0)]
         self.map_.grow(len(self.slots) + len(self.free))
 
     def checkpoint(self) -> Undo:

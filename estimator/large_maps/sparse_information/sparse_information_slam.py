@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import inf
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from ..multifrontal import PLACES, ROWS
 from . import local_information
 from .local_information import link_count
-from .scan_update import ESTIMATE, ScanRules, Sparsity, process_scan
+from .scan_update import ESTIMATE, ScanRules, process_scan
 from .sparse_belief import SparseBelief
 
 
@@ -107,13 +106,16 @@ gate_probability, noise_at_rest, min_range
         belief_limit: int = 5000,
         **settings: Any,
     ) -> None:
-        self._scan_rules = ScanRules(motion_std, measurement_std, base=base, **settings)
-        bound: float = inf
-        if active_bound is not None:
-            bound = argument_checks.whole("active_bound", active_bound, 2)
-        kind = argument_checks.one_of("sparsify", sparsify, ("relocate", "prune"))
-        self._sparsity = Sparsity(bound, kind == "prune")
-        self._largest_dense = min(bound, local_information.SMALLEST_LOCAL_MAP)
+        self._scan_rules = ScanRules(
+            motion_std,
+            measurement_std,
+            base=base,
+            active_bound=active_bound,
+            sparsify=sparsify,
+            **settings,
+        )
+        largest = local_information.SMALLEST_LOCAL_MAP
+        self._largest_dense = min(self._scan_rules.bound, largest)
         self.belief_limit = argument_checks.whole("belief_limit", belief_limit, 1)
         self.reset(initial_pose, initial_pose_std)
 
@@ -170,17 +172,15 @@ gate_probability, noise_at_rest, min_range
                 if chosen is not None:
                     belief.change_local_map(chosen)
                     belief.origin = belief.pose.mean[:2].copy()
-                result = process_scan(
+                state, belief.report = process_scan(
                     (belief.local, belief.pose),
                     self._scan_rules,
-                    self._sparsity,
                     (readings, ids),
                     belief.slots,
                     belief.free_slots(len(ids)),
                 )
-                belief.add(result.report.added_ids, result.added_slots)
-                belief.pose, belief.local = result.pose, result.local
-                belief.report = result.report
+                belief.add(belief.report.added_ids)
+                belief.local, belief.pose = state
                 belief.steps += 1
         self._held = belief
         return belief.report
