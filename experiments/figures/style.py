@@ -21,7 +21,7 @@ from ...sim_configs.scenario_files import replace_when_written
 INK, GREY, PALE = "#1b1f24", "#6b737c", "#e8eaed"
 BLUE, ORANGE, ALARM, TEAL = "#0072b2", "#e69f00", "#d55e00", "#009e73"  # Okabe, Ito
 
-_METADATA = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+_METADATA = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -76,10 +76,10 @@ def save_figure(figure: Figure, path: str | Path, dpi: float = 200) -> None:
 def draw_file(figure: Figure, path: Path, suffix: str, dpi: float = 300) -> None:
     """Write a figure in the format of a suffix, with the fonts in the file."""
     lay_out(figure, dpi)
-    form, metadata = suffix.removeprefix("."), _METADATA.get(suffix)
+    form = suffix.removeprefix(".")
     # The salt makes ids reproducible; type 42 is what publishers accept.
     with rc_context({"svg.hashsalt": "slamgym", "pdf.fonttype": 42}):
-        figure.savefig(path, dpi=dpi, format=form, metadata=metadata)
+        figure.savefig(path, dpi=dpi, format=form, metadata=_METADATA.get(form))
 
 
 def dress(axes: Axes, *, size: float = 10.0) -> None:

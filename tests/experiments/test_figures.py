@@ -23,12 +23,20 @@ from slamgym.experiments.figures import (
 )
 from slamgym.experiments.figures.accuracy import correlations, nis_band
 from slamgym.experiments.figures.maps import FIRST, LATER, PREDICTED, UPDATED
-from slamgym.experiments.figures.style import lay_out, new_figure
+from slamgym.experiments.figures.style import draw_file, lay_out, new_figure
 
 
 def noise_study(trace):
     names = [f"σ{name} {by}" for name in "xyαβr" for by in ("× 10", "÷ 10")]
     return noise_study_figure([(name, trace) for name in ("unchanged", *names)])
+
+
+@pytest.mark.parametrize("suffix", ["svg", ".svg", "pdf", ".pdf"])
+def test_a_figure_holds_no_date(tmp_path, suffix):
+    draw_file(errors_figure(make_trace()), tmp_path / "figure", suffix)
+    written = (tmp_path / "figure").read_bytes()
+    assert b"<dc:date>" not in written
+    assert b"/CreationDate" not in written
 
 
 @functools.cache
