@@ -62,12 +62,13 @@ def write(
             *_vertices(places, poses, len(landmarks)),
             *_odometry_edges(each, len(landmarks), smallest_std),
         ]
+        readings = list(_readings(each, smallest_std))
+        positions = [position for position, _ in readings]
         fixed = f"FIX {len(landmarks)}"
+        write_lines(path / f"{name}.g2o", [*graph, *positions, fixed])
         write_lines(
-            path / f"{name}.g2o", [*graph, *_xy_edges(each, smallest_std), fixed]
+            path / f"{name}_gtsam.g2o", [*graph, *(line for _, line in readings)]
         )
-        readings = _bearing_range_edges(each, smallest_std)
-        write_lines(path / f"{name}_gtsam.g2o", [*graph, *readings])
         truth = _vertices(landmarks, each.poses, len(landmarks))
         write_lines(path / f"{name}_truth.g2o", list(truth))
 
@@ -122,35 +123,25 @@ def _odometry_edges(
         )
 
 
-def _readings(trajectory: Trajectory) -> Iterator[tuple[int, int, float, float]]:
-    """Yield (pose, landmark, β, r) of every reading."""
+def _readings(trajectory: Trajectory, smallest: float) -> Iterator[tuple[str, str]]:
+    """Yield every reading as a position in the robot's frame, and as (β, r, σβ, σr).
+
+    The information of the position is of first order.
+    """
     mask = array_of(trajectory, "mask")
     measurements = array_of(trajectory, "measurements")
+    sensor = trajectory.scenario.sensor
+    bearing_std = max(sensor.std[0], smallest)
     for step, landmark in np.argwhere(mask).tolist():
         bearing, distance = measurements[step, landmark].tolist()
-        yield mask.shape[1] + step, landmark, bearing, distance
-
-
-def _stds(scenario: Scenario, distance: float, smallest: float) -> tuple[float, float]:
-    """Return (σβ, σr(r)) of a reading, at least `smallest`."""
-    bearing_std, range_std = scenario.sensor.std
-    range_std += scenario.sensor.range_std_per_metre * distance
-    return max(bearing_std, smallest), max(range_std, smallest)
-
-
-def _xy_edges(trajectory: Trajectory, smallest: float) -> Iterator[str]:
-    """Yield readings as positions in the frame of the robot, Ω to first order."""
-    for pose, landmark, bearing, distance in _readings(trajectory):
-        bearing_std, range_std = _stds(trajectory.scenario, distance, smallest)
+        range_std = max(sensor.std[1] + sensor.range_std_per_metre * distance, smallest)
         information = _turned(range_std**-2, (distance * bearing_std) ** -2, bearing)
         position = distance * math.cos(bearing), distance * math.sin(bearing)
-        yield f"EDGE_SE2_XY {pose} {landmark} {numbers((*position, *information))}"
-
-
-def _bearing_range_edges(trajectory: Trajectory, smallest: float) -> Iterator[str]:
-    for pose, landmark, bearing, distance in _readings(trajectory):
-        stds = _stds(trajectory.scenario, distance, smallest)
-        yield f"BR {pose} {landmark} {numbers((bearing, distance, *stds))}"
+        ends = f"{mask.shape[1] + step} {landmark}"
+        yield (
+            f"EDGE_SE2_XY {ends} {numbers((*position, *information))}",
+            f"BR {ends} {numbers((bearing, distance, bearing_std, range_std))}",
+        )
 
 
 def _turned(along: float, aside: float, angle: float) -> tuple[float, float, float]:
