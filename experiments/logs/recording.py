@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, cast
 import gymnasium
 import numpy as np
 
-from ...arrays import Array
+from ...arrays import Array, IntArray
 from ...envs.controllers import Controller
 from ...envs.landmark_world import LandmarkWorldEnv, Observation
 from ...estimator.models.motions import find_motion
@@ -272,6 +272,15 @@ def predictions(row: OdometryRow, motion: str) -> tuple[Prediction, ...]:
         return (Prediction((row.d, row.alpha), row.dt),)
     half = row.alpha / 2
     return Prediction((0.0, half), 0.0), Prediction((row.d, half), row.dt)
+
+
+def predictions_until(log: SlamLog) -> IntArray:
+    """Return how many predictions there are until the end of each step, (K + 1,)."""
+    counts = [
+        sum(len(predictions(row, log.motion)) for row in step.motions)
+        for step in steps_of(log)
+    ]
+    return np.cumsum(counts, dtype=np.int64)
 
 
 def _start_time(log: SlamLog) -> float:

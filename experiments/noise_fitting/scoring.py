@@ -27,7 +27,7 @@ from ...estimator.map_management.hypotheses import HypothesisSlam
 from ...estimator.map_management.managed_slam import ManagedSlam
 from ...estimator.smoother import Drive, RecordedSlam
 from ...estimator.smoother.drive import Sightings
-from ..logs.recording import predictions, steps_of
+from ..logs.recording import predictions, predictions_until, steps_of
 from ..logs.slamlog import OdometryRow, Scan, SlamLog
 from ..runs.filter_settings import SMOOTHER, FilterSettings
 from ..runs.log_replay import Progress, replay
@@ -285,13 +285,9 @@ def _distinct(sightings: Sightings) -> Iterable[Sightings]:
 
 def _times_after(log: SlamLog, counts: IntArray) -> Array:
     """Return the times after these numbers of predictions."""
-    times, until, done = [], [], 0
-    for step in steps_of(log):
-        done += sum(len(predictions(row, log.motion)) for row in step.motions)
-        times.append(step.t)
-        until.append(done)
-    reached = np.searchsorted(until, counts)
-    return np.array(times)[np.minimum(reached, len(times) - 1)]
+    times = np.array([step.t for step in steps_of(log)])
+    reached = np.searchsorted(predictions_until(log), counts)
+    return times[np.minimum(reached, len(times) - 1)]
 
 
 Motion = tuple[float, float, float]

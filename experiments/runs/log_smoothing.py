@@ -22,7 +22,7 @@ from ...estimator.smoother.batch_smoother import smooth_repaired, smoother_in
 from ...estimator.smoother.drive import Sightings
 from ...evaluation import nees
 from ..logs.ground_truth import path_accuracy, true_landmarks_of, true_poses_of
-from ..logs.recording import predictions, steps_of
+from ..logs.recording import predictions_until, steps_of
 from ..logs.slamlog import SlamLog
 from . import summary
 from .filter_settings import FilterSettings, one_blas_thread
@@ -108,7 +108,7 @@ def smooth_log(
             drive = smoother.smoothed()
     if not isinstance(drive, SmoothedDrive):
         raise ValueError(f"estimator '{settings.estimator}' is not slamgym's smoother")
-    readings = _readings_until(log)
+    readings = predictions_until(log)
     scan_steps = np.searchsorted(readings, drive.readings_until).astype(np.int64)
     return SmoothedLog(filtered, drive, drive.path[readings], scan_steps, repair)
 
@@ -202,15 +202,6 @@ def _repair_table(smoothed: SmoothedLog) -> dict[str, Any] | None:
         "landmarks": len(found.drive.landmark_ids),
         "unused": int((ids < 0).sum()),
     }
-
-
-def _readings_until(log: SlamLog) -> IntArray:
-    """Return how many readings of odometry there are until each step, (K + 1,)."""
-    counts = [
-        sum(len(predictions(row, log.motion)) for row in step.motions)
-        for step in steps_of(log)
-    ]
-    return np.cumsum(counts, dtype=np.int64)
 
 
 def _nees(smoothed: SmoothedLog) -> dict[str, Any] | None:
