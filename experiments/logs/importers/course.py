@@ -16,7 +16,7 @@ import numpy as np
 
 from ....arrays import Array, IntArray
 from .. import slamlog
-from ..log_lines import LogLine, read_lines, shown
+from ..log_lines import read_lines, shown
 
 #: Ground truth that the homework prints for the six landmarks of its log [m].
 PUBLISHED_LANDMARKS = np.array([[3, 6], [3, 12], [7, 8], [7, 14], [11, 6], [11, 12.0]])
@@ -54,10 +54,17 @@ def read_course(path: str | PathLike[str]) -> slamlog.SlamLog:
         raise lines[0].error("pairs of bearing and range", f"{count} numbers")
     recorder = slamlog.EventRecorder()
     for k, line in enumerate(lines):
+        t, fields = float((k + 1) // 2), line.text.split()
         if k % 2:
-            _take_odometry(recorder, line, (k + 1) // 2)
-        else:
-            _take_scan(recorder, line, k // 2, count)
+            line.check_count(fields, (2,), "odometry d α")
+            d, alpha = map(line.to_real, fields)
+            recorder.add_row(line, slamlog.OdometryRow(t, d, alpha, dt=1.0))
+            continue
+        line.check_count(fields, (count,), f"{count // 2} pairs of bearing and range")
+        numbers = list(map(line.to_real, fields))
+        pairs = zip(map(slamlog.wrap_bearing, numbers[::2]), numbers[1::2], strict=True)
+        for landmark, reading in enumerate(pairs):
+            recorder.add_reading(line, slamlog.Reading(t, landmark, *reading))
     events = recorder.finish()
     ids, landmarks, origin = _truth(path, cast(slamlog.Scan, events[0]))
     return slamlog.SlamLog(
@@ -97,26 +104,6 @@ def _is_published_world(scan: slamlog.Scan) -> bool:
     seen = np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], axis=1)
     apart = np.linalg.norm(seen - PUBLISHED_LANDMARKS, axis=1)
     return bool((apart <= MATCH_DISTANCE).all())
-
-
-def _take_odometry(recorder: slamlog.EventRecorder, line: LogLine, step: int) -> None:
-    fields = line.text.split()
-    line.check_count(fields, (2,), "odometry d α")
-    d, alpha = map(line.to_real, fields)
-    recorder.add_row(line, slamlog.OdometryRow(float(step), d, alpha, dt=1.0))
-
-
-def _take_scan(
-    recorder: slamlog.EventRecorder, line: LogLine, step: int, count: int
-) -> None:
-    fields = line.text.split()
-    line.check_count(fields, (count,), f"{count // 2} pairs of bearing and range")
-    pairs = np.array([line.to_real(field) for field in fields]).reshape(-1, 2)
-    for k, (bearing, distance) in enumerate(pairs):
-        reading = slamlog.Reading(
-            float(step), k, slamlog.wrap_bearing(float(bearing)), float(distance)
-        )
-        recorder.add_reading(line, reading)
 
 
 ROW_FORMS = {"ODOMETRY": "ODOMETRY r1 t r2", "SENSOR": "SENSOR id range bearing"}

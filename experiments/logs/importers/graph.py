@@ -433,7 +433,10 @@ def _events(
         if step:
             _take_increment(recorder, chain[step - 1], step)
         for line in graph.readings.get(pose, []):
-            _take_reading(recorder, line, step)
+            x, y = reals_at(line, 3, 5)
+            polar = slamlog.wrap_bearing(math.atan2(y, x)), math.hypot(x, y)
+            reading = slamlog.Reading(float(step), id_at(line, 2), *polar)
+            recorder.add_reading(line, reading)
     return recorder.finish()
 
 
@@ -444,12 +447,4 @@ def _take_increment(recorder: slamlog.EventRecorder, line: LogLine, step: int) -
     distance = sign * math.hypot(dx, dy)
     recorder.add_turn_drive_turn(
         line, step, before=direction, d=distance, after=turn - direction
-    )
-
-
-def _take_reading(recorder: slamlog.EventRecorder, line: LogLine, step: int) -> None:
-    x, y = reals_at(line, 3, 5)
-    bearing = slamlog.wrap_bearing(math.atan2(y, x))
-    recorder.add_reading(
-        line, slamlog.Reading(float(step), id_at(line, 2), bearing, math.hypot(x, y))
     )
