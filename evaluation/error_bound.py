@@ -50,7 +50,7 @@ class PosteriorBound(NamedTuple):
     map: Array
     #: Of (x, y, θ, l1x, …) at the end of each run, shape (3 + 2n, 3 + 2n) for the n
     #: landmarks that it read, in the order of their rows.
-    covariances: tuple[Array, ...]
+    covariances: tuple[Array, ...] = ()
 
 
 class Efficiency(NamedTuple):
@@ -124,7 +124,7 @@ def posterior_bound(
     fixes = np.broadcast_to(np.square(pose_std), (count, steps, 3)).astype(np.float64)
     position, heading, raw = (np.full((count, steps), np.nan) for _ in range(3))
     if read not in (BEARING_RANGE, POSITION):
-        return PosteriorBound(position, heading, raw, np.full(count, np.nan), ())
+        return PosteriorBound(position, heading, raw, np.full(count, np.nan))
     starts = _invariant_start(poses[:, :1], start)
     runs = zip(poses, places, seen, durations, fixes, strict=True)
     rows = zip(position, heading, raw, strict=True)

@@ -38,6 +38,12 @@ class Estimate(NamedTuple):
     landmarks: Array = np.zeros((0, 2))
     landmark_covariances: Array = np.zeros((0, 2, 2))
 
+    def at(self, rows: IntArray) -> "Estimate":
+        """Return the same file with some of its poses only."""
+        times = None if self.times is None else self.times[rows]
+        poses, covariances = self.poses[rows], self.covariances[rows]
+        return self._replace(poses=poses, covariances=covariances, times=times)
+
 
 def true_path(path: Path) -> Array:
     """Read rows (t, x, y, θ) of TUM, or of a log with ground truth."""

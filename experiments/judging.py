@@ -59,7 +59,7 @@ FRAMES = {"additive": "additive", "invariant": "invariant", "right": "invariant"
 _BOUNDS = ("position_bound", "position_bound_raw", "heading_bound", "map_bound")
 _UNKNOWN = np.array(np.nan)
 #: For estimates without a map: what came later may be in their poses.
-_NO_BOUND = PosteriorBound(_UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, ())
+_NO_BOUND = PosteriorBound(_UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN)
 NO_FILE = "there is no file of estimates"
 _AT_ONCE = 100  # drives in memory
 _ON_TIME = 0.01  # of a step
@@ -233,16 +233,13 @@ def _chunks(
         alike = list(_alike(some, runs))
         noise = np.concatenate([noise_of_runs(s, s, same) for s, same in alike])
         bound = _NO_BOUND
-        if any(_has_map(each) for listed in files.values() for each in listed):
+        given = (each for listed in files.values() for each in listed)
+        if any(isinstance(each, Estimate) and len(each.landmark_ids) for each in given):
             bounds = [bound_runs(scenario, same)[:4] for scenario, same in alike]
-            joined = zip(*bounds, strict=True)
-            position, heading, raw, of_map = (np.concatenate(each) for each in joined)
-            bound = PosteriorBound(position, heading, raw, of_map, ())
+            joined = (np.concatenate(each) for each in zip(*bounds, strict=True))
+            position, heading, raw, of_map = joined
+            bound = PosteriorBound(position, heading, raw, of_map)
         yield _Chunk(runs, files, bound, noise, some[0].scenario.dt)
-
-
-def _has_map(estimate: Estimate | str) -> bool:
-    return isinstance(estimate, Estimate) and len(estimate.landmark_ids) > 0
 
 
 def _runs_of(drives: Sequence[Trajectory]) -> SimulatedRuns:
@@ -320,32 +317,20 @@ def _paths(truth: Place | Sequence[Place], sources: dict[str, list[Path]]) -> _T
                 estimate, exact = inside[label, name]
                 few = np.linspace(0, len(exact) - 1, count).round().astype(int)
                 poses[row] = exact[few]
-                files.append(
-                    estimate._replace(
-                        poses=estimate.poses[few],
-                        covariances=estimate.covariances[few],
-                        times=None,
-                    )
-                )
-            yield _chunk_without_world(poses, {label: files})
+                files.append(estimate.at(few)._replace(times=None))
+            empty = np.zeros((len(names), count, 0, 2))  # of a world without landmarks
+            runs = SimulatedRuns(
+                odometry=np.zeros((len(names), count, 2)),
+                measurements=empty,
+                visible=np.zeros(empty.shape[:3], np.bool_),
+                true_poses=poses,
+                landmarks=empty[:, 0],
+                initial_poses=poses[:, 0],
+            )
+            noise = np.zeros((len(names), len(CHANNELS), len(MOMENTS)))
+            yield _Chunk(runs, {label: files}, _NO_BOUND, noise)
 
     return _Task(Path(places[0]).stem, "", 0, names, chunks())
-
-
-def _chunk_without_world(
-    poses: Array, files: dict[str, list[Estimate | str]]
-) -> _Chunk:
-    count, steps, _ = poses.shape
-    runs = SimulatedRuns(
-        odometry=np.zeros((count, steps, 2)),
-        measurements=np.zeros((count, steps, 0, 2)),
-        visible=np.zeros((count, steps, 0), np.bool_),
-        true_poses=poses,
-        landmarks=np.zeros((count, 0, 2)),
-        initial_poses=poses[:, 0],
-    )
-    noise = np.zeros((count, len(CHANNELS), len(MOMENTS)))
-    return _Chunk(runs, files, _NO_BOUND, noise)
 
 
 def _within(estimate: Estimate, path: Array) -> tuple[Estimate, Array]:
@@ -358,13 +343,8 @@ def _within(estimate: Estimate, path: Array) -> tuple[Estimate, Array]:
             )
         return estimate, path[:, 1:]
     exact = poses_at(estimate.times, path)
-    inside = np.isfinite(exact).all(axis=1)
-    kept = estimate._replace(
-        poses=estimate.poses[inside],
-        covariances=estimate.covariances[inside],
-        times=estimate.times[inside],
-    )
-    return kept, exact[inside]
+    inside = np.flatnonzero(np.isfinite(exact).all(axis=1))
+    return estimate.at(inside), exact[inside]
 
 
 # --------------------------------------------------------------------------------------
