@@ -64,7 +64,7 @@ def truth_figure(trace: RunTrace, walls: Walls = ()) -> Figure:
         figure = style.new_figure(10.8, tall + 1.5)
         area, *beside = figure.subplots(1, 3, width_ratios=[6.2, 1.7, 1.7])
         ids = trace.landmark_ids[landmarks].astype(np.int64)
-        _draw_distances(beside[0], beside[1], distances, ids, room=tall)
+        _draw_distances(beside, distances, ids, room=tall)
     style.dress_map(area, limits)
     keys = draw_against_truth(area, trace) + draw_walls(area, walls)
     style.write_title(
@@ -142,18 +142,13 @@ def distances_from_truth(trace: RunTrace) -> LandmarkDistances | None:
 
 
 def _draw_distances(
-    metres: Axes,
-    sigmas: Axes,
-    distances: LandmarkDistances,
-    ids: IntArray,
-    *,
-    room: float,
+    panels: Sequence[Axes], distances: LandmarkDistances, ids: IntArray, *, room: float
 ) -> None:
     """Draw one bar per landmark, in the order of their ids from the top.
 
     As many are named as fit into the height of the axes, `room` [inches].
     """
-    order = np.argsort(ids)
+    (metres, sigmas), order = panels, np.argsort(ids)
     _draw_bars(metres, distances.euclidean[order])
     _draw_bars(sigmas, distances.mahalanobis[order])
     names = [f"l{i}" for i in ids[order]]
@@ -379,14 +374,15 @@ def covariance_figure(trace: RunTrace) -> Figure:
     counts = [len(ids) for ids, *_ in trace.landmark_history]
     first_step = next((step for step, count in enumerate(counts) if count), 0)
     figure = style.new_figure(12.4, 5.6)
-    before, after = figure.subplots(1, 2)
-    _draw_correlations(before, trace.first_covariance, trace.map_at(first_step).ids)
-    size = _size_of_correlations(trace.first_covariance, first_step)
-    style.write_title(before, "Before: the first map", size)
-    image = _draw_correlations(after, trace.final_covariance, trace.landmark_ids)
-    size = _size_of_correlations(trace.final_covariance, trace.last_step)
-    style.write_title(after, "After: the final map", size)
-    bar = figure.colorbar(image, ax=[before, after], shrink=0.85, aspect=28, pad=0.015)
+    panels, ids = figure.subplots(1, 2), trace.map_at(first_step).ids
+    for axes, title, step, shown, covariance in (
+        (panels[0], "Before: the first map", first_step, ids, trace.first_covariance),
+        (panels[1], "After: the final map", trace.last_step, trace.landmark_ids,
+         trace.final_covariance),
+    ):  # fmt: skip
+        image = _draw_correlations(axes, covariance, shown)
+        style.write_title(axes, title, _size_of_correlations(covariance, step))
+    bar = figure.colorbar(image, ax=panels, shrink=0.85, aspect=28, pad=0.015)
     bar.set_label("correlation", fontsize=10, color=style.INK)
     bar.ax.tick_params(labelsize=9, color=style.GREY)
     bar.outline.set_visible(False)
