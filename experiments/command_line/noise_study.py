@@ -137,14 +137,8 @@ class Results(NamedTuple):
     shown: Sequence[Any]
 
 
-class Study(NamedTuple):
-    """A noise study to run and to write."""
-
-    #: Of its folder, by default.
-    names: tuple[str, str]
-    #: The head of its summary.
-    about: dict[str, Any]
-    run: Callable[[Reporter], Results]
+#: The names of its folder, by default; the head of its summary; what runs it.
+Study = tuple[tuple[str, str], dict[str, Any], Callable[[Reporter], Results]]
 
 
 def one_run_study(
@@ -154,7 +148,6 @@ def one_run_study(
     study: "Callable[..., list[NoiseRun]]",
 ) -> Study:
     """Prepare the study of a log or of one run of a scenario."""
-    from ... import __version__
     from ..runs.summary import settings_table
 
     def run(reporter: Reporter) -> Results:
@@ -170,18 +163,12 @@ def one_run_study(
         rows, titles = [run.row for run in runs], [run.title for run in runs]
         return Results(rows, titles, drawn, 130, (title, runs_table(runs)))
 
-    about = {
-        "slamgym": __version__,
-        "name": name,
-        "estimator": estimator,
-        "settings": settings_table(settings),
-    }
-    return Study((name, estimator), about, run)
+    about = {"estimator": estimator, "settings": settings_table(settings)}
+    return (name, estimator), about, run
 
 
 def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
     """Prepare the study of a scenario over many runs."""
-    from ... import __version__
     from ...estimator.registry import split_labels
     from ..noise_study import CHANGED, noise_effects, noise_effects_figure
     from .tables import effects_table
@@ -203,27 +190,29 @@ def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
         shown = [effects_table(world.name, runs, effects)]
         return Results(effects, (), noise_effects_figure(effects), 150, shown)
 
-    about = {"slamgym": __version__, "name": world.name, "runs": runs, "seed": seed}
-    return Study((world.name, f"{runs}-runs"), about, run)
+    return (world.name, f"{runs}-runs"), {"runs": runs, "seed": seed}, run
 
 
 def write_study(study: Study, out: Path | None, reporter: Reporter) -> None:
     """Run a study, write its figure, table and summary, and print its results."""
+    from ... import __version__
     from ..figures.style import sign
     from .output_folder import default_folder, output_folder, write_summary
     from .tables import written
 
-    place = out or default_folder("noise-study", *study.names)
+    names, about, run = study
+    head = {"slamgym": __version__, "name": names[0], **about}
+    place = out or default_folder("noise-study", *names)
     with output_folder(place) as folder:
-        found = study.run(reporter)
-        figure = sign(found.figure, " · ".join(study.names))
+        found = run(reporter)
+        figure = sign(found.figure, " · ".join(names))
         figures.save_figure(figure, folder / "noise_study.png", dpi=found.dpi)
         _write_csv(folder / "noise_study.csv", found.rows)
         rows = [_plain(row) for row in found.rows]
         if found.titles:
             titles = zip(found.titles, rows, strict=True)
             rows = [{"title": title, **row} for title, row in titles]
-        summary = write_summary(folder, {**study.about, "rows": rows})
+        summary = write_summary(folder, {**head, "rows": rows})
     reporter.show(*found.shown, "", written(str(place), summary["files"]))
     reporter.finish({**summary, "out": str(place)})
 

@@ -108,7 +108,10 @@ def _in_a_batch(
     finite[:, -1] &= [belief is None or _is_finite_map(belief) for belief in beliefs]
     failures = {}
     for run in np.flatnonzero(~finite.all(axis=1)).tolist():
-        failures[run] = _why(settings, runs, run, int(finite[run].argmin()))
+        # the single filter repeats the run, for its message
+        again = _empty_trace(*runs.visible.shape[:2])
+        found = _one_by_one(settings, runs, run, again, [], {})
+        failures[run] = found or Failure(int(finite[run].argmin()), _NOT_FINITE)
         _erase(trace, run, failures[run].step)
         beliefs[run] = None
     return FilteredRuns(trace, beliefs, failures)
@@ -152,13 +155,6 @@ def _renamed(belief: interface.Belief, runs: SimulatedRuns) -> interface.Belief:
     return replace(belief, landmark_ids=tuple(runs.ids_of(rows)))
 
 
-def _why(settings: FilterSettings, runs: SimulatedRuns, run: int, step: int) -> Failure:
-    """Repeat a run that failed in a batch, for the message of the single filter."""
-    trace = _empty_trace(*runs.visible.shape[:2])
-    failure = _one_by_one(settings, runs, run, trace, [], {})
-    return failure or Failure(step, _NOT_FINITE)
-
-
 def _one_by_one(
     settings: FilterSettings,
     runs: SimulatedRuns,
@@ -181,7 +177,10 @@ def _one_by_one(
             if not _finite(trace, (run, step)):
                 return Failure(step, _NOT_FINITE)
         if (smoother := smoother_in(slam)) is not None:
-            belief = _take_smoothed(smoother.smoothed(), trace, run)
+            path = smoother.smoothed()  # without innovations, and so without NIS
+            belief, covariances = path.belief(), path.pose_covariances
+            trace.poses[run], trace.pose_covariances[run] = path.poses, covariances
+            trace.nis[run], trace.degrees_of_freedom[run] = 0.0, 0
     except (Exception, SystemExit) as error:
         return Failure(step, f"{type(error).__name__}: {error}")
     if not _is_finite_map(belief):
@@ -219,18 +218,6 @@ def _step(
     trace.nis[run, step] = report.nis
     trace.degrees_of_freedom[run, step] = report.degrees_of_freedom
     return belief
-
-
-def _take_smoothed(
-    path: interface.SmoothedPath, trace: BatchTrace, run: int
-) -> interface.Belief:
-    """Put the poses given the whole drive in place of the filter's; return the belief.
-
-    They have no innovations, and so no NIS.
-    """
-    trace.poses[run], trace.pose_covariances[run] = path.poses, path.pose_covariances
-    trace.nis[run], trace.degrees_of_freedom[run] = 0.0, 0
-    return path.belief()
 
 
 def _finite(trace: BatchTrace, where: Any = ...) -> BoolArray:

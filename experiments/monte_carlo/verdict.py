@@ -336,19 +336,16 @@ def _failed(label: str, entry: Mapping[str, Any], runs: int) -> str:
     groups = entry["failure_groups"]
     if not groups:
         return ""
-    named = [_group(group) for group in groups[:_MOST_GROUPS]]
+    named = []
+    for group in groups[:_MOST_GROUPS]:
+        message = textwrap.shorten(group["message"], _LETTERS, placeholder=" …")
+        at = f", step {group['step']}" if group["step"] >= 0 else ""
+        named.append(f"{group['count']} × {message} (first: run {group['run']}{at})")
     if len(groups) > _MOST_GROUPS:
         others = sum(group["count"] for group in groups[_MOST_GROUPS:])
         named.append(f"{others} × other messages")
-    return f"{label}: {runs - entry['good_runs']} of {runs} runs failed: " + (
-        "; ".join(named) + "."
-    )
-
-
-def _group(group: Mapping[str, Any]) -> str:
-    message = textwrap.shorten(group["message"], _LETTERS, placeholder=" …")
-    at = f", step {group['step']}" if group["step"] >= 0 else ""
-    return f"{group['count']} × {message} (first: run {group['run']}{at})"
+    failed = runs - entry["good_runs"]
+    return f"{label}: {failed} of {runs} runs failed: {'; '.join(named)}."
 
 
 # --------------------------------------------------------------------------------------

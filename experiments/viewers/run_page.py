@@ -146,7 +146,7 @@ def _readings(scan: Scan | None) -> tuple[Array, IntArray]:
 def _pack_filter(
     packed: PackedArrays, prefix: str, run: ViewedRun, steps: Sequence[int]
 ) -> None:
-    """Pack the beliefs of one filter."""
+    """Pack the beliefs of one filter, and the true positions of its landmarks."""
     trace, maps = run.trace, [map_at(run, step) for step in steps]
     _pack_poses(packed, prefix, trace, steps)
     packed.put_frames(f"{prefix}id", [frame.ids for frame in maps], "int32")
@@ -154,7 +154,12 @@ def _pack_filter(
     packed.put_frames(f"{prefix}outcome", [frame.outcomes for frame in maps], "uint8")
     packed.put_frames(f"{prefix}row_id", [frame.row_ids for frame in maps], "int32")
     _pack_correlations(packed, prefix, run.frames, steps)
-    _pack_true_map(packed, prefix, trace)
+    packed.put(f"{prefix}final.id", trace.landmark_ids, "int32")
+    truth = trace.true_landmarks
+    if truth is None:
+        truth = np.full((len(trace.landmark_ids), 2), np.nan)
+    packed.put(f"{prefix}final.x", truth[:, 0], "float32")
+    packed.put(f"{prefix}final.y", truth[:, 1], "float32")
 
 
 def _pack_maps(packed: PackedArrays, prefix: str, maps: Sequence[MapFrame]) -> None:
@@ -166,16 +171,6 @@ def _pack_maps(packed: PackedArrays, prefix: str, maps: Sequence[MapFrame]) -> N
         packed.put_frames(f"{prefix}std_{name}", std, "int16")
     rho = [np.round(_rho(frame.covariances) * 32000) for frame in maps]
     packed.put_frames(f"{prefix}rho", rho, "int16")
-
-
-def _pack_true_map(packed: PackedArrays, prefix: str, trace: RunTrace) -> None:
-    """Pack the true positions of the landmarks in a filter's map."""
-    packed.put(f"{prefix}final.id", trace.landmark_ids, "int32")
-    truth = trace.true_landmarks
-    if truth is None:
-        truth = np.full((len(trace.landmark_ids), 2), np.nan)
-    packed.put(f"{prefix}final.x", truth[:, 0], "float32")
-    packed.put(f"{prefix}final.y", truth[:, 1], "float32")
 
 
 def _pack_poses(
