@@ -69,6 +69,7 @@ def test_solution_cost_and_covariances_are_those_of_dense_least_squares(example)
     assert joint == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sensor", "std"),
     [
