@@ -25,6 +25,7 @@ from slamgym.evaluation.trajectory_error import position_accuracy
 from slamgym.sim_configs import Scenario, load_scenario
 
 METHODS: dict[str, dict[str, Any]] = {
+    "default": {},
     "nearest": {"association": "nearest", "constellations": False},
     "joint": {"association": "joint", "constellations": False},
     "nearest, constellations": {"association": "nearest", "constellations": True},

@@ -396,7 +396,7 @@ def coincide(
     Raises
     ------
     numpy.linalg.LinAlgError
-        If C is not positive definite.
+        If S is not positive definite.
 
     Examples
     --------

@@ -1,8 +1,9 @@
 """The family of EKF-SLAM filters on the shared kernels, and their settings.
 
-`MapFilter` predicts and updates for all of them. `EkfSlam` is the standard filter. Its
-subclasses differ in where they linearise and in their error frame: `InvariantEkfSlam`,
-`FirstEstimatesEkfSlam`, `ObservabilityConstrainedEkfSlam` and `IteratedEkfSlam`.
+`MapFilter` holds what all of them share: settings, map and saved state. `EkfSlam`, the
+standard filter, predicts and updates. Its subclasses differ in where they linearise and
+in their error frame: `InvariantEkfSlam`, `FirstEstimatesEkfSlam`,
+`ObservabilityConstrainedEkfSlam` and `IteratedEkfSlam`.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ def njit_reordered(function: Kernel) -> Kernel:
 def njit_inlined(function: Kernel) -> Kernel:
     """Copy the body of a function into its caller, which compiles it only once.
 
-    For a function that calls other kernels and has one caller.
+    For a short function, or one that calls other kernels and has one caller.
     """
     return cast("Kernel", njit(inline="always", error_model="numpy")(function))
 

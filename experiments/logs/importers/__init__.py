@@ -1,6 +1,7 @@
 """Readers of public log formats, one module each.
 
-``any_format`` recognises a format by the first line of the file.
+``any_format`` recognises a format by the first line of a file, or by the
+files in a folder.
 """
 
 from typing import TYPE_CHECKING
