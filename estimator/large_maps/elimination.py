@@ -1,12 +1,18 @@
 """Elimination of the unknowns of a large sparse map, and its order.
 
 `LandmarkElimination` eliminates all landmarks except the local map from a sparse
-information matrix.  Each node of a :class:`LandmarkDissection` eliminates its own
-landmarks, after those of its descendants (:mod:`.multifrontal`).  Landmarks of the
-local map are not eliminated: they remain in the fronts up to the root, where the update
-is −C, the Schur complement without Λ_LL.  Nodes that do not depend on the local map are
-cached.  When the local map changes, only the nodes above the old and the new local map
-are computed again.
+information matrix.  Each node of a tree eliminates its own landmarks, after those of
+its descendants (:mod:`.multifrontal`).  Landmarks of the local map are not eliminated:
+they remain in the fronts up to the root, where the update is −C, the Schur complement
+without Λ_LL.  Nodes that do not depend on the local map are cached.  When the local map
+changes, only the nodes above the old and the new local map are computed again.
+
+The nodes form a binary tree of separators.  The landmarks are halved by position.
+Those of one half that are linked with the other half separate the two.  They belong to
+the root and are eliminated last; both halves are dissected in the same way (nested
+dissection, George 1973).  Node k has the children 2k and 2k + 1.  Of two linked
+landmarks, the node of one is always an ancestor of the node of the other, or the same
+node.  Elimination in one branch therefore does not affect any other branch.
 
 `SubmapElimination` solves the least-squares problem of joined submaps in the same way,
 part by part of the tree that `dissect` returns.
@@ -31,6 +37,9 @@ from .multifrontal import (
     substitute_back,
     substitute_forward,
 )
+
+LEAF = 75  # largest number of landmarks in a leaf
+EXTRA_LEVELS = 6  # levels by which a branch may exceed the depth of a balanced tree
 
 
 class _Eliminated(NamedTuple):
@@ -57,30 +66,53 @@ class LandmarkElimination:
     """Elimination order of a map, and the eliminated nodes that are still valid."""
 
     def __init__(self) -> None:
-        self.dissection = LandmarkDissection()
+        #: Node of each landmark by slot; 0 for landmarks without a node.
+        self.nodes = np.zeros(0, dtype=np.int64)
+        #: Number of landmarks when the whole map was dissected.
+        self.dissected = 0
         self._cache: dict[int, _Eliminated] = {}
-
-    def checkpoint(self) -> Callable[[], None]:
-        """Return what takes back later changes of the order."""
-        nodes, dissected = self.dissection.nodes.copy(), self.dissection.dissected
-
-        def undo() -> None:
-            self.dissection.nodes, self.dissection.dissected = nodes, dissected
-            self._cache.clear()
-
-        return undo
 
     @property
     def nbytes(self) -> int:
         """Memory of the cached nodes [bytes]."""
         return sum(part.nbytes for part in self._cache.values())
 
+    def grow(self, count: int) -> None:
+        """Make room for ``count`` landmarks."""
+        more = np.zeros(max(count - len(self.nodes), 0), dtype=np.int64)
+        self.nodes = np.append(self.nodes, more)
+
     def revise(
         self, matrix: InformationMatrix, first: Array, changed: IntArray
     ) -> None:
-        """Update the elimination order after rows changed, and drop invalid nodes."""
-        nodes, dissected = self.dissection.revise(matrix, first, changed)
-        invalid = with_ancestors(np.append(nodes, np.array(dissected, dtype=np.int64)))
+        """Update the elimination order after rows changed, and drop invalid nodes.
+
+        Parameters
+        ----------
+        matrix : InformationMatrix
+        first : ndarray, shape (2n,) or longer
+            First position estimates of the landmarks [m].
+        changed : ndarray, shape (k,)
+            Landmarks whose rows changed.
+        """
+        count = len(matrix)
+        self.grow(count)
+        before = self.nodes[changed]
+        filled = matrix.is_filled(changed)
+        self.nodes[changed[~filled]] = 0
+        new = changed[filled & (self.nodes[changed] == 0)]
+        total = len(new) + int((self.nodes > 0).sum())
+        if total > 2 * self.dissected:
+            self.dissected = total
+            everything = np.arange(count)
+            self._dissect(matrix, first, everything[matrix.is_filled(everything)], 1)
+            self._cache.clear()
+            return
+        self._insert(matrix, new)
+        self._raise_linked(matrix, changed[filled])
+        after = self.nodes[changed]
+        dissected = self._dissect_large_leaves(matrix, first, np.unique(after))
+        invalid = with_ancestors(np.concatenate([before, after, dissected]).astype(int))
         cached = np.array(list(self._cache), dtype=np.int64)
         for top in dissected:
             invalid.update(cached[descends(cached, top)].tolist())
@@ -89,8 +121,8 @@ class LandmarkElimination:
 
     def eliminate(self, matrix: InformationMatrix, local: IntArray) -> RestFactor:
         """Eliminate all landmarks except the local ones."""
-        self.dissection.grow(len(matrix))
-        nodes = self.dissection.nodes
+        self.grow(len(matrix))
+        nodes = self.nodes
         place = np.full(len(nodes), -1)
         place[local] = np.arange(len(local))
         is_local = place >= 0
@@ -117,153 +149,6 @@ class LandmarkElimination:
         return RestFactor(
             [part.node for part in done.values()], slots, border[order], C, len(nodes)
         )
-
-
-def _by_node(slots: IntArray, nodes: IntArray) -> dict[int, IntArray]:
-    """Group landmarks by their nodes."""
-    order = slots[np.argsort(nodes[slots], kind="stable")]
-    names, starts = np.unique(nodes[order], return_index=True)
-    groups = np.split(order, starts[1:])[: len(names)]
-    return dict(zip(names.tolist(), groups, strict=True))
-
-
-def _eliminate(
-    matrix: InformationMatrix, own: IntArray, far: BoolArray, below: list[_Eliminated]
-) -> _Eliminated:
-    """Eliminate a node's own landmarks; ``far`` marks those not below the node."""
-    counts, links, blocks = matrix.rows(own)
-    inherited = [child.node.rest[::2] // 2 for child in below]
-    is_rest = np.zeros(len(far), dtype=bool)
-    for slots in (links[far[links]], *inherited):
-        is_rest[slots] = True
-    is_rest[own] = False
-    rest = np.flatnonzero(is_rest)
-    place = np.full(len(far), -1)
-    place[own] = np.arange(len(own))
-    place[rest] = np.arange(len(own), len(own) + len(rest))
-    p, r = 2 * len(own), 2 * len(rest)
-    top, remainder = np.zeros((p, p + r)), np.zeros((r, r))
-    here = place[links]
-    row = np.repeat(np.arange(len(own)), counts)[here >= 0]
-    quads = top.reshape(len(own), 2, len(own) + len(rest), 2)
-    quads[row, :, here[here >= 0], :] = blocks[here >= 0]
-    for child, slots in zip(below, inherited, strict=True):
-        add_update(top, remainder, pairs(place[slots]), child.update)
-    node = eliminate(top, remainder, pairs(own), pairs(rest))
-    return _Eliminated(node, remainder if below else None)
-
-
-class RestFactor(NamedTuple):
-    """All landmarks H except the local ones L, eliminated from a map.
-
-    ::
-
-        Λ_LL δ_L + Λ_LH δ_H = b_L,   Λ_HL δ_L + Λ_HH δ_H = 0
-        ⟹ (Λ_LL − C) δ_L = b_L,   δ_H = −T δ_B,   T = Λ_HH⁻¹ Λ_HB,   C = Λ_BH T
-
-    where B ⊂ L are the local landmarks linked with H.
-    """
-
-    nodes: list[Node]  # children first
-    slots: IntArray  # H
-    border: IntArray  # B, in the order of L
-    complement: Array  # C, shape (2c, 2c), symmetric
-    size: int  # number of slots of the map
-
-    def respond(self, shift: Array) -> Array:
-        """Return T δ_B."""
-        values = np.zeros(2 * self.size)
-        values[pairs(self.border)] = shift
-        substitute_back(self.nodes, values)
-        return -values[pairs(self.slots)]
-
-    def covariance(self, slots: IntArray) -> tuple[Array, Array]:
-        """Return blocks of Λ_HH⁻¹ and rows of T.
-
-        Parameters
-        ----------
-        slots : ndarray, shape (v,)
-            Eliminated landmarks.
-
-        Returns
-        -------
-        covariance : ndarray, shape (2v, 2v)
-        response : ndarray, shape (2v, 2c)
-        """
-        columns = pairs(slots)
-        size = len(columns)
-        where = (np.arange(size), columns)
-        unit = csc_array((np.ones(size), where), (size, 2 * self.size))
-        covariance, remainder = marginal_covariance(self.nodes, unit)
-        response = np.zeros((size, 2 * len(self.border)))
-        for column, unknown in enumerate(pairs(self.border).tolist()):
-            response[:, column] = -remainder.get(unknown, 0.0)
-        return covariance, response
-
-
-# --------------------------------------------------------------------------------------
-# Elimination order of the landmarks of a map: a binary tree of separators.
-#
-# The landmarks are halved by position.  Those of one half that are linked with the
-# other half separate the two.  They belong to the root and are eliminated last; both
-# halves are dissected in the same way (nested dissection, George 1973).  Node k has the
-# children 2k and 2k + 1.  Of two linked landmarks, the node of one is always an
-# ancestor of the node of the other, or the same node.  Elimination in one branch
-# therefore does not affect any other branch.
-
-LEAF = 75  # largest number of landmarks in a leaf
-EXTRA_LEVELS = 6  # levels by which a branch may exceed the depth of a balanced tree
-
-
-class LandmarkDissection:
-    """Node of each landmark by slot; 0 for landmarks without a node."""
-
-    def __init__(self) -> None:
-        self.nodes = np.zeros(0, dtype=np.int64)
-        self.dissected = 0  # number of landmarks when the whole map was dissected
-
-    def grow(self, count: int) -> None:
-        """Make room for ``count`` landmarks."""
-        more = np.zeros(max(count - len(self.nodes), 0), dtype=np.int64)
-        self.nodes = np.append(self.nodes, more)
-
-    def revise(
-        self, matrix: InformationMatrix, first: Array, changed: IntArray
-    ) -> tuple[IntArray, list[int]]:
-        """Update the tree after rows of the matrix changed.
-
-        Parameters
-        ----------
-        matrix : InformationMatrix
-        first : ndarray, shape (2n,) or longer
-            First position estimates of the landmarks [m].
-        changed : ndarray, shape (k,)
-            Landmarks whose rows changed.
-
-        Returns
-        -------
-        nodes : ndarray
-            Nodes that the landmarks were in or are in now.
-        dissected : list of int
-            Nodes whose branches were dissected again.
-        """
-        count = len(matrix)
-        self.grow(count)
-        before = self.nodes[changed]
-        filled = matrix.is_filled(changed)
-        self.nodes[changed[~filled]] = 0
-        new = changed[filled & (self.nodes[changed] == 0)]
-        total = len(new) + int((self.nodes > 0).sum())
-        if total > 2 * self.dissected:
-            self.dissected = total
-            everything = np.arange(count)
-            self._dissect(matrix, first, everything[matrix.is_filled(everything)], 1)
-            return before, [1]
-        self._insert(matrix, new)
-        self._raise_linked(matrix, changed[filled])
-        after = self.nodes[changed]
-        dissected = self._dissect_large_leaves(matrix, first, np.unique(after))
-        return np.union1d(before, after), dissected
 
     def check(self, matrix: InformationMatrix, local: IntArray) -> None:
         """Raise a ValueError if linked landmarks, not both local, are unrelated."""
@@ -352,6 +237,88 @@ class LandmarkDissection:
             if len(low) and len(high):
                 front += [(2 * node, low), (2 * node + 1, high)]
         self.nodes[slots] = nodes
+
+
+def _by_node(slots: IntArray, nodes: IntArray) -> dict[int, IntArray]:
+    """Group landmarks by their nodes."""
+    order = slots[np.argsort(nodes[slots], kind="stable")]
+    names, starts = np.unique(nodes[order], return_index=True)
+    groups = np.split(order, starts[1:])[: len(names)]
+    return dict(zip(names.tolist(), groups, strict=True))
+
+
+def _eliminate(
+    matrix: InformationMatrix, own: IntArray, far: BoolArray, below: list[_Eliminated]
+) -> _Eliminated:
+    """Eliminate a node's own landmarks; ``far`` marks those not below the node."""
+    counts, links, blocks = matrix.rows(own)
+    inherited = [child.node.rest[::2] // 2 for child in below]
+    is_rest = np.zeros(len(far), dtype=bool)
+    for slots in (links[far[links]], *inherited):
+        is_rest[slots] = True
+    is_rest[own] = False
+    rest = np.flatnonzero(is_rest)
+    place = np.full(len(far), -1)
+    place[own] = np.arange(len(own))
+    place[rest] = np.arange(len(own), len(own) + len(rest))
+    p, r = 2 * len(own), 2 * len(rest)
+    top, remainder = np.zeros((p, p + r)), np.zeros((r, r))
+    here = place[links]
+    row = np.repeat(np.arange(len(own)), counts)[here >= 0]
+    quads = top.reshape(len(own), 2, len(own) + len(rest), 2)
+    quads[row, :, here[here >= 0], :] = blocks[here >= 0]
+    for child, slots in zip(below, inherited, strict=True):
+        add_update(top, remainder, pairs(place[slots]), child.update)
+    node = eliminate(top, remainder, pairs(own), pairs(rest))
+    return _Eliminated(node, remainder if below else None)
+
+
+class RestFactor(NamedTuple):
+    """All landmarks H except the local ones L, eliminated from a map.
+
+    ::
+
+        Λ_LL δ_L + Λ_LH δ_H = b_L,   Λ_HL δ_L + Λ_HH δ_H = 0
+        ⟹ (Λ_LL − C) δ_L = b_L,   δ_H = −T δ_B,   T = Λ_HH⁻¹ Λ_HB,   C = Λ_BH T
+
+    where B ⊂ L are the local landmarks linked with H.
+    """
+
+    nodes: list[Node]  # children first
+    slots: IntArray  # H
+    border: IntArray  # B, in the order of L
+    complement: Array  # C, shape (2c, 2c), symmetric
+    size: int  # number of slots of the map
+
+    def respond(self, shift: Array) -> Array:
+        """Return T δ_B."""
+        values = np.zeros(2 * self.size)
+        values[pairs(self.border)] = shift
+        substitute_back(self.nodes, values)
+        return -values[pairs(self.slots)]
+
+    def covariance(self, slots: IntArray) -> tuple[Array, Array]:
+        """Return blocks of Λ_HH⁻¹ and rows of T.
+
+        Parameters
+        ----------
+        slots : ndarray, shape (v,)
+            Eliminated landmarks.
+
+        Returns
+        -------
+        covariance : ndarray, shape (2v, 2v)
+        response : ndarray, shape (2v, 2c)
+        """
+        columns = pairs(slots)
+        size = len(columns)
+        where = (np.arange(size), columns)
+        unit = csc_array((np.ones(size), where), (size, 2 * self.size))
+        covariance, remainder = marginal_covariance(self.nodes, unit)
+        response = np.zeros((size, 2 * len(self.border)))
+        for column, unknown in enumerate(pairs(self.border).tolist()):
+            response[:, column] = -remainder.get(unknown, 0.0)
+        return covariance, response
 
 
 def _linked(

@@ -566,7 +566,7 @@ def test_what_is_kept_of_the_elimination_is_that_of_the_whole_map_at_any_time(
 
     world.first[: 2 * len(places)] = places.ravel()
     store(known)
-    deepest = world.elimination.dissection.nodes.max()
+    deepest = world.elimination.nodes.max()
     assert deepest > 8
     for turn in range(12):
         centre = rng.integers(400)
@@ -586,7 +586,7 @@ def test_what_is_kept_of_the_elimination_is_that_of_the_whole_map_at_any_time(
         elif turn == 4:
             gone, known = known[100:104], np.delete(known, range(100, 104))
             store(gone)
-    assert world.elimination.dissection.nodes.max() > deepest
+    assert world.elimination.nodes.max() > deepest
 
 
 def assert_eliminates(elimination, matrix, dense, known, local):

@@ -39,9 +39,8 @@ class SparseMap:
 
     def checkpoint(self) -> Undo:
         """Return what takes back later changes of means, information and order."""
-        return undo_all(
-            contents(self), self.information.checkpoint(), self.elimination.checkpoint()
-        )
+        parts = contents(self, self.elimination)
+        return undo_all(parts, self.information.checkpoint())
 
 
 @dataclass(frozen=True)

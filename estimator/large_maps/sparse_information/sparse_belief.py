@@ -205,5 +205,5 @@ class SparseBelief:
         self.map_.information.replace(self.local.slots, information)
         self.local, self.pose = rest
         slots = [self.slots.pop(i) for i in ids]
-        self.map_.elimination.dissection.nodes[slots] = 0
+        self.map_.elimination.nodes[slots] = 0
         self.free += slots

@@ -381,15 +381,15 @@ STATE: saved_states.Table = {
 def as_arrays(belief: SparseBelief, name: str, base: str) -> dict[str, Any]:
     """Return copies of the whole state, as arrays."""
     map_, local = belief.map_, belief.local
-    dissection, size = map_.elimination.dissection, 2 * len(map_.information)
-    dissection.grow(len(map_.information))
+    order, size = map_.elimination, 2 * len(map_.information)
+    order.grow(len(map_.information))
     parts = {"local": local, "pose": belief.pose}
     found = {
         "landmark_ids": list(belief.slots),
         "slots": list(belief.slots.values()),
         "free": belief.free,
-        "nodes": dissection.nodes,
-        "parted": dissection.dissected,
+        "nodes": order.nodes,
+        "parted": order.dissected,
         "origin": belief.origin,
         "points": map_.points[:size],
         "first": map_.first[:size],
@@ -467,11 +467,11 @@ def _load_order(
         raise ValueError(
             f"state['nodes'] must be whole numbers in [0, 2⁵⁰), got {nodes.max()}"
         )
-    dissection = map_.elimination.dissection
-    dissection.nodes = nodes
-    dissection.dissected = int(saved["parted"])
-    others = np.setdiff1d(np.flatnonzero(dissection.nodes == 0), local)
+    order = map_.elimination
+    order.nodes = nodes
+    order.dissected = int(saved["parted"])
+    others = np.setdiff1d(np.flatnonzero(order.nodes == 0), local)
     others = others[matrix.is_filled(others)]
     if len(others):
-        dissection.revise(matrix, map_.first, others)
-    dissection.check(matrix, local)
+        order.revise(matrix, map_.first, others)
+    order.check(matrix, local)
