@@ -150,10 +150,8 @@ def _fill_variances(
     for i in range(len(ranges)):
         for j in range(len(expected)):
             found = likely_variances_jit(noise, ranges[i], expected[j], spread[j])
-            variances[i, j, 0], variances[i, j, 1] = (
-                max(found[0], TINY),
-                max(found[1], TINY),
-            )
+            variances[i, j, 0] = max(found[0], TINY)
+            variances[i, j, 1] = max(found[1], TINY)
 
 
 def _limits(policy: AssociationPolicy, rows: int) -> Array:
@@ -261,10 +259,8 @@ def _k_of_n(value: Any) -> tuple[int, int]:
         raise ValueError(
             f"confirm must be two whole numbers (k, n), got {value!r}"
         ) from None
-    k, n = (
-        argument_checks.whole("confirm[0]", k, 1),
-        argument_checks.whole("confirm[1]", n, 1),
-    )
+    k = argument_checks.whole("confirm[0]", k, 1)
+    n = argument_checks.whole("confirm[1]", n, 1)
     if not k <= n <= MOST_SCANS:
         raise ValueError(
             f"confirm must be (k, n) with k <= n <= {MOST_SCANS}, got ({k}, {n})"

@@ -42,6 +42,9 @@ SECTORS, RINGS = 16, 8
 
 NO_COUNTS = np.zeros((SECTORS, RINGS))
 
+#: Variance of a heading that is equally likely everywhere [rad²].
+UNIFORM = np.pi**2 / 3
+
 #: A label is the scan of the first sighting, shifted by these bits, plus its row.
 LABEL_BITS = 20
 
@@ -86,14 +89,8 @@ class ScanAssociation:
         density = self._density.after(
             self._readings, np.array(is_new, dtype=np.bool_), len(self.confirmed)
         )
-        return Candidates(
-            self._tentative,
-            self._waiting,
-            self._next_id,
-            self.scan + 1,
-            density,
-            self._detections,
-        )
+        known = self._tentative, self._waiting, self._next_id, self.scan + 1
+        return Candidates(*known, density, self._detections)
 
     def assign(
         self, rows: IntArray, slots: IntArray, view: MapView, noise: Noise
@@ -210,6 +207,15 @@ class ScanAssociation:
 # no evidence.  P_D learns the rates of a lost run, too, so g falls again: the largest g
 # counts.
 #
+# A lost run whose landmarks all stay in view misses none.  Many of these have lost the
+# heading: linearised equations no longer hold where its standard deviation is a radian.
+# Scans in succession that leave the heading unknown count c each::
+#
+#     h ← h + c  if min(σ²_θ, π²/3) > least + 1 rad² and there is a map,  else  h ← 0
+#
+# π²/3 is the variance of a uniform heading: one that is unknown at the start is no
+# evidence.
+#
 # References
 # ----------
 # .. [1] E. S. Page, Continuous inspection schemes, Biometrika 41, 1954.
@@ -240,13 +246,17 @@ class Detections(NamedTuple):
     shown: Mapping[int, int]
     #: g, evidence that the run is lost: a logarithm of a ratio of likelihoods.
     lost: float = 0.0
-    #: The largest g so far.
+    #: The largest evidence so far.
     most_lost: float = 0.0
+    #: Least variance of the heading so far [rad²].
+    surest: float = UNIFORM
+    #: How many scans in succession have left the heading unknown.
+    unknown: int = 0
 
     @classmethod
     def none(cls) -> Detections:
         """Return the state before the first scan."""
-        return cls(np.zeros((SECTORS, RINGS)), np.zeros((SECTORS, RINGS)), {}, {})
+        return cls(NO_COUNTS, NO_COUNTS, {}, {})
 
     def after(
         self, view: MapView, slots: IntArray, longest: float
@@ -275,7 +285,26 @@ class Detections(NamedTuple):
         some = {i: left for i, left in every.items() if left < 1}
         proven = {**self.shown, **dict(zip(view.ids, shown.tolist(), strict=True))}
         most_lost = max(self.most_lost, lost)
-        return cost, Detections(*counts, some, proven, lost, most_lost)
+        return cost, Detections(*counts, some, proven, lost, most_lost, *self[6:])
+
+    def with_heading(self, view: MapView) -> Detections:
+        """Count a scan after which the belief is ``view``.
+
+        Examples
+        --------
+        >>> detections = Detections.none()
+        >>> for variance in (0.01, 1.1, 1.2, 1.3):
+        ...     view = MapView(np.zeros(5), variance * np.eye(5), (7,))
+        ...     detections = detections.with_heading(view)
+        >>> detections.unknown, detections.most_lost > LOST_SCORE
+        (3, True)
+        """
+        variance = min(float(view.covariance[2, 2]), UNIFORM)
+        surest = min(self.surest, variance)
+        is_unknown = len(view.mapped) > 0 and variance - surest > UNKNOWN
+        unknown = self.unknown + 1 if is_unknown else 0
+        most_lost = max(self.most_lost, MOST_OF_SCAN * unknown)
+        return self._replace(surest=surest, unknown=unknown, most_lost=most_lost)
 
 
 class UnexplainedDensity(NamedTuple):
@@ -316,12 +345,7 @@ class UnexplainedDensity(NamedTuple):
         sectors, rings = self.cells.sum(axis=1) + 0.5, self.cells.sum(axis=0) + 0.5
         sector, ring = _cells(readings, self.longest)
         shape = sectors[sector] / sectors.mean() * rings[ring] / rings.mean()
-        return np.asarray(self.value * shape)
-
-    @property
-    def value(self) -> float:
-        """Readings per scan and [rad m]."""
-        return self.per_scan / (2 * np.pi * self.longest)
+        return np.asarray(self.per_scan / (2 * np.pi * self.longest) * shape)
 
     @property
     def per_scan(self) -> float:
@@ -388,7 +412,7 @@ class Candidates:
             "expected": self.detections.expected,
             "missed": list(self.detections.missed.items()),
             "shown": list(self.detections.shown.items()),
-            "lost": [self.detections.lost, self.detections.most_lost],
+            "lost": self.detections[4:],
         }
         return saved_states.write(found, CANDIDATES)
 
@@ -420,18 +444,19 @@ class Candidates:
         if not all(0 <= left <= 1 for left in missed.values()):
             raise ValueError("state['tentative.missed'] must be probabilities")
         shown = dict(saved["shown"].tolist())
-        lost, most_lost = saved["lost"].tolist()
-        if not 0 <= lost <= most_lost:
+        lost, most_lost, surest, unknown = saved["lost"].tolist()
+        if min(lost, surest, unknown) < 0 or lost > most_lost:
             raise ValueError(
                 "state['tentative.lost'] must be >= 0, the first at most the second"
             )
+        evidence = lost, most_lost, surest, int(unknown)
         return cls(
             TentativeLandmarks(*(saved[key] for key in TENTATIVE)),
             waiting,
             int(saved["next_id"]),
             int(saved["scan"]),
             UnexplainedDensity(*density.tolist())._replace(cells=saved["unexplained"]),
-            Detections(seen, expected, missed, shown, lost, most_lost),
+            Detections(seen, expected, missed, shown, *evidence),
         )
 
 
@@ -451,7 +476,7 @@ CANDIDATES: saved_states.Table = {
     "expected": (saved_states.NUMBERS, SECTORS, RINGS),
     "missed": (saved_states.NUMBERS, -1, 2),
     "shown": (saved_states.WHOLE, -1, 2),
-    "lost": (saved_states.NUMBERS, 2),
+    "lost": (saved_states.NUMBERS, 4),
 }
 
 #: Weights of a Gaussian at 0, +2 σ and −2 σ, which keep its variance.
@@ -472,7 +497,10 @@ FEWER = 0.3
 #: c: most evidence of being lost from one scan.
 MOST_OF_SCAN = 3.0
 
-#: A run whose g has exceeded this is probably lost.
+#: A heading is unknown if its variance has grown by this [rad²].
+UNKNOWN = 1.0
+
+#: A run whose evidence has exceeded this is probably lost.
 LOST_SCORE = 6.0
 
 #: A landmark that was shown in this many scans is not of clutter.

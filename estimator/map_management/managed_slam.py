@@ -303,8 +303,10 @@ class ManagedSlam:
         """Do what follows an update of the filter; return the whole report."""
         self._recent.note_scan(plan, scans, first, report)
         self._editor.expire()
-        self.candidates = plan.candidates
-        seen = set(self._editor.map_view().ids).intersection(plan.row_ids)
+        view, candidates = self._editor.map_view(), plan.candidates
+        detections = candidates.detections.with_heading(view)
+        self.candidates = replace(candidates, detections=detections)
+        seen = set(view.ids).intersection(plan.row_ids)
         seen -= {*report.rejected_ids, *report.skipped_ids}
         removed, merged = self._pruner.prune(readings, plan, seen, missed)
         self._recent.note_edits(removed, merged)

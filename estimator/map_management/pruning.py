@@ -39,8 +39,7 @@ class MapPruner:
     def __init__(self, policy: LandmarkPolicy, editor: MapEditor, noise: Noise) -> None:
         self._policy, self._editor = policy, editor
         bearing_std, range_std, per_metre = np.maximum(noise[:3], 1e-12).tolist()
-        metres = noise.bearing_std_metres
-        self._noise = Noise(bearing_std, range_std, per_metre, metres)
+        self._noise = Noise(bearing_std, range_std, per_metre, noise.bearing_std_metres)
         self.forget()
 
     def forget(self) -> None:

@@ -255,9 +255,63 @@ def test_the_alarm_stays_once_the_map_is_seen_again():
     assert detections.most_lost == max(scores)
 
 
-@pytest.mark.parametrize("lost", [(-1.0, 2.0), (3.0, 2.0)])
+def with_headings(stds, ids=(7,)):
+    """Return the evidence after scans that leave these deviations of the heading."""
+    detections = Detections.none()
+    for std in stds:
+        view = MapView(np.zeros(5), std**2 * np.eye(5), ids)
+        detections = detections.with_heading(view)
+    return detections
+
+
+def test_a_heading_that_stays_unknown_is_evidence_of_a_lost_run():
+    assert with_headings([0.1, 1.1, 1.1]).most_lost <= LOST_SCORE
+    assert with_headings([0.1, 1.1, 1.1, 1.1, 0.1]).most_lost > LOST_SCORE
+    assert with_headings([0.1, 1.1, 1.1, 0.9, 1.1, 1.1]).most_lost <= LOST_SCORE
+
+
+@pytest.mark.parametrize("std", [1.6, np.pi, 10.0])
+def test_a_heading_that_is_unknown_from_the_start_is_no_evidence(std):
+    assert with_headings([std, std, std + 1, std + 1, std + 1]).most_lost == 0
+
+
+def test_a_heading_is_no_evidence_before_there_is_a_map():
+    assert with_headings([0.1, 2.0, 2.0, 2.0, 2.0], ids=()).most_lost == 0
+
+
+@pytest.mark.parametrize("association", ["joint", "hypotheses"])
+def test_a_robot_that_turns_blindly_is_probably_lost(association):
+    def make():
+        return make_estimator(
+            "invariant",
+            motion_std=(0.01, 0.0, 0.6),
+            measurement_std=(0.02, 0.05),
+            management={"association": association},
+        )
+
+    def turn(slam, scans):
+        for _ in range(scans):
+            slam.predict((0.1, 0.1))
+            slam.update(np.empty((0, 2)))
+
+    slam, kept = make(), make()
+    for _ in range(3):
+        slam.update([(0.5, 4.0), (-0.5, 3.0)])
+    turn(slam, 4)  # variances 0.36, 0.72, 1.08, 1.44
+    assert not slam.probably_lost
+    kept.load_state_dict(slam.state_dict())
+    for one in (slam, kept):
+        turn(one, 1)
+        assert one.probably_lost
+    slam.reset(np.zeros(3), np.zeros(3))
+    assert not slam.probably_lost
+
+
+@pytest.mark.parametrize(
+    "lost", [(-1, 2, 0.1, 0), (3, 2, 0.1, 0), (0, 2, -0.1, 0), (0, 2, 0.1, -1)]
+)
 def test_a_saved_state_with_impossible_evidence_is_refused(lost):
     slam = circling("joint", steps=5)
-    state = slam.state_dict() | {"tentative.lost": np.array(lost)}
+    state = slam.state_dict() | {"tentative.lost": np.array(lost, float)}
     with pytest.raises(ValueError, match="lost"):
         slam.load_state_dict(state)
