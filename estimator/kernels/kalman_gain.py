@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ...jit import fma, njit_inlined, njit_internal
+from ...jit import fma, njit_apart, njit_inlined, njit_internal
 from ..models.rigid_motion import turn_coefficients_jit
 from ..support.argument_checks import aligned_zeros
 
@@ -99,12 +99,13 @@ def whiten(
     The rows of A from ``first`` on are finished, and P does not contain them yet.
     The function returns false where S is not positive definite; P stays as it is.
     """
-    _correlate(covariance, size, system, row, c)
-    least = SINGULAR * _own_variance(system, row, c)
-    least_below = SINGULAR * _own_variance(system, row + 1, c)
+    pair = system[row : row + 2]
+    _correlate(covariance, size, pair, c)
+    least = SINGULAR * _own_variance(pair, 0, c)
+    least_below = SINGULAR * _own_variance(pair, 1, c)
     for before in range(first, row, 2):
-        _orthogonalise(size, system, row, before, c)
-    return _normalise(size, system, rows[CORRECTION], row, c, least, least_below)
+        _orthogonalise(size, pair, system[before : before + 2], c)
+    return _normalise(size, pair, rows[CORRECTION], c, least, least_below)
 
 
 @njit_internal
@@ -129,55 +130,46 @@ def _whole(size: int) -> int:
     return (size + 7) & -8
 
 
-@njit_internal
-def _correlate(covariance: Array, size: int, system: Array, row: int, c: int) -> None:
+@njit_apart
+def _correlate(covariance: Array, size: int, pair: Array, c: int) -> None:
     """Fill the two rows of one reading in A with H P."""
-    P, below = covariance, row + 1
-    a = system[row, JACOBIAN : JACOBIAN + 5]
-    b = system[below, JACOBIAN : JACOBIAN + 5]
+    P = covariance
+    a, b = pair[0, JACOBIAN : JACOBIAN + 5], pair[1, JACOBIAN : JACOBIAN + 5]
     a0, a1, a2, a3, a4 = a[0], a[1], a[2], a[3], a[4]
     b0, b1, b2, b3, b4 = b[0], b[1], b[2], b[3], b[4]
     for j in range((size + 3) & -4):
         p0, p1, p2, p3, p4 = P[0, j], P[1, j], P[2, j], P[c, j], P[c + 1, j]
         upper = fma(a4, p4, fma(a3, p3, fma(a2, p2, fma(a1, p1, a0 * p0))))
         lower = fma(b4, p4, fma(b3, p3, fma(b2, p2, fma(b1, p1, b0 * p0))))
-        system[row, j], system[below, j] = upper, lower
+        pair[0, j], pair[1, j] = upper, lower
 
 
-@njit_internal
-def _orthogonalise(size: int, system: Array, row: int, before: int, c: int) -> None:
+@njit_apart
+def _orthogonalise(size: int, pair: Array, done: Array, c: int) -> None:
     """Subtract from the rows of a reading in A their part along two finished rows.
 
     The factors are the reading's entries of L in the columns of those rows.
     """
-    A, below = system, row + 1
-    l00, l01 = times(A, row, c, A[before]), times(A, row, c, A[before + 1])
-    l10, l11 = times(A, below, c, A[before]), times(A, below, c, A[before + 1])
+    l00, l01 = times(pair, 0, c, done[0]), times(pair, 0, c, done[1])
+    l10, l11 = times(pair, 1, c, done[0]), times(pair, 1, c, done[1])
     for j in range(_whole(size)):
-        a0, a1 = A[before, j], A[before + 1, j]
-        A[row, j] = fma(-l01, a1, fma(-l00, a0, A[row, j]))
-        A[below, j] = fma(-l11, a1, fma(-l10, a0, A[below, j]))
+        a0, a1 = done[0, j], done[1, j]
+        pair[0, j] = fma(-l01, a1, fma(-l00, a0, pair[0, j]))
+        pair[1, j] = fma(-l11, a1, fma(-l10, a0, pair[1, j]))
 
 
-@njit_internal
+@njit_apart
 def _normalise(
-    size: int,
-    system: Array,
-    delta: Array,
-    row: int,
-    c: int,
-    least: float,
-    least_below: float,
+    size: int, pair: Array, delta: Array, c: int, least: float, least_below: float
 ) -> bool:
     """Divide the rows of a reading in A by the Cholesky factor of its block of S.
 
     The block is what the readings before leave of S.  The function returns false where
     only rounding is left.  It whitens ν likewise and adds its share to δ.
     """
-    A, below = system, row + 1
-    s00 = _own_variance(A, row, c)
-    s10 = times(A, below, c, A[row])
-    s11 = _own_variance(A, below, c)
+    s00 = _own_variance(pair, 0, c)
+    s10 = times(pair, 1, c, pair[0])
+    s11 = _own_variance(pair, 1, c)
     if not s00 > least:
         return False
     l00 = np.sqrt(s00)
@@ -186,22 +178,22 @@ def _normalise(
     if not rest > least_below:
         return False
     l11 = np.sqrt(rest)
-    A[row, ROOT], A[row, ROOT + 1] = l00, 0.0
-    A[below, ROOT], A[below, ROOT + 1] = l10, l11
+    pair[0, ROOT], pair[0, ROOT + 1] = l00, 0.0
+    pair[1, ROOT], pair[1, ROOT + 1] = l10, l11
     inverse0, inverse1 = 1 / l00, 1 / l11
-    w0 = (A[row, INNOVATION] - times(A, row, c, delta)) * inverse0
-    w1 = A[below, INNOVATION] - times(A, below, c, delta)
+    w0 = (pair[0, INNOVATION] - times(pair, 0, c, delta)) * inverse0
+    w1 = pair[1, INNOVATION] - times(pair, 1, c, delta)
     w1 = (w1 - l10 * w0) * inverse1
-    A[row, WHITE], A[below, WHITE] = w0, w1
+    pair[0, WHITE], pair[1, WHITE] = w0, w1
     for j in range(_whole(size)):
-        a0 = A[row, j] * inverse0
-        a1 = fma(-l10, a0, A[below, j]) * inverse1
-        A[row, j], A[below, j] = a0, a1
+        a0 = pair[0, j] * inverse0
+        a1 = fma(-l10, a0, pair[1, j]) * inverse1
+        pair[0, j], pair[1, j] = a0, a1
         delta[j] = fma(w1, a1, fma(w0, a0, delta[j]))
     return True
 
 
-@njit_internal
+@njit_apart
 def downdate(
     covariance: Array, size: int, system: Array, first: int, last: int
 ) -> None:

@@ -23,6 +23,7 @@ import numba
 import numpy as np
 from numba import config, njit, types
 from numba.core import compiler, serialize
+from numba.core.cpu import CPUTargetOptions
 from numba.core.runtime.nrt import rtsys
 from numba.extending import intrinsic
 
@@ -58,6 +59,15 @@ def njit_reordered(function: Kernel) -> Kernel:
     return _compile(function, callable_from_python=False, reordered=True)
 
 
+def njit_apart(function: Kernel) -> Kernel:
+    """Compile an internal function whose arrays do not overlap in memory.
+
+    Its loops then run on whole vector registers at once.  Otherwise they first compare
+    the addresses of all arrays, which takes longer than the loop over a small map.
+    """
+    return _compile(function, callable_from_python=False, apart=True)
+
+
 def njit_inlined(function: Kernel) -> Kernel:
     """Copy the body of a function into its caller, which compiles it only once.
 
@@ -66,8 +76,16 @@ def njit_inlined(function: Kernel) -> Kernel:
     return cast("Kernel", njit(inline="always", error_model="numpy")(function))
 
 
+_TARGET: Any = CPUTargetOptions  # numba has this flag, and no option that sets it
+_TARGET.noalias = _TARGET.Mapping("noalias")
+
+
 def _compile(
-    function: Kernel, *, callable_from_python: bool, reordered: bool = False
+    function: Kernel,
+    *,
+    callable_from_python: bool,
+    reordered: bool = False,
+    apart: bool = False,
 ) -> Kernel:
     options: dict[str, Any] = {
         "error_model": "numpy",
@@ -75,6 +93,7 @@ def _compile(
         "no_cfunc_wrapper": True,
         "no_cpython_wrapper": not callable_from_python,
         "fastmath": {"reassoc", "nsz", "contract"} if reordered else False,
+        "noalias": apart,
     }
     return cast("Kernel", _kept(njit(**options)(function)))
 

@@ -17,7 +17,14 @@ import pytest
 import slamgym
 from slamgym import jit as kernel_cache
 from slamgym.estimator import list_peers
-from slamgym.jit import UnknownValueError, code_fingerprint, fma, jit, njit_internal
+from slamgym.jit import (
+    UnknownValueError,
+    code_fingerprint,
+    fma,
+    jit,
+    njit_apart,
+    njit_internal,
+)
 
 CALLER = """
     from callee import twice
@@ -274,7 +281,7 @@ def test_the_folder_stays_small_and_keeps_what_was_used_last(tmp_path, monkeypat
 SOURCE = """
 from typing import NamedTuple
 from slamgym import jit as tools
-from slamgym.jit import jit, njit_internal, njit_inlined
+from slamgym.jit import jit, njit_apart, njit_internal, njit_inlined
 import numpy as np
 
 TABLE = np.array([1.0, 2.0])
@@ -316,12 +323,32 @@ def fingerprint(source):
         ("tools.fma", "tools._multiply_add"),
         ("    gate: float\n    rest: float", "    rest: float\n    gate: float"),
         ("@njit_internal\ndef called", "@jit\ndef called"),
+        ("@njit_internal\ndef called", "@njit_apart\ndef called"),
         ("x < 0", "x <= 0"),
     ],
 )
 def test_every_edit_of_what_a_kernel_uses_changes_its_fingerprint(old, new):
     assert old in SOURCE
     assert fingerprint(SOURCE.replace(old, new)) != fingerprint(SOURCE)
+
+
+@pytest.mark.parametrize("decorate", [njit_internal, njit_apart])
+def test_the_compiler_knows_which_arrays_are_apart(decorate, tmp_path, monkeypatch):
+    # numba shows the code of what it has compiled itself, not of what it has loaded
+    monkeypatch.setattr(kernel_cache, "cache_folder", lambda: tmp_path)
+
+    def add(target, more):
+        for i in range(len(target)):
+            target[i] += more[i]
+
+    kernel = decorate(add)
+    kernel.compile("(float64[::1], float64[::1])")
+    (code,) = kernel.inspect_llvm().values()
+    apart = [line for line in code.splitlines() if "ptr noalias" in line]
+    arrays = [
+        line for line in apart if line.count("noalias") > len(["result", "error"])
+    ]
+    assert bool(arrays) == (decorate is njit_apart)
 
 
 def test_comments_and_places_do_not_change_a_fingerprint():

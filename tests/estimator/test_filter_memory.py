@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -89,6 +90,14 @@ def test_a_report_keeps_its_results_while_the_filter_goes_on(name):
     for late, early in zip(kept, read, strict=True):
         assert late == early
     assert pickle.loads(pickle.dumps(kept[-1])) == copy.deepcopy(kept[-1]) == read[-1]
+
+
+def test_the_parts_of_a_memory_are_apart():
+    slam = make_estimator(
+        "iterated", motion_std=(0.1, 0.1, 0.1), measurement_std=(0.1, 0.1)
+    )
+    for one, other in combinations(slam.map.parts, 2):
+        assert not np.shares_memory(one, other)
 
 
 def test_the_readings_of_a_report_are_read_without_a_copy_of_its_rows():
