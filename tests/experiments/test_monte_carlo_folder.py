@@ -280,7 +280,7 @@ def test_parts_of_two_machines_are_merged_without_their_rests(tmp_path, whole):
     with monte_carlo(**JOB, runs=RUNS, first_run=4, out=two) as part:
         xr.testing.assert_equal(part.load(), whole.isel(run=slice(4, None)))
     ignored = shutil.ignore_patterns("runs-*")
-    shutil.copycontents(one, both, ignore=ignored)  # but its rests
+    shutil.copytree(one, both, ignore=ignored)  # but its rests
     merge_blocks([one, two], both)
     assert names(both) == sorted({*finished()} - {"results.nc", MANIFEST})
     done = []
