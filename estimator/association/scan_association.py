@@ -89,8 +89,14 @@ class ScanAssociation:
         density = self._density.after(
             self._readings, np.array(is_new, dtype=np.bool_), len(self.confirmed)
         )
-        known = self._tentative, self._waiting, self._next_id, self.scan + 1
-        return Candidates(*known, density, self._detections)
+        return Candidates(
+            self._tentative,
+            self._waiting,
+            self._next_id,
+            self.scan + 1,
+            density,
+            self._detections,
+        )
 
     def assign(
         self, rows: IntArray, slots: IntArray, view: MapView, noise: Noise
@@ -285,7 +291,15 @@ class Detections(NamedTuple):
         some = {i: left for i, left in every.items() if left < 1}
         proven = {**self.shown, **dict(zip(view.ids, shown.tolist(), strict=True))}
         most_lost = max(self.most_lost, lost)
-        return cost, Detections(*counts, some, proven, lost, most_lost, *self[6:])
+        seen, expected = counts
+        return cost, self._replace(
+            seen=seen,
+            expected=expected,
+            missed=some,
+            shown=proven,
+            lost=lost,
+            most_lost=most_lost,
+        )
 
     def with_heading(self, view: MapView) -> Detections:
         """Count a scan after which the belief is ``view``.

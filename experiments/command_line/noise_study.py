@@ -137,8 +137,14 @@ class Results(NamedTuple):
     shown: Sequence[Any]
 
 
-#: The names of its folder, by default; the head of its summary; what runs it.
-Study = tuple[tuple[str, str], dict[str, Any], Callable[[Reporter], Results]]
+class Study(NamedTuple):
+    """A noise study to run and to write."""
+
+    #: Of its folder, by default; the first is the name of the study.
+    names: tuple[str, str]
+    #: What the head of its summary says beside the name.
+    about: dict[str, Any]
+    run: Callable[[Reporter], Results]
 
 
 def one_run_study(
@@ -164,7 +170,7 @@ def one_run_study(
         return Results(rows, titles, drawn, 130, (title, runs_table(runs)))
 
     about = {"estimator": estimator, "settings": settings_table(settings)}
-    return (name, estimator), about, run
+    return Study((name, estimator), about, run)
 
 
 def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
@@ -190,7 +196,8 @@ def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
         shown = [effects_table(world.name, runs, effects)]
         return Results(effects, (), noise_effects_figure(effects), 150, shown)
 
-    return (world.name, f"{runs}-runs"), {"runs": runs, "seed": seed}, run
+    about = {"runs": runs, "seed": seed}
+    return Study((world.name, f"{runs}-runs"), about, run)
 
 
 def write_study(study: Study, out: Path | None, reporter: Reporter) -> None:
@@ -200,12 +207,11 @@ def write_study(study: Study, out: Path | None, reporter: Reporter) -> None:
     from .output_folder import default_folder, output_folder, write_summary
     from .tables import written
 
-    names, about, run = study
-    head = {"slamgym": __version__, "name": names[0], **about}
-    place = out or default_folder("noise-study", *names)
+    head = {"slamgym": __version__, "name": study.names[0], **study.about}
+    place = out or default_folder("noise-study", *study.names)
     with output_folder(place) as folder:
-        found = run(reporter)
-        figure = sign(found.figure, " · ".join(names))
+        found = study.run(reporter)
+        figure = sign(found.figure, " · ".join(study.names))
         figures.save_figure(figure, folder / "noise_study.png", dpi=found.dpi)
         _write_csv(folder / "noise_study.csv", found.rows)
         rows = [_plain(row) for row in found.rows]

@@ -274,9 +274,8 @@ be 2 numbers >= 0 with commas between, got '0.2,-1'
         """
         counts = {"motion_std": 3, "measurement_std": 2, "initial_pose_std": 3}
         return {
-            name: _numbers(f"--{name.replace('_', '-')}", getattr(self, name), count)
-            for name, count in counts.items()
-            if getattr(self, name) is not None
+            name: _numbers(f"--{name.replace('_', '-')}", text, counts[name])
+            for name, text in self._given(*counts).items()
         }
 
     def noise_arguments(self) -> list[str]:
@@ -288,18 +287,16 @@ be 2 numbers >= 0 with commas between, got '0.2,-1'
         >>> given.noise_arguments()
         ['--range-std-per-metre=1.0', '--no-noise-at-rest']
         """
-        names = (
-            *("motion_std", "measurement_std", "initial_pose_std"),
-            *("range_std_per_metre", "noise_at_rest"),
-        )
-        given = {name.replace("_", "-"): getattr(self, name) for name in names}
-        return [
-            f"--{'' if value else 'no-'}{name}"
-            if isinstance(value, bool)
-            else f"--{name}={value}"
-            for name, value in given.items()
-            if value is not None
-        ]
+        stds = "motion_std", "measurement_std", "initial_pose_std"
+        given = self._given(*stds, "range_std_per_metre", "noise_at_rest")
+        arguments = []
+        for name, value in given.items():
+            option = name.replace("_", "-")
+            if isinstance(value, bool):
+                arguments.append(f"--{option}" if value else f"--no-{option}")
+            else:
+                arguments.append(f"--{option}={value}")
+        return arguments
 
     def named_options(self) -> dict[str, Any]:
         """Return the options of filters that the user gave by their own names.
@@ -309,10 +306,11 @@ be 2 numbers >= 0 with commas between, got '0.2,-1'
         >>> Options(gate_probability=0.99).named_options()
         {'gate_probability': 0.99}
         """
-        names = (
-            *("landmark_init", "gate_probability"),
-            *("range_std_per_metre", "noise_at_rest"),
-        )
+        shared = "range_std_per_metre", "noise_at_rest"
+        return self._given("landmark_init", "gate_probability", *shared)
+
+    def _given(self, *names: str) -> dict[str, Any]:
+        """Return those of some options that the user gave."""
         values = {name: getattr(self, name) for name in names}
         return {name: value for name, value in values.items() if value is not None}
 

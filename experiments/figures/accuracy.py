@@ -374,15 +374,14 @@ def covariance_figure(trace: RunTrace) -> Figure:
     counts = [len(ids) for ids, *_ in trace.landmark_history]
     first_step = next((step for step, count in enumerate(counts) if count), 0)
     figure = style.new_figure(12.4, 5.6)
-    panels, ids = figure.subplots(1, 2), trace.map_at(first_step).ids
-    for axes, title, step, shown, covariance in (
-        (panels[0], "Before: the first map", first_step, ids, trace.first_covariance),
-        (panels[1], "After: the final map", trace.last_step, trace.landmark_ids,
-         trace.final_covariance),
-    ):  # fmt: skip
-        image = _draw_correlations(axes, covariance, shown)
-        style.write_title(axes, title, _size_of_correlations(covariance, step))
-    bar = figure.colorbar(image, ax=panels, shrink=0.85, aspect=28, pad=0.015)
+    before, after = figure.subplots(1, 2)
+    _draw_correlations(before, trace.first_covariance, trace.map_at(first_step).ids)
+    size = _size_of_correlations(trace.first_covariance, first_step)
+    style.write_title(before, "Before: the first map", size)
+    image = _draw_correlations(after, trace.final_covariance, trace.landmark_ids)
+    size = _size_of_correlations(trace.final_covariance, trace.last_step)
+    style.write_title(after, "After: the final map", size)
+    bar = figure.colorbar(image, ax=[before, after], shrink=0.85, aspect=28, pad=0.015)
     bar.set_label("correlation", fontsize=10, color=style.INK)
     bar.ax.tick_params(labelsize=9, color=style.GREY)
     bar.outline.set_visible(False)

@@ -69,7 +69,7 @@ def html_report(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
         "described": "; ".join(_described(*entry) for entry in entries.items()),
         "files": _files(summary),
         "measures": measures(summary),
-        "bad_run": _no_bound(summary) + _bad_run(summary),
+        "notes": _no_bound(summary) + _bad_run(summary),
         "figures": report_figures(dataset, summary),
         "prints": [file for file in summary.get("files", ()) if "mm." in file],
         "good_runs": max(entry["good_runs"] for entry in entries.values()),

@@ -142,15 +142,16 @@ def replay(
                         estimator.predict(odometry, dt)
                 predicted = interface.marginal_without_joining(estimator, ())
                 report: UpdateReport | None = None
+                ids: list[int] | None = None
                 if step.scan is not None:
-                    report = estimator.update(step.scan.measurements, _ids(step.scan))
+                    ids = _ids(step.scan)
+                    report = estimator.update(step.scan.measurements, ids)
                     decisions.add(report, ground_truth.true_ids_of(step.scan))
                 for fix_row in step.fixes:
                     taking = interface.taking_poses(estimator)
                     fix = taking.observe_pose(*fix_row.arguments)
                     report = interface.with_fix(report or UpdateReport(), fix)
-                seen = () if step.scan is None else _ids(step.scan) or ()
-                recorder.add(predicted, report, seen)
+                recorder.add(predicted, report, ids or ())
             watch(number, estimator, report)
             progress(number + 1, len(steps))
     hidden = ground_truth.hides_identities(log)

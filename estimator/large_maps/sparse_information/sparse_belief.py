@@ -159,7 +159,10 @@ class SparseBelief:
             cross = -T @ near[np.ix_(border, here)]
             covariance[np.ix_(outside, inside)] = cross
             covariance[np.ix_(inside, outside)] = cross.T
-        points = means(self.map_, local)[pairs(slots)]
+        if len(outside):
+            points = means(self.map_, local)[pairs(slots)]
+        else:
+            points = local.points[pairs(place[slots])]
         mean = np.concatenate([self.pose.mean, points])
         return Belief(mean, covariance, tuple(ids), "additive")
 
