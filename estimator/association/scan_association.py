@@ -358,7 +358,8 @@ class UnexplainedDensity(NamedTuple):
         """
         sectors, rings = self.cells.sum(axis=1) + 0.5, self.cells.sum(axis=0) + 0.5
         sector, ring = _cells(readings, self.longest)
-        shape = sectors[sector] / sectors.mean() * rings[ring] / rings.mean()
+        usual, usual_ring = sectors.sum() / SECTORS, rings.sum() / RINGS
+        shape = sectors[sector] / usual * rings[ring] / usual_ring
         return np.asarray(self.per_scan / (2 * np.pi * self.longest) * shape)
 
     @property
@@ -377,10 +378,12 @@ class UnexplainedDensity(NamedTuple):
         """Count one more scan (m, 2), its rows of no landmark, and those confirmed."""
         finite = np.isfinite(readings).all(axis=1)
         longest = max(self.longest, float(readings[finite, 1].max(initial=0.0)))
-        cells = self.cells.copy()
-        np.add.at(cells, _cells(readings[is_new & finite], longest), 1.0)
+        cells, new = self.cells, int(is_new.sum())
+        if new:
+            cells = cells.copy()
+            np.add.at(cells, _cells(readings[is_new & finite], longest), 1.0)
         return UnexplainedDensity(
-            MEMORY * self.readings + int(is_new.sum()),
+            MEMORY * self.readings + new,
             MEMORY * self.scans + 1,
             longest,
             MEMORY * self.landmarks + landmarks,
@@ -392,7 +395,7 @@ def _cells(readings: Array, longest: float) -> tuple[IntArray, IntArray]:
     """Return the sector and the ring of readings (m, 2)."""
     turned = np.mod(readings[:, 0] + np.pi, 2 * np.pi)
     sector = np.floor(turned * (SECTORS / (2 * np.pi)))
-    ring = np.clip(readings[:, 1] * (RINGS / longest), 0, RINGS - 1)
+    ring = np.minimum(np.maximum(readings[:, 1] * (RINGS / longest), 0), RINGS - 1)
     return sector.astype(np.int64) % SECTORS, ring.astype(np.int64)
 
 

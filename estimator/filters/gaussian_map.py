@@ -649,41 +649,39 @@ class ScanReport(UpdateReport):
     @cached_property
     def associated_ids(self) -> tuple[int, ...]:
         """Mapped landmarks whose readings corrected the belief."""
-        return self._with_outcome(gain.USED)
+        return self._readings_with(gain.OUTCOME, gain.USED)
 
     @cached_property
     def added_ids(self) -> tuple[int, ...]:
         """Landmarks that entered the map."""
-        return self._with_outcome(gain.ADDED)
+        return self._readings_with(gain.OUTCOME, gain.ADDED)
 
     @cached_property
     def rejected_ids(self) -> tuple[int, ...]:
         """Mapped landmarks whose readings the chi-square gate rejected."""
-        return self._with_outcome(gain.GATED)
+        return self._readings_with(gain.OUTCOME, gain.GATED)
 
     @cached_property
     def skipped_ids(self) -> tuple[int, ...]:
         """Landmarks whose readings are too close to use."""
-        return self._with_outcome(gain.SKIPPED)
+        return self._readings_with(gain.OUTCOME, gain.SKIPPED)
 
     @cached_property
     def near_ids(self) -> tuple[int, ...]:
         """Mapped landmarks within 10 σ of the robot."""
-        ids, ledger = self._readings()
-        return tuple(ids[ledger[gain.NEAR] > 0].tolist())
+        return self._readings_with(gain.NEAR, 1)
 
     @cached_property
     def innovation(self) -> Array:
         """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
         return self._record.rows[:, gain.INNOVATION].reshape(-1, 2)
 
-    def _with_outcome(self, outcome: int) -> tuple[int, ...]:
-        ids, ledger = self._readings()
-        return tuple(ids[ledger[gain.OUTCOME] == outcome].tolist())
-
-    def _readings(self) -> tuple[IntArray, IntArray]:
-        """Return landmarks and ledger without a copy of the rows, which are large."""
+    def _readings_with(self, row: int, value: int) -> tuple[int, ...]:
+        """Return the landmarks of the readings that have a value in the ledger."""
         if self.is_detached:
-            return self._record.scan_ids, self._record.ledger
-        parts, count = self._parts, int(self._parts.numbers[SCANNED])
-        return parts.scan_ids[:count], parts.ledger[:, :count]
+            ids, values = self._record.scan_ids, self._record.ledger[row]
+        else:  # without a copy of the rows, which are large
+            parts, count = self._parts, self._parts.numbers[SCANNED]
+            ids, values = parts.scan_ids[:count], parts.ledger[row, :count]
+        readings = zip(ids.tolist(), values.tolist(), strict=True)
+        return tuple([i for i, found in readings if found == value])

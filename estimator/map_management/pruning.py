@@ -353,11 +353,13 @@ class LandmarkRecords:
         """
         slots = self.slots(ids)
         cos, sin = np.cos(bearings), np.sin(bearings)
+        read = np.empty((len(slots), 3))
+        read[:, 0] = along * cos * cos + across * sin * sin
+        read[:, 1] = (along - across) * cos * sin
+        read[:, 2] = along * sin * sin + across * cos * cos
         self.sightings[slots] += 1
         self.misses[slots] = 0
-        self.information[slots, 0] += along * cos * cos + across * sin * sin
-        self.information[slots, 1] += (along - across) * cos * sin
-        self.information[slots, 2] += along * sin * sin + across * cos * cos
+        self.information[slots] += read
 
     def slots(self, ids: Iterable[int]) -> IntArray:
         """Return the places of landmarks in the order of the map."""
