@@ -511,6 +511,11 @@ def hides_its_belief(slam: object) -> bool:
     ``belief()`` and the saved state are valid.
     """
     kind: Any = type(slam)
+    return _hides_its_belief(kind)
+
+
+@lru_cache(maxsize=64)
+def _hides_its_belief(kind: Any) -> bool:
     owner = next((base for base in kind.__mro__ if "map_view" in vars(base)), kind)
     return owner is not kind and kind.belief is not getattr(
         owner, "belief", kind.belief

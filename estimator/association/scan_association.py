@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import compress
+from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -376,9 +378,10 @@ class UnexplainedDensity(NamedTuple):
         self, readings: Array, is_new: BoolArray, landmarks: int = 0
     ) -> UnexplainedDensity:
         """Count one more scan (m, 2), its rows of no landmark, and those confirmed."""
-        finite = np.isfinite(readings).all(axis=1)
-        longest = max(self.longest, float(readings[finite, 1].max(initial=0.0)))
-        cells, new = self.cells, int(is_new.sum())
+        finite = [isfinite(b) and isfinite(r) for b, r in readings.tolist()]
+        ranges = compress(readings[:, 1].tolist(), finite)
+        longest, new = max([self.longest, *ranges]), np.count_nonzero(is_new)
+        cells = self.cells
         if new:
             cells = cells.copy()
             np.add.at(cells, _cells(readings[is_new & finite], longest), 1.0)

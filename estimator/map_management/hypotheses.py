@@ -300,9 +300,9 @@ class HypothesisSlam:
             if landmark_ids is None:
                 options = self._options(readings)
             else:
-                argument_checks.identities(landmark_ids, len(readings))
+                given = argument_checks.identities(landmark_ids, len(readings))
                 options = [
-                    (h.cost, k, partial(h.slam.as_given, readings, landmark_ids))
+                    (h.cost, k, partial(h.slam.as_given, readings, given))
                     for k, h in enumerate(self.hypotheses)
                 ]
             plans = [complete() for _, _, complete in options]

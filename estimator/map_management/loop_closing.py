@@ -183,18 +183,16 @@ def _recognised(
 
 def _relative_std(view: MapView) -> Array:
     """Return the largest σ of each landmark relative to the robot, shape (n,) [m]."""
-    n, P = len(view.ids), view.covariance
-    columns = np.arange(3, 3 + 2 * n).reshape(n, 2)
-    lever = (view.landmarks - view.mean[:2])[:, ::-1] * (-1.0, 1.0)
-    C = P[columns[:, :, None], columns[:, None, :]] + P[:2, :2]
-    with_pose = P[columns, 0], P[columns, 1]
-    cross = np.stack(with_pose, axis=2)
-    C = C - cross - cross.transpose(0, 2, 1)
-    heading = P[columns, 2] - P[:2, 2]
-    both = heading[:, :, None] * lever[:, None, :]
-    C = C - both - both.transpose(0, 2, 1)
-    C = C + P[2, 2] * lever[:, :, None] * lever[:, None, :]
-    return _largest_std(C[:, 0, 0], C[:, 0, 1], C[:, 1, 1])
+    mean, P, end = view.mean, view.covariance, 3 + 2 * len(view.ids)
+    x, y, variances = slice(3, end, 2), slice(4, end, 2), P.diagonal()
+    along, across = mean[1] - mean[y], mean[x] - mean[0]  # J (l − p)
+    turn_x, turn_y = P[x, 2] - P[0, 2], P[y, 2] - P[1, 2]
+    xx = variances[x] + P[0, 0] - 2 * P[x, 0] - 2 * turn_x * along
+    yy = variances[y] + P[1, 1] - 2 * P[y, 1] - 2 * turn_y * across
+    xy = P.diagonal(1)[x] + P[0, 1] - P[x, 1] - P[y, 0]
+    xy = xy - turn_x * across - turn_y * along + P[2, 2] * along * across
+    xx, yy = xx + P[2, 2] * along * along, yy + P[2, 2] * across * across
+    return _largest_std(xx, xy, yy)
 
 
 def _offsets(view: MapView, some: IntArray, others: IntArray) -> tuple[Array, Array]:

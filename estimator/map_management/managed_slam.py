@@ -178,11 +178,14 @@ class ManagedSlam:
         reading = argument_checks.pair("odometry", odometry)
         displacement = self._motion_noise.motion.moved(reading)
         variance = self._motion_noise.over(displacement, dt)
-        moved = self.candidates.tentative.moved(displacement, variance)
+        tentative = self.candidates.tentative
+        moved, candidates = tentative.moved(displacement, variance), self.candidates
+        if moved is not tentative:
+            candidates = replace(candidates, tentative=moved)
 
         def follow(_: object) -> None:
             self._editor.expire()
-            self.candidates = replace(self.candidates, tentative=moved)
+            self.candidates = candidates
             self._recent.note_motion(*reading, dt)
             self.steps += 1
 
@@ -218,7 +221,8 @@ class ManagedSlam:
         def associate() -> ScanAssociation:
             if landmark_ids is None:
                 return self.alternatives(readings)[0][1]()
-            return self.as_given(readings, landmark_ids)
+            given = argument_checks.identities(landmark_ids, len(readings))
+            return self.as_given(readings, given)
 
         return self.take(readings, associate)
 
@@ -246,12 +250,11 @@ class ManagedSlam:
         undo = attributes(self, self._recent)
         return advance(self._filter, step, follow, undo, lambda: undo)
 
-    def as_given(self, readings: Array, landmark_ids: LandmarkIds) -> ScanAssociation:
-        """Associate readings (m, 2) by their identities."""
-        given = argument_checks.identities(landmark_ids, len(readings))
+    def as_given(self, readings: Array, ids: Sequence[int]) -> ScanAssociation:
+        """Associate readings (m, 2) by their identities, without repetition."""
         plan = ScanAssociation(self._policy, self.candidates, readings)
         view = self._editor.map_view(self._policy.reach(readings))
-        plan.translate(given, view.mapped, self._pruner.merger.aliases)
+        plan.translate(ids, view.mapped, self._pruner.merger.aliases)
         return plan
 
     def alternatives(self, readings: Array, ceiling: float = np.inf) -> list[Option]:

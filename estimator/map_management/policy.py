@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from math import inf, pi, sqrt
+from math import inf, isfinite, pi, sqrt
 from typing import Any, TypeVar
 
 import numpy as np
@@ -81,8 +81,8 @@ class LandmarkPolicy(AssociationPolicy):
 
     def reach(self, readings: Array) -> float:
         """Return the distance within which a landmark may matter for a scan [m]."""
-        ranges = readings[np.isfinite(readings[:, 1]), 1]
-        reach = float(ranges.max(initial=0.0))
+        ranges: list[float] = readings[:, 1].tolist()
+        reach = max([0.0, *filter(isfinite, ranges)])
         if self.remove_after is not None and self.view is not None:
             reach = max(reach, self.view.max_range)
         return reach + (self.merge_within or 0.0)

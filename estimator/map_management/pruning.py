@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array, IntArray
+from ...jit import jit
 from ..association.scan_assignments import Noise
 from ..association.scan_association import ScanAssociation
 from ..filters.conditioning import separation
@@ -39,7 +40,7 @@ class MapPruner:
     def __init__(self, policy: LandmarkPolicy, editor: MapEditor, noise: Noise) -> None:
         self._policy, self._editor = policy, editor
         bearing_std, range_std, per_metre = np.maximum(noise[:3], 1e-12).tolist()
-        self._noise = Noise(bearing_std, range_std, per_metre, noise.bearing_std_metres)
+        self._noise = bearing_std, range_std, per_metre, noise.bearing_std_metres
         self.forget()
 
     def forget(self) -> None:
@@ -54,11 +55,7 @@ class MapPruner:
         self._records.follow(view.mapped)
         if not ids:
             return
-        bearing, distance = readings.T
-        bearing_std, range_std, per_metre, metres = self._noise
-        along = (range_std + per_metre * distance) ** -2.0
-        across = (np.maximum(distance, 1e-12) * bearing_std + metres) ** -2.0
-        self._records.note_sightings(ids, bearing + view.mean[2], along, across)
+        self._records.note_sightings(ids, readings, float(view.mean[2]), self._noise)
         self.merger.note_scan(view, ids)
 
     def expected(self, scan: Array) -> set[int]:
@@ -309,8 +306,8 @@ class LandmarkRecords:
     --------
     >>> records = LandmarkRecords()
     >>> records.follow([7, 9])
-    >>> ahead, across = np.zeros(2), np.ones(2)
-    >>> records.note_sightings([7, 9], ahead, np.array([4.0, 9.0]), across)
+    >>> readings = np.array([[0.0, 9.0], [0.0, 4.0]])
+    >>> records.note_sightings([7, 9], readings, 0.0, (0.1, 0.1, 0.0, 0.0))
     >>> records.by_information([9, 7])
     [7, 9]
     """
@@ -338,28 +335,29 @@ class LandmarkRecords:
         self.ids = tuple(ids)  # last: an interrupted call begins anew
 
     def note_sightings(
-        self, ids: Sequence[int], bearings: Array, along: Array, across: Array
+        self,
+        ids: Sequence[int],
+        readings: Array,
+        heading: float,
+        noise: tuple[float, float, float, float],
     ) -> None:
-        """Count one sighting of each landmark; all arrays have shape (m,).
+        """Count one sighting of each landmark.
 
         Parameters
         ----------
         ids : sequence of int
             The landmarks, without repetition.
-        bearings : ndarray
-            Directions in the world frame in which they were seen [rad].
-        along, across : ndarray
-            Information of each reading along the line of sight and across it [1/m²].
+        readings : ndarray, shape (m, 2)
+            Of these landmarks, rows (β, r) [rad, m].
+        heading : float
+            Of the robot [rad].
+        noise : tuple of float
+            What :class:`Noise` holds; a plain tuple reaches a kernel faster.
         """
         slots = self.slots(ids)
-        cos, sin = np.cos(bearings), np.sin(bearings)
-        read = np.empty((len(slots), 3))
-        read[:, 0] = along * cos * cos + across * sin * sin
-        read[:, 1] = (along - across) * cos * sin
-        read[:, 2] = along * sin * sin + across * cos * cos
         self.sightings[slots] += 1
         self.misses[slots] = 0
-        self.information[slots] += read
+        _add_information(self.information, slots, readings, heading, noise)
 
     def slots(self, ids: Iterable[int]) -> IntArray:
         """Return the places of landmarks in the order of the map."""
@@ -377,3 +375,24 @@ class LandmarkRecords:
         xx, xy, yy = self.information[self.slots(ids)[::-1]].T
         order = np.argsort(xx * yy - xy * xy, kind="stable")
         return [ids[len(ids) - 1 - k] for k in order.tolist()]
+
+
+@jit
+def _add_information(
+    information: Array,
+    slots: IntArray,
+    readings: Array,
+    heading: float,
+    noise: tuple[float, float, float, float],
+) -> None:
+    """Λ ← Λ + H_lᵀ Q⁻¹ H_l for each reading, as xx, xy, yy in the rows ``slots``."""
+    bearing_std, range_std, per_metre, metres = noise
+    for k in range(len(slots)):
+        bearing, distance = readings[k, 0] + heading, readings[k, 1]
+        along = (range_std + per_metre * distance) ** -2.0
+        across = (max(distance, 1e-12) * bearing_std + metres) ** -2.0
+        cos, sin = np.cos(bearing), np.sin(bearing)
+        row = information[slots[k]]
+        row[0] += along * cos * cos + across * sin * sin
+        row[1] += (along - across) * cos * sin
+        row[2] += along * sin * sin + across * cos * cos
