@@ -83,9 +83,8 @@ class ScanAssociation:
         #: Landmarks that some row may belong to, so that they are not missing.
         self.explained: set[int] = set()
 
-    @property
-    def candidates(self) -> Candidates:
-        """The candidates after the scan."""
+    def candidates_after(self, view: MapView) -> Candidates:
+        """Return the candidates after the scan, which has led to a belief."""
         first = [label < 0 or label >> LABEL_BITS == self.scan for label in self.labels]
         is_new = [i is None and f for i, f in zip(self.row_ids, first, strict=True)]
         density = self._density.after(
@@ -97,7 +96,7 @@ class ScanAssociation:
             self._next_id,
             self.scan + 1,
             density,
-            self._detections,
+            self._detections.with_heading(view),
         )
 
     def assign(

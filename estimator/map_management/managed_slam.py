@@ -306,10 +306,10 @@ class ManagedSlam:
         """Do what follows an update of the filter; return the whole report."""
         self._recent.note_scan(plan, scans, first, report)
         self._editor.expire()
-        view, candidates = self._editor.map_view(), plan.candidates
-        detections = candidates.detections.with_heading(view)
-        self.candidates = replace(candidates, detections=detections)
-        seen = set(view.ids).intersection(plan.row_ids)
+        view = self._editor.map_view()
+        self.candidates = plan.candidates_after(view)
+        used = {i for i in plan.row_ids if i is not None}
+        seen = used.intersection(view.ids)
         seen -= {*report.rejected_ids, *report.skipped_ids}
         removed, merged = self._pruner.prune(readings, plan, seen, missed)
         self._recent.note_edits(removed, merged)

@@ -130,8 +130,11 @@ class MapPruner:
 
     def keep_capacity(self, seen: set[int]) -> list[int]:
         """Remove the landmarks of least information, first among those not seen."""
-        capacity, ids = self._policy.capacity, list(self._editor.map_view().mapped)
-        if capacity is None or len(ids) <= capacity:
+        capacity = self._policy.capacity
+        if capacity is None:
+            return []
+        ids = list(self._editor.map_view().mapped)
+        if len(ids) <= capacity:
             return []
         ranked = self._records.by_information(ids)
         ranked.sort(key=seen.__contains__)
@@ -247,9 +250,10 @@ class LandmarkMerger:
 
     def _duplicate(self, seen: set[int]) -> tuple[int, int] | None:
         """Find two landmarks that are one; keep the first of them in the map."""
-        view, within = self._editor.map_view(), self._policy.merge_within
+        within = self._policy.merge_within
         if within is None:
             return None
+        view = self._editor.map_view()
         slots = self._places(view, [i for i in view.ids if i in seen])
         near = _distances(view.landmarks[slots], view.landmarks) < within
         for row, other in np.argwhere(near).tolist():

@@ -231,6 +231,8 @@ def _relabel(scans: list[RecentScan], confirmed: Mapping[int, int]) -> int | Non
         the filter was kept.
     """
     names = {label: i for i, label in confirmed.items() if label != NO_LABEL}
+    if not names:
+        return None
     starts = [k for k, scan in enumerate(scans[:-1]) if scan.before is not None]
     shown = [k for k in starts if not names.keys().isdisjoint(scans[k].labels)]
     if not shown:
