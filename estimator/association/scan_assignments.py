@@ -126,9 +126,9 @@ def _is_superfluous(
     problem: Problem, marks: IntArray, slots: IntArray, better: list[IntArray]
 ) -> bool:
     """Return whether these only leave out readings that hardly change the belief."""
-    ambiguous = slots == AMBIGUOUS
+    ambiguous, of_scan = slots == AMBIGUOUS, tuple(problem)
     return any(
-        ambiguous[marks != other].all() and largest_change(problem, other, marks) < SAME
+        ambiguous[marks != other].all() and largest_change(of_scan, other, marks) < SAME
         for other in better
     )
 
@@ -139,14 +139,19 @@ def _likely_variances(
     """Return (σβ², σr²) of each pair, shape (m, J, 2); above 0, for their logarithm."""
     variances = np.empty((len(readings), len(expected), 2))
     spread = np.diagonal(joint)[1::2]
-    _fill_variances(readings[:, 1], expected[:, 1], spread, noise, variances)
+    _fill_variances(readings[:, 1], expected[:, 1], spread, tuple(noise), variances)
     return variances
 
 
 @jit
 def _fill_variances(
-    ranges: Array, expected: Array, spread: Array, noise: Noise, variances: Array
+    ranges: Array,
+    expected: Array,
+    spread: Array,
+    of_sensor: tuple[float, ...],
+    variances: Array,
 ) -> None:
+    noise = Noise(*of_sensor)
     for i in range(len(ranges)):
         for j in range(len(expected)):
             found = likely_variances_jit(noise, ranges[i], expected[j], spread[j])
@@ -385,7 +390,7 @@ def innovation_distances(
     shape = (len(readings), landmarks)
     fit = Distances(np.full(shape, np.inf), np.full(shape, np.inf))
     if fit.squared.size:
-        _compare(mean, covariance, readings, noise, largest, fit)
+        _compare(mean, covariance, readings, tuple(noise), largest, tuple(fit))
     return fit
 
 
@@ -394,11 +399,11 @@ def _compare(
     mean: Array,
     covariance: Array,
     readings: Array,
-    noise: Noise,
+    of_sensor: tuple[float, ...],
     largest: float,
-    fit: Distances,
+    fit: tuple[Array, ...],
 ) -> None:
-    squared, unlikelihood = fit
+    noise, (squared, unlikelihood) = Noise(*of_sensor), fit
     P, x, y, heading = covariance, mean[0], mean[1], mean[2]
     for j in range(squared.shape[1]):
         c = 3 + 2 * j
@@ -600,15 +605,15 @@ def best_assignments(
     >>> best_assignments(problem).marks.tolist()
     [[0, 1]]
     """
-    rows, visited = len(problem.innovations), 0
+    rows, visited, of_scan = len(problem.innovations), 0, tuple(problem)
     costs = np.full(most, np.inf)
     marks = np.full((most, rows), UNPAIRED)
     distances = np.full((most, rows), np.inf)
     if problem.feasible.size:
-        visited = search_assignments(problem, costs, marks, spread, ceiling, nodes)
+        visited = search_assignments(of_scan, costs, marks, spread, ceiling, nodes)
     else:
         costs[0] = problem.missing.sum()
     count = int((np.isfinite(costs) & (costs <= costs[0] + spread)).sum())
     if problem.feasible.size:
-        fill_distances(problem, marks[:count], distances[:count])
+        fill_distances(of_scan, marks[:count], distances[:count])
     return Solutions(costs[:count], marks[:count], distances[:count], visited < nodes)

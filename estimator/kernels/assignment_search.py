@@ -8,7 +8,7 @@ The expected readings given the pairs so far stand at ``level[d]`` of ``shifts``
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -107,7 +107,7 @@ def _insert(
 
 @jit
 def search_assignments(
-    problem: Problem,
+    of_scan: tuple[Any, ...],
     costs: Array,
     marks: IntArray,
     spread: float,
@@ -118,7 +118,8 @@ def search_assignments(
 
     Parameters
     ----------
-    problem : Problem
+    of_scan : tuple
+        What a :class:`Problem` holds; a plain tuple reaches a kernel faster.
     costs, marks : ndarray, shape (M,) and (M, m)
         Infinite and `UNPAIRED`; on return the assignments found, the cheapest first.
     spread, ceiling : float
@@ -132,6 +133,7 @@ def search_assignments(
     int
         Number of nodes visited.
     """
+    problem = Problem(*of_scan)
     missing, gate, limits, pairs_first = (
         problem.missing,
         problem.gate,
@@ -400,7 +402,7 @@ def condition_on_all(
 
 
 @jit
-def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
+def fill_distances(of_scan: tuple[Any, ...], marks: IntArray, distances: Array) -> None:
     """Find the least νᵀ S⁻¹ ν of each unpaired reading to a landmark without one.
 
     A scan shows a landmark once, so a reading near a paired landmark shows another one.
@@ -408,10 +410,12 @@ def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
 
     Parameters
     ----------
-    problem : Problem
+    of_scan : tuple
+        As in :func:`search_assignments`.
     marks, distances : ndarray, shape (M, m)
         Assignments; the distances are infinite before.
     """
+    problem = Problem(*of_scan)
     innovations, variances = problem.innovations, problem.variances
     rows, landmarks = problem.feasible.shape
     shifts = np.empty((2, landmarks, 2))
@@ -437,7 +441,7 @@ def fill_distances(problem: Problem, marks: IntArray, distances: Array) -> None:
 
 
 @jit
-def largest_change(problem: Problem, marks: IntArray, fewer: IntArray) -> float:
+def largest_change(of_scan: tuple[Any, ...], marks: IntArray, fewer: IntArray) -> float:
     """Bound how much some pairs change any coordinate of the state, in its σ.
 
     With means μ and deviations σ, after all pairs 1 and without some of them 2, no
@@ -449,7 +453,8 @@ def largest_change(problem: Problem, marks: IntArray, fewer: IntArray) -> float:
 
     Parameters
     ----------
-    problem : Problem
+    of_scan : tuple
+        As in :func:`search_assignments`.
     marks, fewer : ndarray, shape (m,)
         Two assignments.
 
@@ -458,6 +463,7 @@ def largest_change(problem: Problem, marks: IntArray, fewer: IntArray) -> float:
     float
         Infinite unless ``fewer`` is ``marks`` without some pairs.
     """
+    problem = Problem(*of_scan)
     for i in range(len(marks)):
         if fewer[i] != marks[i] and fewer[i] != UNPAIRED:
             return np.inf
