@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cached_property, partial
+from itertools import accumulate
 from typing import Any, NamedTuple
 from weakref import ref
 
@@ -358,8 +359,8 @@ def new_block(capacity: int, readings: int, values: Array) -> Array:
         height * (capacity + gain.META_WIDTH),
     ]
     sizes += [before**2, capacity, table, readings, gain.LEDGER_HEIGHT * readings]
-    starts = NUMBERS + np.cumsum([0, *sizes])
-    block = aligned_zeros(int(starts[-1]))
+    starts = [*accumulate(sizes, initial=NUMBERS)]
+    block = aligned_zeros(starts[-1])
     numbers = block[:NUMBERS].view(np.int64)
     numbers[: BEFORE + 1] = capacity, height, before
     numbers[STARTS:] = starts

@@ -85,7 +85,7 @@ class RobocentricEkfSlam(EkfSlam):
         """Correct map and motion with one scan, then move the frame to the robot."""
         readings = argument_checks.scan(measurements, self.sensor.columns)
         given = argument_checks.identity_array(landmark_ids, len(readings), self)
-        if len(given) and given.min() <= max(RESERVED):
+        if min(given.tolist(), default=0) <= max(RESERVED):
             raise ValueError(f"landmark_ids must be above {max(RESERVED)}")
         return super().update(readings, given)
 

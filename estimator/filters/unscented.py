@@ -17,6 +17,7 @@ from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from ..support.undo import undone_on_error
 from .ekf import EkfSlam, reading_variances
+from .gaussian_map import FIRST_LANDMARKS
 
 
 class UnscentedSlam(EkfSlam):
@@ -68,22 +69,24 @@ class UnscentedSlam(EkfSlam):
         readings = argument_checks.scan(measurements, self.sensor.columns)
         ids = argument_checks.given_identities(landmark_ids, len(readings), self)
         argument_checks.refuse_unusable(readings, ids)
-        usable = np.array(
-            [
-                min(self._read_distance(reading), self._expected_range(i))
-                >= self.rules.min_range
-                for i, reading in zip(ids, readings, strict=True)
-            ],
-            dtype=bool,
+        slots, least = self.map.slots, self.rules.min_range
+        mapped = np.array([i in slots for i in ids], dtype=bool)
+        usable = self._read_distances(readings) >= least
+        expected, near = self._expected_ranges(
+            [slots[i] for i in compress(ids, mapped)]
         )
-        mapped = np.array([i in self.map.slots for i in ids], dtype=bool)
+        usable[mapped] &= expected >= least
         known, skipped = mapped & usable, mapped & ~usable
-        self.map.make_room(len(ids))  # it may raise: before anything changes
         corrected, others = UpdateReport(), list(compress(ids, ~mapped))
-        with undone_on_error(self.bookmark()):
-            self.map.hold(self.map.used, self.map.slots)  # what follows changes a copy
+        needed = max(FIRST_LANDMARKS, len(slots) + len(others))
+        with undone_on_error(self.bookmark()):  # what follows changes a copy
+            block = self.map.blank(needed, readings=len(others))
+            self.map.hold(self.map.used, slots, block=block)
             if known.any():
-                corrected = self._correct(readings[known], list(compress(ids, known)))
+                near = near[usable[mapped]]
+                corrected = self._correct(
+                    readings[known], [*compress(ids, known)], near
+                )
             added = super().update(readings[~mapped], others)
             self._report = corrected.replace(
                 added_ids=added.added_ids,
@@ -95,35 +98,33 @@ class UnscentedSlam(EkfSlam):
         """Return the report of the last update once more."""
         return self._report
 
-    def _read_distance(self, reading: Array) -> float:
-        """Return the distance of a landmark by its reading [m]; infinite if unknown."""
+    def _read_distances(self, readings: Array) -> Array:
+        """Return the distances of landmarks by readings (m, 2) [m], inf if unknown."""
         read = for_sensor(read_distance_jit, self.sensor)
-        return float(read(reading[0], reading[1]))
+        return np.array([read(first, second) for first, second in readings])
 
-    def _expected_range(self, landmark_id: int) -> float:
-        """Return the expected range of a landmark [m]; infinite for a new one."""
-        if landmark_id not in self.map.slots:
-            return np.inf
-        return float(np.linalg.norm(self._place(landmark_id)[0]))
+    def _expected_ranges(self, slots: list[int]) -> tuple[Array, BoolArray]:
+        """Return the expected ranges of landmarks (m,) [m], and which are near.
 
-    def _place(self, landmark_id: int) -> tuple[Array, Array]:
-        """Return the offset δ (2,) of a landmark from the robot and its covariance.
-
-        The axes are those of the world, the error is e_l − e_p − J δ e_θ.
+        Near are those within 10 σ of the robot.  σ is the largest standard deviation
+        of the error e_l − e_p − J δ e_θ of the offset δ from the robot to a landmark.
         """
-        c = 3 + 2 * self.map.slots[landmark_id]
-        dx, dy = self.map.mean[c : c + 2] - self.map.mean[:2]
-        own = [0, 1, 2, c, c + 1]
-        H = np.array([[-1, 0, dy, 1, 0], [0, -1, -dx, 0, 1]])
-        return np.array([dx, dy]), H @ self.map.covariance[np.ix_(own, own)] @ H.T
+        own = np.zeros((len(slots), 5), dtype=np.int64)
+        own[:, 1:] = 1, 2, 3, 4
+        own[:, 3:] += 2 * np.array(slots, dtype=np.int64)[:, None]
+        offsets = self.map.mean[own[:, 3:]] - self.map.mean[:2]
+        H = np.zeros((len(slots), 2, 5))
+        H[:, (0, 1), (0, 1)], H[:, (0, 1), (3, 4)] = -1.0, 1.0
+        H[:, 0, 2], H[:, 1, 2] = offsets[:, 1], -offsets[:, 0]
+        P = self.map.covariance[own[:, :, None], own[:, None]]
+        largest = np.linalg.eigvalsh(H @ P @ H.transpose(0, 2, 1))[:, -1]
+        expected = np.hypot(*offsets.T)
+        return expected, expected < 10 * np.sqrt(np.maximum(largest, 0.0))
 
-    def _is_near(self, landmark_id: int) -> bool:
-        offset, covariance = self._place(landmark_id)
-        return bool(offset @ offset < 100 * np.linalg.eigvalsh(covariance)[-1])
-
-    def _correct(self, readings: Array, ids: list[int]) -> UpdateReport:
+    def _correct(
+        self, readings: Array, ids: list[int], near: BoolArray
+    ) -> UpdateReport:
         n = self.map.size
-        near = {i for i in ids if self._is_near(i)}
         columns = 3 + 2 * np.array([self.map.slots[i] for i in ids])
         root = _square_root(self.map.covariance[:n, :n])
         deviations = np.sqrt(n) * np.concatenate([root, -root], axis=1)
@@ -131,7 +132,7 @@ class UnscentedSlam(EkfSlam):
         expected, spread, distances = _through_sensor(sensor, mean, deviations, columns)
         innovation = sensor.difference(readings, expected)
         if self.rules.noise_as_read:
-            distances = np.array([self._read_distance(z) for z in readings])
+            distances = self._read_distances(readings)
         noise = reading_variances(self.rules, distances, sensor)
         kept = self._within_gate(innovation, spread, noise)
         rows = np.repeat(kept, 2)
@@ -146,9 +147,9 @@ class UnscentedSlam(EkfSlam):
         return UpdateReport(
             nis=float(white @ white),
             degrees_of_freedom=len(nu) * sensor.size // 2,
-            associated_ids=tuple(i for i, k in zip(ids, kept, strict=True) if k),
-            rejected_ids=tuple(i for i, k in zip(ids, kept, strict=True) if not k),
-            near_ids=tuple(i for i in compress(ids, kept) if i in near),
+            associated_ids=tuple(compress(ids, kept)),
+            rejected_ids=tuple(compress(ids, ~kept)),
+            near_ids=tuple(compress(ids, kept & near)),
             innovation=innovation[kept],
             factor=factor,
         )
