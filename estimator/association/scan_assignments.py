@@ -232,7 +232,8 @@ class AssociationPolicy:
     new_gate: float = 25.0
     #: Left out where two landmarks differ by less than this in −2 ln likelihood.
     ambiguity: float = 1.0
-    #: (k, n): seen in k of n successive scans, a landmark enters the map.
+    #: (k, n): seen in k of n successive scans, a landmark enters the map, unless the
+    #: scans that missed it make clutter likely.
     confirm: tuple[int, int] = (3, 8)
     #: Whether landmarks that come with an identity enter at first sight.
     trust_ids: bool = True

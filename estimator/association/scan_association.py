@@ -47,6 +47,9 @@ NO_COUNTS = np.zeros((SECTORS, RINGS))
 #: Variance of a heading that is equally likely everywhere [rad²].
 UNIFORM = np.pi**2 / 3
 
+#: ln of the odds, 20 to 1, beyond which a tentative landmark may enter the map.
+ENTRY_ODDS = 3.0
+
 #: A label is the scan of the first sighting, shifted by these bits, plus its row.
 LABEL_BITS = 20
 
@@ -113,7 +116,7 @@ class ScanAssociation:
         self.ambiguous_rows += sorted(set(range(len(self.labels))) - set(rows.tolist()))
         self.ambiguous_rows += rows[slots == AMBIGUOUS].tolist()
         new = rows[slots == NEW]
-        if len(new):
+        if len(new) or len(self._tentative.seen):
             self._match_tentative(new, noise)
         self.ambiguous_rows.sort()
         self.tentative_rows.sort()
@@ -138,34 +141,40 @@ class ScanAssociation:
                 self.tentative_rows.append(row)
 
     def _match_tentative(self, rows: IntArray, noise: Noise) -> None:
-        """Match rows that no landmark explains with tentative ones; confirm these."""
+        """Match rows that no landmark explains with tentative ones; confirm these.
+
+        A row that is ambiguous beside one begins another one: an outlier may have begun
+        the first.
+        """
         tentative, readings = self._tentative, self._readings
         density = _assumed_density(self._policy, self._density, readings[rows])
         view = tentative.view()
         found = assign_scan(self._policy, view, readings[rows], noise, density, most=1)
         slots = found.ranked[0].slots
-        self.ambiguous_rows += rows[slots == AMBIGUOUS].tolist()
         pairs = list(zip(rows.tolist(), slots.tolist(), strict=True))
-        for row, slot in pairs:
+        for n, (row, slot) in enumerate(pairs):
             if slot >= 0:
                 self.labels[row] = int(tentative.labels[slot])
-                tentative = tentative.with_sighting(slot, readings[row], noise)
+                reading = readings[row]
+                tentative = tentative.with_sighting(slot, reading, noise, density[n])
+        chance = self._detections.chance_to_miss(view, self._density.longest)
+        tentative = tentative.with_misses(chance)
         needed = self._policy.confirm[0]
-        enough = tentative.sightings >= needed
+        enough = (tentative.sightings >= needed) & (tentative.odds > ENTRY_ODDS)
         confirmed = set(np.flatnonzero(enough).tolist())
         if needed == 1:
             confirmed.add(NEW)
         for row, slot in pairs:
-            if slot in confirmed:
+            if max(slot, NEW) in confirmed:
                 self._confirm(row, self._next_id, self.labels[row])
-            elif slot != AMBIGUOUS:
+            else:
                 self.tentative_rows.append(row)
-        fresh = rows[(slots == NEW) & (needed > 1)]
+        fresh = rows[(slots < 0) & (needed > 1)]
         labels = (self.scan << LABEL_BITS) + fresh
         for row, label in zip(fresh.tolist(), labels.tolist(), strict=True):
             self.labels[row] = label
         self._tentative = tentative.chosen(~enough).with_new(
-            readings[fresh], noise, labels
+            readings[fresh], noise, labels, self._density.landmark_share
         )
 
     def _has_waited(self, landmark_id: int) -> bool:
@@ -301,6 +310,13 @@ class Detections(NamedTuple):
             lost=lost,
             most_lost=most_lost,
         )
+
+    def chance_to_miss(self, view: MapView, longest: float) -> Array:
+        """Return the probability that a scan does not show a landmark, shape (n,)."""
+        chance, none = np.ones(len(view.ids)), np.zeros(len(view.ids), dtype=np.bool_)
+        counts = self.seen.copy(), self.expected.copy()
+        _count(view.mean, view.covariance, (none, none), longest, counts, chance)
+        return chance
 
     def with_heading(self, view: MapView) -> Detections:
         """Count a scan after which the belief is ``view``.

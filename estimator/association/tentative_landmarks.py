@@ -10,6 +10,14 @@ sightings change both::
 
 They do not depend on the belief of the filter or its frame.  A tentative landmark that
 is never confirmed leaves the belief unchanged.
+
+Each has the odds o of being a landmark rather than clutter.  They begin with the share
+of readings of no mapped landmark that proved to be of a new one; ρ is the density of
+all such readings::
+
+    new       o ← share / (1 − share)
+    sighting  o ← o N(ν; S) / ρ
+    miss      o ← o (1 − P_D)
 """
 
 from typing import Any, NamedTuple
@@ -26,6 +34,9 @@ from .scan_assignments import Noise
 
 Masks = NDArray[np.uint64]
 
+#: Least prior probability of being a landmark: the robot may enter a new region.
+LEAST_SHARE = 0.01
+
 
 class TentativeLandmarks(NamedTuple):
     """Tentative landmarks; methods return changed copies.
@@ -35,8 +46,8 @@ class TentativeLandmarks(NamedTuple):
     Three sightings within five scans make a landmark:
 
     >>> noise, none = Noise(0.1, 0.1), TentativeLandmarks.none()
-    >>> one = none.with_new(np.array([[0.0, 4.0]]), noise, np.array([1]))
-    >>> two = one.next_scan(5).with_sighting(0, np.array([0.1, 4.1]), noise)
+    >>> one = none.with_new(np.array([[0.0, 4.0]]), noise, np.array([1]), share=0.5)
+    >>> two = one.next_scan(5).with_sighting(0, np.array([0.1, 4.1]), noise, 0.05)
     >>> two.sightings.tolist()
     [2]
     """
@@ -49,6 +60,8 @@ class TentativeLandmarks(NamedTuple):
     seen: Masks
     #: Unique number of each, shape (t,).
     labels: IntArray
+    #: ln o of each, shape (t,).
+    odds: Array
 
     @classmethod
     def none(cls) -> "TentativeLandmarks":
@@ -58,6 +71,7 @@ class TentativeLandmarks(NamedTuple):
             np.empty((0, 2, 2)),
             np.empty(0, np.uint64),
             np.empty(0, np.int64),
+            np.empty(0),
         )
 
     @property
@@ -96,10 +110,15 @@ class TentativeLandmarks(NamedTuple):
         blocks[np.arange(t), :, np.arange(t), :] = self.covariances
         return MapView(mean, covariance, tuple(range(t)))
 
+    def with_misses(self, chance: Array) -> "TentativeLandmarks":
+        """Count the landmarks that this scan does not show; chance is 1 − P_D, (t,)."""
+        missed = self.seen & np.uint64(1) == 0
+        return self._replace(odds=self.odds + np.where(missed, np.log(chance), 0.0))
+
     def with_sighting(
-        self, which: int, reading: Array, noise: Noise
+        self, which: int, reading: Array, noise: Noise, density: float
     ) -> "TentativeLandmarks":
-        """Correct one landmark by another reading (β, r) of it."""
+        """Correct one landmark by another reading (β, r) of it, where ρ is known."""
         (x, y), C = self.places[which], self.covariances[which]
         distance = np.hypot(x, y)
         H = np.array(
@@ -115,14 +134,18 @@ class TentativeLandmarks(NamedTuple):
         places[which] += gain @ nu
         spread[which] = (corrected + corrected.T) / 2
         seen[which] |= np.uint64(1)
-        return self._replace(places=places, covariances=spread, seen=seen)
+        odds = self.odds.copy()
+        unlikelihood = nu @ np.linalg.solve(S, nu) + np.log(np.linalg.det(S))
+        odds[which] -= unlikelihood / 2 + np.log(2 * np.pi * density)
+        return self._replace(places=places, covariances=spread, seen=seen, odds=odds)
 
     def with_new(
-        self, readings: Array, noise: Noise, labels: IntArray
+        self, readings: Array, noise: Noise, labels: IntArray, share: float
     ) -> "TentativeLandmarks":
         """Add landmarks seen for the first time, by their readings, rows (β, r)."""
         if not len(readings):
             return self
+        share = min(max(share, LEAST_SHARE), 0.5)
         places, spread = [], []
         variances = noise.variances(readings[:, 1])
         for (bearing, distance), (across, along) in zip(
@@ -137,6 +160,7 @@ class TentativeLandmarks(NamedTuple):
             np.concatenate([self.covariances, spread]),
             np.concatenate([self.seen, np.ones(len(readings), np.uint64)]),
             np.concatenate([self.labels, labels]),
+            np.append(self.odds, np.full(len(readings), np.log(share / (1 - share)))),
         )
 
     def chosen(self, which: BoolArray) -> "TentativeLandmarks":
@@ -148,6 +172,7 @@ class TentativeLandmarks(NamedTuple):
             self.covariances[which],
             self.seen[which],
             self.labels[which],
+            self.odds[which],
         )
 
 
@@ -168,4 +193,5 @@ TENTATIVE: saved_states.Table = {
     "covariances": (saved_states.NUMBERS, "t", 2, 2),
     "seen": (saved_states.Kind(np.uint64, _masks), "t"),
     "labels": (saved_states.WHOLE, "t"),
+    "odds": (saved_states.NUMBERS, "t"),
 }

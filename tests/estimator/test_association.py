@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numeric_jacobian import numeric_jacobian
+from scipy.stats import multivariate_normal
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import make_estimator
@@ -33,6 +34,7 @@ from slamgym.estimator.kernels.kalman_gain import (
 )
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
 from slamgym.estimator.models.motions import predict_pose
+from slamgym.evaluation import score_association
 from slamgym.sim_configs import action_sequence, load_scenario
 
 NOISE = Noise(0.02, 0.1, 0.01, 0.05)
@@ -136,7 +138,7 @@ def test_every_reading_gets_one_landmark_or_none(squared, log_det, ambiguity, ex
 
 def tracked(readings):
     rows, labels = np.array(readings, dtype=float), np.arange(len(readings))
-    return TentativeLandmarks.none().with_new(rows, NOISE, labels)
+    return TentativeLandmarks.none().with_new(rows, NOISE, labels, share=0.2)
 
 
 def test_a_tentative_landmark_starts_where_it_was_read():
@@ -181,11 +183,14 @@ def test_a_sighting_corrects_a_tentative_landmark_like_any_filter():
     S = H @ one.covariances[0] @ H.T
     S += sensor_noise(NOISE, 5.2)
     K = one.covariances[0] @ H.T @ np.linalg.inv(S)
-    seen = one.with_sighting(0, np.array(reading), NOISE)
+    seen = one.with_sighting(0, np.array(reading), NOISE, density=0.03)
     place = one.places[0] + K @ (np.array(reading) - expected.measurement[0])
     np.testing.assert_allclose(seen.places[0], place, rtol=1e-10)
     left = (np.eye(2) - K @ H) @ one.covariances[0]
     np.testing.assert_allclose(seen.covariances[0], left, rtol=1e-9)
+    likelihood = multivariate_normal(expected.measurement[0], S).pdf(reading)
+    odds = 0.2 / 0.8 * likelihood / 0.03
+    np.testing.assert_allclose(seen.odds, np.log(odds), rtol=1e-9)
 
 
 def test_sightings_count_as_long_as_they_are_recent():
@@ -194,12 +199,63 @@ def test_sightings_count_as_long_as_they_are_recent():
     for seen in (True, False, False, True, False, False, False, False):
         landmark = landmark.next_scan(4)
         if seen:
-            landmark = landmark.with_sighting(0, np.array([0.0, 5.0]), NOISE)
+            landmark = landmark.with_sighting(0, np.array([0.0, 5.0]), NOISE, 1.0)
         counts += landmark.sightings.tolist()
     assert counts == [2, 2, 2, 2, 1, 1, 1]  # and at last it is forgotten
 
 
+def test_a_miss_counts_against_a_tentative_landmark():
+    both = tracked([(0.0, 5.0), (1.0, 5.0)]).next_scan(8)
+    one = both.with_sighting(0, np.array([0.0, 5.0]), NOISE, density=0.1)
+    missed = one.with_misses(np.array([0.3, 0.05]))
+    np.testing.assert_allclose(missed.odds - one.odds, [0.0, np.log(0.05)])
+
+
 # --- all of it ---
+
+
+@pytest.mark.slow
+def test_clutter_between_misses_makes_few_landmarks():
+    settings = load_scenario("loop").model_dump()
+    settings["sensor"] |= {"identities": False, "clutter": 1.0, "max_clutter": 5}
+    world, ghosts = load_scenario(settings), 0
+    for seed in range(6):
+        env = LandmarkWorldEnv(world)
+        observation, info = env.reset(seed=seed)
+        true_ids = []
+        slam = make_estimator(
+            "invariant",
+            motion_std=world.motion.std,
+            measurement_std=world.sensor.std,
+            initial_pose=world.start.pose,
+            initial_pose_std=world.start.std,
+            management={"association": "joint"},
+        )
+        for action in action_sequence(world)[:150]:
+            seen = observation["mask"]
+            slam.update(observation["landmarks"][seen])
+            true_ids.append(info["landmark_ids"][seen])
+            observation, *_, info = env.step(action)
+            slam.predict(observation["odometry"])
+        scores = score_association(slam.decisions, true_ids)
+        ghosts += scores.ghost
+        assert scores.new_correct == 14
+    assert ghosts <= 2  # five, if sightings alone counted
+
+
+@pytest.mark.parametrize("association", ["joint", "hypotheses"])
+def test_an_outlier_that_began_a_landmark_does_not_delay_it(association):
+    slam = make_estimator(
+        "invariant",
+        motion_std=(0.01, 0.01, 0.01),
+        measurement_std=(0.05, 0.1),
+        management={"association": association, "confirm": (3, 8)},
+    )
+    slam.update([(0.3, 4.6)])
+    for _ in range(3):
+        slam.predict((0.0, 0.0))
+        slam.update([(0.3, 4.0)])
+    np.testing.assert_allclose(np.hypot(*slam.belief().landmarks[0]), 4.0, atol=0.1)
 
 
 @pytest.mark.parametrize("association", ["joint", "hypotheses"])
