@@ -262,15 +262,6 @@ def mirror(covariance: Array, size: int) -> None:
                 covariance[b, a] = covariance[a, b]
 
 
-@njit_internal
-def squared_whitened(rows: Array, used: int) -> float:
-    """Return the NIS νᵀ S⁻¹ ν of the readings in use, linearised at the prior."""
-    nis = 0.0
-    for row in range(FIRST, FIRST + 2 * used):
-        nis += rows[row, WHITE] * rows[row, WHITE]
-    return nis
-
-
 # --------------------------------------------------------------------------------------
 # The correction of the state: δ is composed with the mean, and P follows.
 
@@ -478,7 +469,7 @@ META_WIDTH = 16
 # Rows of the ledger of one scan.
 SLOT = 0  # of each reading: place of its landmark in the map, negative for a new one
 OUTCOME = 1  # of each reading: USED, ADDED, GATED, SKIPPED or WAITING
-NEAR = 2  # of each reading: 1 where the robot is too near its landmark to linearise
+NEAR = 2  # of each reading: 1 where the robot is within 10 σ of its landmark
 COLUMN = 3  # of each reading in use: its landmark's first column in the state
 ORDER = 4  # the readings in use in the order in which they are taken one by one
 LEDGER_HEIGHT = 5
@@ -492,7 +483,7 @@ class Workspace(NamedTuple):
     """Room for one update; every row begins on a cache line."""
 
     rows: Array  # (FIRST + 2m + 2, capacity + META_WIDTH), two systems to iterate
-    before: Array  # (capacity, capacity) P to restore after a failure, or empty
+    before: Array  # P to restore after a failure; empty, or square with room for it
 
 
 def new_workspace(
@@ -515,12 +506,6 @@ def new_workspace(
         aligned_zeros(FIRST + systems, (capacity + 7) // 8 * 8 + META_WIDTH),
         aligned_zeros(kept, kept),
     )
-
-
-@njit_internal
-def second_system(rows: Array) -> Array:
-    """Return the system of readings linearised again, where the rules iterate."""
-    return rows[FIRST + (len(rows) - FIRST) // 2 :]
 
 
 class BeliefArrays(NamedTuple):

@@ -55,8 +55,6 @@ from .kalman_gain import (
     mirror,
     retract,
     retract_point,
-    second_system,
-    squared_whitened,
     times,
     transport,
     whiten,
@@ -118,7 +116,9 @@ def update_belief(
     failed = correct(belief, size, ledger, rules, workspace, used)
     if failed >= 0:
         return failed // 2, used, 0.0
-    nis = squared_whitened(rows, used)
+    nis = 0.0  # of the readings in use, linearised at the prior
+    for row in range(FIRST, FIRST + 2 * used):
+        nis += rows[row, WHITE] * rows[row, WHITE]
     add_landmarks(belief, size, readings, count, rules, ledger)
     return DONE, used, nis
 
@@ -209,7 +209,7 @@ def screen(
         # The range as read makes σr small just where its error is negative.
         at = distance if rules.noise_as_read else expected
         system[row, VARIANCE], system[row + 1, VARIANCE] = variances(rules, at)
-        ledger[NEAR, k] = is_too_near(mean, belief.covariance, column)
+        ledger[NEAR, k] = is_near(mean, belief.covariance, column)
         if rules.gate < np.inf:
             linearise(mean, belief.reference, rules.linearisation, system, row, column)
             if not squared_innovation(belief.covariance, system, row, column) <= (
@@ -256,7 +256,7 @@ def squared_innovation(covariance: Array, system: Array, row: int, c: int) -> fl
 
 
 @njit_internal
-def is_too_near(mean: Array, covariance: Array, column: int) -> bool:
+def is_near(mean: Array, covariance: Array, column: int) -> bool:
     """Whether the robot is within 10 σ of a landmark, where linearisation fails.
 
     σ is the largest standard deviation of the landmark's place in the robot's frame,
@@ -393,6 +393,12 @@ def relinearise(
                 break
     downdate(belief.covariance, size, now, 0, 2 * used)
     return -1
+
+
+@njit_internal
+def second_system(rows: Array) -> Array:
+    """Return the system of readings linearised again, where the rules iterate."""
+    return rows[FIRST + (len(rows) - FIRST) // 2 :]
 
 
 @njit_internal
@@ -570,7 +576,11 @@ def linearise(
     row: int,
     column: int,
 ) -> None:
-    """Fill H and ν of the reading in ``row`` and the next, eqs. 1.4 to 1.6."""
+    """Fill H and ν of the reading in ``row`` and the next.
+
+    At the estimate they are those of :func:`..models.bearing_range.predict_measurement`
+    for a sensor of bearing and range.
+    """
     H = system[row : row + 2, JACOBIAN : JACOBIAN + 5]
     z, nu = system[row : row + 2, READING], system[row : row + 2, INNOVATION]
     dx, dy = mean[column] - mean[0], mean[column + 1] - mean[1]
@@ -616,9 +626,10 @@ def _project(reference: Array, column: int, H: Array) -> None:
 def add_landmark(
     belief: BeliefArrays, size: int, z0: float, z1: float, rules: Rules
 ) -> None:
-    """Append the landmark of one reading, eq. 1.3, with its correlation to all else.
+    """Append the landmark of one reading with its correlation to all else.
 
-    ::
+    F_p and F_z are the derivatives of :func:`..models.bearing_range.locate_landmark`,
+    or those of another sensor::
 
         P_l* = F_p P_p*,    P_ll = F_p P_pp F_pᵀ + F_z Q F_zᵀ
 

@@ -113,8 +113,9 @@ def predict(
     motion_variance: Array,
     linearisation: int,
 ) -> None:
-    """Move a belief by a displacement in the robot's frame, in place; eqs. 1.1 and 1.2.
+    """Move a belief by a displacement in the robot's frame, in place.
 
+    The equations are those of :func:`.motions.predict_pose`, for any displacement.
     Linearised elsewhere than at the estimate (linearisation > 0), G is taken over the
     displacement between the predicted positions, which the reference keeps.
     """

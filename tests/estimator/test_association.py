@@ -372,7 +372,7 @@ def plain(kernel):
 
 @pytest.mark.parametrize("share", [0.98, 1.02])
 @pytest.mark.parametrize("seed", range(5))
-def test_a_landmark_is_too_near_within_ten_standard_deviations(seed, share):
+def test_a_landmark_is_near_within_ten_standard_deviations(seed, share):
     rng, column = np.random.default_rng(seed), 5
     root = rng.standard_normal((7, 7))
     P, mean = root @ root.T, np.zeros(7)
@@ -386,11 +386,11 @@ def test_a_landmark_is_too_near_within_ten_standard_deviations(seed, share):
     P *= (3.0 / (10 * share)) ** 2 / widest
     mean[:2] = rng.standard_normal(2)
     mean[column:] = mean[:2] + delta
-    assert plain(screening.is_too_near)(mean, P, column) == (share < 1)
+    assert plain(screening.is_near)(mean, P, column) == (share < 1)
 
 
 def test_a_reading_is_screened_at_the_expected_distance(monkeypatch):
-    for name in ("is_too_near", "variances"):
+    for name in ("is_near", "variances"):
         monkeypatch.setattr(screening, name, plain(getattr(screening, name)))
     rules = Rules(first_std=0.1, second_std=0.2, std_per_metre=0.1, std_metres=0.3)
     mean = np.array([1.0, 2.0, 0.5, 9.0, 9.0, 4.0, 6.0])  # 5 m from the second landmark

@@ -208,7 +208,7 @@ class ScanRules:
         solved = np.linalg.solve(blocks, scan.innovation[..., None])[..., 0]
         refused = (scan.innovation * solved).sum(axis=1) > self.rules.gate
         gated, near = np.zeros_like(skipped), np.zeros_like(skipped)
-        gated[kept], near[kept] = refused, _is_too_near(scan, blocks, expected[kept])
+        gated[kept], near[kept] = refused, _is_near(scan, blocks, expected[kept])
         used = np.repeat(~refused, 2)
         used_ids = [i for i, k in zip(ids, kept & ~gated, strict=True) if k]
         factor, nis = np.empty((0, 0)), 0.0
@@ -230,7 +230,7 @@ def _innovation_covariance(
     return np.asarray(spread.T @ spread + N)
 
 
-def _is_too_near(scan: LinearScan, blocks: Array, distance: Array) -> BoolArray:
+def _is_near(scan: LinearScan, blocks: Array, distance: Array) -> BoolArray:
     """Return whether the robot is within 10 σ of each landmark, as :class:`EkfSlam`.
 
     A landmark's covariance in the robot frame is H_l⁻¹ (S − Q) H_l⁻ᵀ.
