@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import compress
-from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,14 +33,16 @@ from .scan_assignments import (
     assign_scan,
     innovation_distances,
 )
-from .tentative_landmarks import TENTATIVE, TentativeLandmarks
+from .tentative_landmarks import (
+    NO_COUNTS,
+    RINGS,
+    SECTORS,
+    TENTATIVE,
+    TentativeLandmarks,
+    UnexplainedDensity,
+)
 
 NO_LABEL = -1
-
-#: Cells over the bearings, and over the ranges up to the longest reading.
-SECTORS, RINGS = 16, 8
-
-NO_COUNTS = np.zeros((SECTORS, RINGS))
 
 #: Variance of a heading that is equally likely everywhere [rad²].
 UNIFORM = np.pi**2 / 3
@@ -338,85 +338,6 @@ class Detections(NamedTuple):
         return self._replace(surest=surest, unknown=unknown, most_lost=most_lost)
 
 
-class UnexplainedDensity(NamedTuple):
-    """A running average of the readings that belong to no landmark of the map.
-
-    Examples
-    --------
-    >>> density = UnexplainedDensity()
-    >>> for _ in range(500):
-    ...     density = density.after(np.array([[0, 7.9], [1, 8]]), np.array([True] * 2))
-    >>> round(density.per_scan, 2)
-    2.0
-    >>> far, near = density.at(np.array([[0, 7.5], [0, 2.5]]))
-    >>> bool(far > 100 * near)
-    True
-    """
-
-    readings: float = 1.0
-    scans: float = 2.0
-    #: Longest range read so far [m].
-    longest: float = 1.0
-    #: How many landmarks were confirmed.
-    landmarks: float = 1.0
-    #: How many readings each sector and ring has shown, shape (SECTORS, RINGS).
-    cells: Array = NO_COUNTS
-
-    def at(self, readings: Array) -> Array:
-        """Return the density at readings (m, 2), shape (m,) [1 / (rad m)].
-
-        New landmarks come into view at certain bearings and ranges, most of them far
-        ahead.  The density is the product of the shares p of its sector and its ring::
-
-            n / (2π r) · p(sector) SECTORS · p(ring) RINGS
-
-        with n readings per scan, r the longest range, and half a reading added to every
-        sector and ring.
-        """
-        sectors, rings = self.cells.sum(axis=1) + 0.5, self.cells.sum(axis=0) + 0.5
-        sector, ring = _cells(readings, self.longest)
-        usual, usual_ring = sectors.sum() / SECTORS, rings.sum() / RINGS
-        shape = sectors[sector] / usual * rings[ring] / usual_ring
-        return np.asarray(self.per_scan / (2 * np.pi * self.longest) * shape)
-
-    @property
-    def per_scan(self) -> float:
-        """Readings per scan; at least half a reading within the memory."""
-        return max(self.readings, 0.5) / self.scans
-
-    @property
-    def landmark_share(self) -> float:
-        """Probability that such a reading is of a landmark."""
-        return min(self.landmarks / self.readings, 1.0)
-
-    def after(
-        self, readings: Array, is_new: BoolArray, landmarks: int = 0
-    ) -> UnexplainedDensity:
-        """Count one more scan (m, 2), its rows of no landmark, and those confirmed."""
-        finite = [isfinite(b) and isfinite(r) for b, r in readings.tolist()]
-        ranges = compress(readings[:, 1].tolist(), finite)
-        longest, new = max([self.longest, *ranges]), np.count_nonzero(is_new)
-        cells = self.cells
-        if new:
-            cells = cells.copy()
-            np.add.at(cells, _cells(readings[is_new & finite], longest), 1.0)
-        return UnexplainedDensity(
-            MEMORY * self.readings + new,
-            MEMORY * self.scans + 1,
-            longest,
-            MEMORY * self.landmarks + landmarks,
-            cells,
-        )
-
-
-def _cells(readings: Array, longest: float) -> tuple[IntArray, IntArray]:
-    """Return the sector and the ring of readings (m, 2)."""
-    turned = np.mod(readings[:, 0] + np.pi, 2 * np.pi)
-    sector = np.floor(turned * (SECTORS / (2 * np.pi)))
-    ring = np.minimum(np.maximum(readings[:, 1] * (RINGS / longest), 0), RINGS - 1)
-    return sector.astype(np.int64) % SECTORS, ring.astype(np.int64)
-
-
 @dataclass(frozen=True)
 class Candidates:
     """Landmarks that are not in the map yet, and the next identity to assign."""
@@ -493,10 +414,6 @@ class Candidates:
             UnexplainedDensity(*density.tolist())._replace(cells=saved["unexplained"]),
             Detections(seen, expected, missed, shown, *evidence),
         )
-
-
-#: Weight of a scan relative to the one after it, in running averages.
-MEMORY = 0.98
 
 
 #: What a saved state holds about the landmarks that are not in the map yet.

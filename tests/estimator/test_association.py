@@ -15,8 +15,10 @@ from slamgym.estimator.association.scan_assignments import (
     innovation_distances,
     nearest_neighbours,
 )
-from slamgym.estimator.association.scan_association import UnexplainedDensity
-from slamgym.estimator.association.tentative_landmarks import TentativeLandmarks
+from slamgym.estimator.association.tentative_landmarks import (
+    TentativeLandmarks,
+    UnexplainedDensity,
+)
 from slamgym.estimator.kernels import scan_update as screening
 from slamgym.estimator.kernels.kalman_gain import (
     ADDED,
