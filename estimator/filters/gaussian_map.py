@@ -20,7 +20,7 @@ from ...jit import jit, njit_internal
 from ..interface import Belief, MapView, UpdateReport
 from ..kernels import kalman_gain as gain
 from ..kernels.kalman_gain import BeliefArrays, Rules, Workspace, new_workspace
-from ..kernels.scan_update import DONE, update_belief
+from ..kernels.scan_update import DONE, update_lower_half
 from ..models.rigid_motion import ErrorFrame, predict
 from ..support import saved_states as saved
 from ..support.argument_checks import aligned_zeros, landmarks_that_fit
@@ -41,6 +41,7 @@ LANDMARKS = 3  # number of landmarks in the map
 TABLED = 4  # how many of them are in the table
 STEPS = 5  # how many odometry readings and scans the belief has taken in
 SCANNED, IN_USE = 6, 7  # number of readings in the last scan, and of those in use
+LOWER = 8  # 1: of P, only the lower half and the rows of the pose are up to date
 STARTS = 13  # where each part begins, and the end
 NUMBERS = 24
 
@@ -140,8 +141,7 @@ class GaussianMap:
     @property
     def arrays(self) -> BeliefArrays:
         """Mean, covariance and linearisation points."""
-        parts = self.parts
-        return BeliefArrays(parts.mean, parts.covariance, parts.reference)
+        return BeliefArrays(self.mean, self.covariance, self.reference)
 
     @property
     def mean(self) -> Array:
@@ -151,6 +151,8 @@ class GaussianMap:
     @property
     def covariance(self) -> Array:
         """Shape (capacity, capacity), of the additive error."""
+        if self.parts.numbers[LOWER]:
+            complete(self.block)
         return self.parts.covariance
 
     @property
@@ -351,14 +353,9 @@ def new_block(capacity: int, readings: int, values: Array) -> Array:
     capacity, readings = (-(-size // 8) * 8 for size in (capacity, readings))
     height = gain.FIRST + (2 if iterated else 1) * (2 * readings + 2)
     before, table = min(capacity, gain.LARGE + 6), 1 << capacity.bit_length()
-    sizes = [
-        VALUES,
-        capacity,
-        capacity**2,
-        capacity,
-        height * (capacity + gain.META_WIDTH),
-    ]
-    sizes += [before**2, capacity, table, readings, gain.LEDGER_HEIGHT * readings]
+    rows, ledger = height * (capacity + gain.META_WIDTH), gain.LEDGER_HEIGHT * readings
+    sizes = [VALUES, capacity, capacity**2, capacity, rows]
+    sizes += [before**2, capacity, table, readings, ledger]
     starts = [*accumulate(sizes, initial=NUMBERS)]
     block = aligned_zeros(starts[-1])
     numbers = block[:NUMBERS].view(np.int64)
@@ -398,8 +395,7 @@ def update_map(block: Array, readings: Array, ids: IntArray) -> int:
     Parameters
     ----------
     block : ndarray
-        The memory of the filter, see :class:`Parts`.  On return it also
-        holds the record of the scan.
+        The memory of the filter (:class:`Parts`); on return with a record of the scan.
     readings : ndarray, shape (m, 2)
         Rows (β, r) [rad, m].
     ids : ndarray of int64, shape (m,)
@@ -423,19 +419,14 @@ def update_map(block: Array, readings: Array, ids: IntArray) -> int:
         return NO_ROOM
     if mapped + find_slots(parts, ids) > (numbers[CAPACITY] - 4) // 2:
         return NO_ROOM
-    status, used, nis = update_belief(
-        parts.mean,
-        parts.covariance,
-        parts.reference,
-        3 + 2 * mapped,
-        readings,
-        count,
-        parts.ledger,
-        parts.rows,
-        parts.before,
-        parts.values,
+    complete_rows(parts, count)
+    size = 3 + 2 * mapped
+    status, used, nis = update_lower_half(
+        parts[2:5], size, readings, count, parts.ledger, parts[5:7], parts.values
     )
     if status == DONE:
+        if used > 0:
+            numbers[LOWER] = size > gain.LARGE
         for k in range(count):
             parts.scan_ids[k] = ids[k]
             if parts.ledger[gain.OUTCOME, k] == gain.ADDED:
@@ -444,6 +435,27 @@ def update_map(block: Array, readings: Array, ids: IntArray) -> int:
         numbers[SCANNED], numbers[IN_USE], parts.values[NIS] = count, used, nis
         numbers[STEPS] += 1
     return int(status)
+
+
+@jit
+def complete(block: Array) -> None:
+    """Copy the lower half of the covariance into the upper, if it is out of date."""
+    parts = parts_jit(block)
+    complete_rows(parts, parts.numbers[LANDMARKS])
+
+
+@njit_internal
+def complete_rows(parts: Parts, count: int) -> None:
+    """Complete the rows of the landmarks of a scan, or all rows if these are many."""
+    numbers, slots = parts.numbers, parts.ledger[gain.SLOT]
+    size = 3 + 2 * numbers[LANDMARKS]
+    if numbers[LOWER] and 8 * count >= numbers[LANDMARKS]:
+        gain.mirror(parts.covariance, size)
+        numbers[LOWER] = 0
+    elif numbers[LOWER]:
+        for k in range(count):
+            if slots[k] >= 0:
+                gain.refresh(parts.covariance, size, 3 + 2 * slots[k])
 
 
 @njit_internal

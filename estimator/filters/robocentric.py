@@ -18,7 +18,7 @@ from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from .conditioning import ObservedMap, PoseReading, observe
 from .ekf import EkfSlam
-from .gaussian_map import LANDMARKS, parts_jit, update_map
+from .gaussian_map import LANDMARKS, complete, parts_jit, update_map
 
 # The state that the kernels see, in the robot's frame at the last scan: the motion
 # since that scan in place of the pose; the world's origin (x, y), its heading and a
@@ -34,6 +34,7 @@ def update_and_move(block: Array, readings: Array, ids: IntArray) -> int:
     if status == DONE and len(ids) > 0:
         parts = parts_jit(block)
         size = 3 + 2 * parts.numbers[LANDMARKS]
+        complete(block)
         move_frame(parts.mean, parts.covariance, size)
     return status
 

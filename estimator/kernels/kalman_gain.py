@@ -58,9 +58,9 @@ def absorb(
     Returns
     -------
     int
-        -1: the lower half of P is right, and :func:`mirror` is to restore the upper.
-        Or the first row at which S is not positive definite: P is then spoilt, unless
-        that row lies in the first block.
+        -1: the lower half of P is right, for :func:`restore_upper`.  Or the first row
+        at which S is not positive definite: P is then spoilt, unless that row lies in
+        the first block.
     """
     system, bottom = rows[FIRST:], 2 * used
     begin_correction(size, rows, system, bottom)
@@ -234,19 +234,34 @@ def downdate(
 @njit_internal
 def _refresh_for(covariance: Array, size: int, columns: IntArray) -> None:
     """Complete the rows of P that the next readings look at."""
-    for pose in range(0, 4, 2):
-        _refresh(covariance, size, pose)
+    refresh_pose(covariance, size)
     for column in columns:
-        _refresh(covariance, size, column)
+        refresh(covariance, size, column)
 
 
 @njit_internal
-def _refresh(covariance: Array, size: int, row: int) -> None:
+def refresh_pose(covariance: Array, size: int) -> None:
+    """Complete the rows of the pose, and the one below."""
+    for row in range(0, 4, 2):
+        refresh(covariance, size, row)
+
+
+@njit_internal
+def refresh(covariance: Array, size: int, row: int) -> None:
     """Copy two columns of the lower half into their rows."""
     covariance[row, row + 1] = covariance[row + 1, row]
     for j in range(row + 2, size):
         covariance[row, j] = covariance[j, row]
         covariance[row + 1, j] = covariance[j, row + 1]
+
+
+@njit_internal
+def restore_upper(covariance: Array, size: int) -> None:
+    """Copy the lower half into the upper; if P is large, into the rows of the pose."""
+    if size <= LARGE:
+        mirror(covariance, size)
+    else:
+        refresh_pose(covariance, size)
 
 
 @njit_internal

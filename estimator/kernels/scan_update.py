@@ -53,6 +53,7 @@ from .kalman_gain import (
     compose,
     downdate,
     mirror,
+    restore_upper,
     retract,
     retract_point,
     times,
@@ -106,9 +107,33 @@ def update_belief(
     nis : float
         νᵀ S⁻¹ ν over them.
     """
-    belief = BeliefArrays(mean, covariance, reference)
-    workspace = Workspace(rows, before)
-    rules = as_rules(rule_values)
+    belief, workspace = (mean, covariance, reference), (rows, before)
+    status, used, nis = update_lower_half(
+        belief, size, readings, count, ledger, workspace, rule_values
+    )
+    if size > LARGE and used > 0:
+        mirror(covariance, size)
+    return status, used, nis
+
+
+@njit_internal
+def update_lower_half(
+    arrays: tuple[Array, Array, Array],
+    size: int,
+    readings: Array,
+    count: int,
+    ledger: IntArray,
+    work_arrays: tuple[Array, Array],
+    rule_values: Array,
+) -> tuple[int, int, float]:
+    """Update one belief as :func:`update_belief`, but leave a large one incomplete.
+
+    Above a size of LARGE, only the lower half of P and the rows of the pose are right
+    after an update, and need be before it, with the rows of the landmarks of the scan.
+    To copy a large half takes as long as to compute it.
+    """
+    belief, workspace = BeliefArrays(*arrays), Workspace(*work_arrays)
+    rows, rules = workspace.rows, as_rules(rule_values)
     for k in range(count):
         if not (usable(readings[k, 0]) and usable(readings[k, 1])):
             return NOT_USABLE, 0, 0.0
@@ -330,7 +355,7 @@ def correct(
         return failed
     if rules.frame == INVARIANT:
         transport(covariance, rows, size)
-    mirror(covariance, size)
+    restore_upper(covariance, size)
     return -1
 
 

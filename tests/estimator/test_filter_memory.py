@@ -9,6 +9,8 @@ import pytest
 from comparison import digest
 
 from slamgym.estimator import UpdateReport, make_estimator
+from slamgym.estimator.filters.gaussian_map import LOWER
+from slamgym.estimator.kernels.kalman_gain import LARGE
 
 NOISE = {"motion_std": (0.05, 0.02, 0.01), "measurement_std": (0.03, 0.1)}
 FAMILY = (
@@ -90,6 +92,34 @@ def test_a_report_keeps_its_results_while_the_filter_goes_on(name):
     for late, early in zip(kept, read, strict=True):
         assert late == early
     assert pickle.loads(pickle.dumps(kept[-1])) == copy.deepcopy(kept[-1]) == read[-1]
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [(name, {}) for name in ("ekf", "invariant", "iterated", "robocentric")]
+    + [(name, {}) for name in ("first_estimates", "observability_constrained")]
+    + [("ekf", {"gate_probability": 0.99}), ("invariant", {"iterations": 1})],
+)
+def test_a_large_covariance_is_completed_when_it_is_read(name, options):
+    slam, read = (make_estimator(name, **NOISE, **options) for _ in range(2))
+    seen_first, was_lower = list(range(150)), False
+    for k, (u, z, seen) in enumerate(scans(0, seen_first, steps=22, most=150)):
+        few = len(seen) if k < 9 else 3 + 2 * k
+        for each in (slam, read):
+            each.predict(u)
+            each.update(z[:few], seen[:few])
+            if k == 15:
+                each.remove(each.landmark_ids[3:5])
+        was_lower |= bool(slam.map.parts.numbers[LOWER])
+        covariance = read.map.covariance  # of a map that is complete after every step
+        assert not read.map.parts.numbers[LOWER]
+        np.testing.assert_array_equal(covariance, covariance.T)
+        if k == 18:
+            slam = copy.deepcopy(slam)
+    assert was_lower == (name != "robocentric")
+    assert slam.map.size > LARGE
+    np.testing.assert_array_equal(slam.map.mean, read.map.mean)
+    np.testing.assert_array_equal(slam.map.covariance, read.map.covariance)
 
 
 def test_the_parts_of_a_memory_are_apart():
