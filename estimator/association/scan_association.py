@@ -93,14 +93,8 @@ class ScanAssociation:
         density = self._density.after(
             self._readings, np.array(is_new, dtype=np.bool_), len(self.confirmed)
         )
-        return Candidates(
-            self._tentative,
-            self._waiting,
-            self._next_id,
-            self.scan + 1,
-            density,
-            self._detections.with_heading(view),
-        )
+        known = self._tentative, self._waiting, self._next_id, self.scan + 1
+        return Candidates(*known, density, self._detections.with_heading(view))
 
     def assign(
         self, rows: IntArray, slots: IntArray, view: MapView, noise: Noise
@@ -214,20 +208,23 @@ class ScanAssociation:
 #
 # A run is probably lost if the scans show far fewer landmarks than its map promises.
 # Page's test [1]_ compares the P_D of landmarks that are in view for sure, the least
-# within two σ, with a fraction ρ of it::
+# within two σ and half a cell, with a fraction ρ of it.  The half cell keeps landmarks
+# at the edge of the view out::
 #
 #     g ← max(0, g + min(c, Σ_seen ln ρ + Σ_missed ln (1 − ρ P_D) / (1 − P_D)))
 #
-# A scan adds at most c, since a single wrong pose may cause all its misses.  A landmark
-# that no two scans have shown since it entered the map may be of clutter: to miss it is
-# no evidence.  P_D learns the rates of a lost run, too, so g falls again: the largest g
-# counts.
+# A scan adds at most c, since a single wrong pose may cause all its misses.  Some
+# landmarks are no evidence.  One that no two scans have shown since it entered the map
+# may be of clutter.  One that a reading beside it may belong to may have been seen.  A
+# lost run sees the landmarks that it maps anew: those that are newer than the last
+# scan at which g was 0.  P_D learns the rates of a lost run, too, so g falls again: the
+# largest g counts.
 #
 # A lost run whose landmarks all stay in view misses none.  Many of these have lost the
-# heading: linearised equations no longer hold where its standard deviation is a radian.
-# Scans in succession that leave the heading unknown count c each::
+# heading: linearised equations do not hold where its standard deviation is a radian.
+# Scans in succession that leave the heading unknown count c / 2 each::
 #
-#     h ← h + c  if min(σ²_θ, π²/3) > least + 1 rad² and there is a map,  else  h ← 0
+#     h ← h + c / 2  if min(σ²_θ, π²/3) > least + 0.8 rad² and there is a map,  else 0
 #
 # π²/3 is the variance of a uniform heading: one that is unknown at the start is no
 # evidence.
@@ -245,7 +242,8 @@ class Detections(NamedTuple):
     >>> view = MapView(np.array([0, 0, 0, 4.5, 0.5]), 1e-6 * np.eye(5), (7,))
     >>> detections = Detections.none()
     >>> for slot in (0, 0, 0, -1):
-    ...     cost, detections = detections.after(view, np.array([slot]), longest=8.0)
+    ...     row = np.array([slot])
+    ...     cost, detections = detections.after(view, row, row[:0], longest=8.0)
     >>> share = (3 + 2 * 4 / 5) / 5  # of the cell, with that of its ring
     >>> bool(np.isclose(cost, -2 * np.log(HIDDEN + (1 - HIDDEN) * (1 - share))))
     True
@@ -264,6 +262,8 @@ class Detections(NamedTuple):
     lost: float = 0.0
     #: The largest evidence so far.
     most_lost: float = 0.0
+    #: Landmarks from this identity on are newer than the last scan at which g was 0.
+    first_new: int = 0
     #: Least variance of the heading so far [rad²].
     surest: float = UNIFORM
     #: How many scans in succession have left the heading unknown.
@@ -275,7 +275,7 @@ class Detections(NamedTuple):
         return cls(NO_COUNTS, NO_COUNTS, {}, {})
 
     def after(
-        self, view: MapView, slots: IntArray, longest: float
+        self, view: MapView, slots: IntArray, explained: IntArray, longest: float
     ) -> tuple[float, Detections]:
         """Count one scan; return the cost of the landmarks that it has missed, too.
 
@@ -285,6 +285,8 @@ class Detections(NamedTuple):
             The map before the scan.
         slots : ndarray of int64, shape (m,)
             Its landmarks that the rows of the scan show; below 0: none.
+        explained : ndarray of int64, shape (k,)
+            Its landmarks that some row may belong to: to miss these is no evidence.
         longest : float
             Longest range read so far [m].
         """
@@ -293,23 +295,21 @@ class Detections(NamedTuple):
         missed = np.array([self.missed.get(i, 1.0) for i in view.ids])
         counts = self.seen.copy(), self.expected.copy()
         shown = np.array([self.shown.get(i, 0) for i in view.ids], dtype=np.int64)
-        known, P = (is_seen, shown >= PROVEN), view.covariance
+        is_telling = (shown >= PROVEN) & (np.array(view.ids) < self.first_new)
+        is_telling[explained] &= is_seen[explained]
+        known, P = (is_seen, is_telling), view.covariance
         cost, fewer = _count(view.mean, P, known, longest, counts, missed)
         shown = np.minimum(shown + is_seen, PROVEN)
         lost = max(0.0, self.lost + min(fewer, MOST_OF_SCAN))
         every = {**self.missed, **dict(zip(view.ids, missed.tolist(), strict=True))}
         some = {i: left for i, left in every.items() if left < 1}
         proven = {**self.shown, **dict(zip(view.ids, shown.tolist(), strict=True))}
-        most_lost = max(self.most_lost, lost)
+        most_lost, first_new = max(self.most_lost, lost), self.first_new
+        if lost == 0:
+            first_new = max(first_new, 1 + max(view.ids, default=-1))
         seen, expected = counts
-        return cost, self._replace(
-            seen=seen,
-            expected=expected,
-            missed=some,
-            shown=proven,
-            lost=lost,
-            most_lost=most_lost,
-        )
+        found = Detections(seen, expected, some, proven, lost, most_lost, first_new)
+        return cost, found._replace(surest=self.surest, unknown=self.unknown)
 
     def chance_to_miss(self, view: MapView, longest: float) -> Array:
         """Return the probability that a scan does not show a landmark, shape (n,)."""
@@ -324,7 +324,7 @@ class Detections(NamedTuple):
         Examples
         --------
         >>> detections = Detections.none()
-        >>> for variance in (0.01, 1.1, 1.2, 1.3):
+        >>> for variance in (0.01, 0.9, 1.0, 1.1):
         ...     view = MapView(np.zeros(5), variance * np.eye(5), (7,))
         ...     detections = detections.with_heading(view)
         >>> detections.unknown, detections.most_lost > LOST_SCORE
@@ -334,7 +334,7 @@ class Detections(NamedTuple):
         surest = min(self.surest, variance)
         is_unknown = len(view.mapped) > 0 and variance - surest > UNKNOWN
         unknown = self.unknown + 1 if is_unknown else 0
-        most_lost = max(self.most_lost, MOST_OF_SCAN * unknown)
+        most_lost = max(self.most_lost, MOST_OF_SCAN / 2 * unknown)
         return self._replace(surest=surest, unknown=unknown, most_lost=most_lost)
 
 
@@ -400,12 +400,12 @@ class Candidates:
         if not all(0 <= left <= 1 for left in missed.values()):
             raise ValueError("state['tentative.missed'] must be probabilities")
         shown = dict(saved["shown"].tolist())
-        lost, most_lost, surest, unknown = saved["lost"].tolist()
-        if min(lost, surest, unknown) < 0 or lost > most_lost:
+        lost, most_lost, first_new, surest, unknown = saved["lost"].tolist()
+        if min(lost, first_new, surest, unknown) < 0 or lost > most_lost:
             raise ValueError(
                 "state['tentative.lost'] must be >= 0, the first at most the second"
             )
-        evidence = lost, most_lost, surest, int(unknown)
+        evidence = lost, most_lost, int(first_new), surest, int(unknown)
         return cls(
             TentativeLandmarks(*(saved[key] for key in TENTATIVE)),
             waiting,
@@ -428,7 +428,7 @@ CANDIDATES: saved_states.Table = {
     "expected": (saved_states.NUMBERS, SECTORS, RINGS),
     "missed": (saved_states.NUMBERS, -1, 2),
     "shown": (saved_states.WHOLE, -1, 2),
-    "lost": (saved_states.NUMBERS, 4),
+    "lost": (saved_states.NUMBERS, 5),
 }
 
 #: Weights of a Gaussian at 0, +2 σ and −2 σ, which keep its variance.
@@ -444,19 +444,25 @@ SUREST = 0.95
 WIDEST = np.pi / 4
 
 #: ρ: detection rate of a lost run, relative to that of its map.
-FEWER = 0.3
+FEWER = 0.5
+
+#: A landmark is evidence if it is in view even this many cells away from its place.
+MARGIN = 0.5
 
 #: c: most evidence of being lost from one scan.
 MOST_OF_SCAN = 3.0
 
 #: A heading is unknown if its variance has grown by this [rad²].
-UNKNOWN = 1.0
+UNKNOWN = 0.8
 
 #: A run whose evidence has exceeded this is probably lost.
-LOST_SCORE = 6.0
+LOST_SCORE = 3.0
 
 #: A landmark that was shown in this many scans is not of clutter.
 PROVEN = 2
+
+#: Bearing + π and range of a landmark, and two σ of both.
+Place = tuple[float, float, float, float]
 
 
 @jit
@@ -470,9 +476,9 @@ def _count(
 ) -> tuple[float, float]:
     """Count a scan; return its cost, and the evidence that the run is lost.
 
-    Known of every landmark is whether the scan shows it, and whether it is proven.
+    Known of every landmark is whether the scan shows it, and whether this is evidence.
     """
-    is_seen, is_proven = known
+    is_seen, is_telling = known
     seen, expected = counts
     sectors, rings = seen.shape
     ring = (seen.sum(axis=0) + 1) / (expected.sum(axis=0) + 2)
@@ -481,7 +487,8 @@ def _count(
     shares = np.minimum((seen + 2 * usual) / (expected + 2), SUREST)
     cost, fewer = 0.0, 0.0
     for j in range(len(is_seen)):
-        bearing, distance, turn, aside = _place_in_scan(mean, P, j)
+        place = _place_in_scan(mean, P, j)
+        bearing, distance, turn, aside = place
         cell = (
             int(bearing // (2 * np.pi / sectors)) % sectors,
             min(int(distance // (longest / rings)), rings - 1),
@@ -493,28 +500,41 @@ def _count(
         if is_seen[j]:
             cost -= 2 * np.log(shares[cell])
             missed[j] = 1.0
-            fewer += is_sure * np.log(FEWER)
+            fewer += is_sure * is_telling[j] * np.log(FEWER)
         elif distance - aside < longest:
-            least, likely = SUREST, 0.0
-            for a in range(-1, 2):
-                side = int((bearing + a * turn) // (2 * np.pi / sectors)) % sectors
-                for b in range(-1, 2):
-                    far = int(abs(distance + b * aside) // (longest / rings))
-                    share = shares[side, far] if far < rings else 0.0
-                    least = min(least, share)
-                    likely += NODES[a] * NODES[b] * share
+            least, likely = _shares_around(shares, place, longest, 0.0)
             left = missed[j] * (1 - least) if is_sure else min(missed[j], 1 - likely)
             odds = HIDDEN + (1 - HIDDEN) * left
             cost -= 2 * np.log(odds / (HIDDEN + (1 - HIDDEN) * missed[j]))
             missed[j] = left
-            if is_sure and is_proven[j]:
+            if is_sure and is_telling[j]:
+                least, _ = _shares_around(shares, place, longest, MARGIN)
                 fewer += np.log((1 - FEWER * least) / (1 - least))
     return cost, fewer
 
 
 @jit
-def _place_in_scan(mean: Array, P: Array, j: int) -> tuple[float, float, float, float]:
-    """Return bearing + π and range of landmark j, and two σ of both."""
+def _shares_around(
+    shares: Array, place: Place, longest: float, margin: float
+) -> tuple[float, float]:
+    """Return the least P_D within two σ and a margin [cells], and the mean P_D."""
+    sectors, rings = shares.shape
+    width, depth = 2 * np.pi / sectors, longest / rings
+    bearing, distance, turn, aside = place
+    least, likely = SUREST, 0.0
+    for a in range(-1, 2):
+        side = int((bearing + a * (turn + margin * width)) // width) % sectors
+        for b in range(-1, 2):
+            far = int(abs(distance + b * (aside + margin * depth)) // depth)
+            share = shares[side, far] if far < rings else 0.0
+            least = min(least, share)
+            likely += NODES[a] * NODES[b] * share
+    return least, likely
+
+
+@jit
+def _place_in_scan(mean: Array, P: Array, j: int) -> Place:
+    """Return where a scan shows landmark j."""
     c = 3 + 2 * j
     dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
     bearing, distance = expected_reading_jit(dx, dy, mean[2])
@@ -545,33 +565,26 @@ def associate(
 ) -> list[Option]:
     """Associate readings (m, 2) that have no identity, in every way to consider.
 
-    Readings closer than the sensor's least range have no usable bearing: they are
-    ambiguous.  Above a cost of ``ceiling``, only the most likely association is of
-    interest.
-
-    Returns
-    -------
-    list of Option
-        The most likely first.
+    The most likely association comes first.  Above a cost of ``ceiling``, only this one
+    is of interest.  Readings closer than the sensor's least range have no usable
+    bearing: they are ambiguous.
     """
     rows = np.flatnonzero(readings[:, 1] >= sensor.min_range)
-    density = _unexplained_density(policy, candidates, readings[rows], sensor.noise)
-    found = assign_scan(
-        policy, view, readings[rows], sensor.noise, density, ceiling=ceiling
-    )
-    explained = {view.ids[slot] for slot in found.explained.tolist()}
+    used, noise = readings[rows], sensor.noise
+    density = _unexplained_density(policy, candidates, used, noise)
+    found = assign_scan(policy, view, used, noise, density, ceiling=ceiling)
 
     def complete(slots: IntArray, detections: Detections) -> ScanAssociation:
         before = replace(candidates, detections=detections)
         association = ScanAssociation(policy, before, readings)
-        association.explained = set(explained)
-        association.assign(rows, slots, view, sensor.noise)
+        association.explained = {view.ids[slot] for slot in found.explained.tolist()}
+        association.assign(rows, slots, view, noise)
         return association
 
     options = []
+    known, longest = candidates.detections, candidates.density.longest
     for cost, slots in found.ranked:
-        longest = candidates.density.longest
-        missed, detections = candidates.detections.after(view, slots, longest)
+        missed, detections = known.after(view, slots, found.explained, longest)
         if policy.density is None:  # the Poisson probability of no other reading
             missed += 2 * candidates.density.per_scan
         options.append((cost + missed, partial(complete, slots, detections)))

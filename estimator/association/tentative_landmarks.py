@@ -157,10 +157,8 @@ class TentativeLandmarks(NamedTuple):
             return self
         share = min(max(share, LEAST_SHARE), 0.5)
         places, spread = [], []
-        variances = noise.variances(readings[:, 1])
-        for (bearing, distance), (across, along) in zip(
-            readings, variances, strict=True
-        ):
+        pairs = zip(readings, noise.variances(readings[:, 1]), strict=True)
+        for (bearing, distance), (across, along) in pairs:
             direction = rotation(bearing)
             places.append(direction @ (distance, 0.0))
             local = np.diag([along, across * distance**2])
@@ -177,13 +175,7 @@ class TentativeLandmarks(NamedTuple):
         """Return some of them."""
         if which.all():
             return self
-        return TentativeLandmarks(
-            self.places[which],
-            self.covariances[which],
-            self.seen[which],
-            self.labels[which],
-            self.odds[which],
-        )
+        return TentativeLandmarks._make(part[which] for part in self)
 
 
 class UnexplainedDensity(NamedTuple):

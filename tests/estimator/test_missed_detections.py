@@ -15,6 +15,7 @@ from slamgym.estimator.association.scan_association import (
     FEWER,
     HIDDEN,
     LOST_SCORE,
+    MARGIN,
     MOST_OF_SCAN,
     PROVEN,
     RINGS,
@@ -27,6 +28,7 @@ from slamgym.estimator.interface import MapView
 from slamgym.estimator.map_management.hypotheses import Hypothesis
 
 LONGEST = 6.0
+NONE = np.empty(0, np.int64)
 
 
 def random_view(rng, landmarks=8):
@@ -35,7 +37,21 @@ def random_view(rng, landmarks=8):
     return MapView(mean, root @ root.T, tuple(range(landmarks)))
 
 
-def plain_count(view, slots, detections):
+CELL = np.array([2 * np.pi / SECTORS, LONGEST / RINGS])
+
+
+def shares_around(shares, middle, reach):
+    """Return weight and P_D of nine nodes."""
+    found = []
+    for across, along in product((-1, 0, 1), repeat=2):
+        node = middle + reach * (across, along)
+        cell = int(node[0] // CELL[0]) % SECTORS, int(abs(node[1]) // CELL[1])
+        weight = np.prod([1 / 8 if step else 3 / 4 for step in (across, along)])
+        found.append((weight, shares[cell] if cell[1] < RINGS else 0.0))
+    return found
+
+
+def plain_count(view, slots, explained, detections):
     """Return cost and counts from the dense expected readings, node by node."""
     expected, joint = predicted_readings(
         view.mean, view.covariance, np.arange(len(view.ids))
@@ -45,32 +61,30 @@ def plain_count(view, slots, detections):
     sector = (seen.sum(axis=1) + 1) / (tries.sum(axis=1) + 2)
     shares = (seen + 2 * np.minimum(sector[:, None], ring)) / (tries + 2)
     shares = np.minimum(shares, SUREST)
-    size = np.array([2 * np.pi / SECTORS, LONGEST / RINGS])
     cost, missed, fewer = 0.0, {}, 0.0
     after = Detections(seen.copy(), tries.copy(), missed, {})
     for j, (bearing, distance) in enumerate(expected):
         std = np.sqrt(np.diagonal(joint)[2 * j : 2 * j + 2])
         middle = np.array([bearing + np.pi, distance])
-        a, b = (middle // size).astype(int)
+        a, b = (middle // CELL).astype(int)
         if j in slots:
             cost -= 2 * np.log(shares[a % SECTORS, min(b, RINGS - 1)])
         is_sure = distance + 2 * std[1] < LONGEST and 2 * std[0] <= WIDEST
         if is_sure:
             after.expected[a % SECTORS, b] += 1
             after.seen[a % SECTORS, b] += j in slots
-            fewer += np.log(FEWER) * (j in slots)
+        is_telling = detections.shown.get(j, 0) >= PROVEN and j < detections.first_new
+        if is_sure and is_telling and j in slots:
+            fewer += np.log(FEWER)
         if j in slots or distance - 2 * std[1] >= LONGEST:
             continue
-        found = []
-        for across, along in product((-2, 0, 2), repeat=2):
-            node = middle + std * (across, along)
-            cell = int(node[0] // size[0]) % SECTORS, int(abs(node[1]) // size[1])
-            weight = np.prod([1 / 8 if step else 3 / 4 for step in (across, along)])
-            found.append((weight, shares[cell] if cell[1] < RINGS else 0.0))
+        found = shares_around(shares, middle, 2 * std)
         before = detections.missed.get(j, 1.0)
         least = min(share for _, share in found)
         left = before * (1 - least)
-        if is_sure and detections.shown.get(j, 0) >= PROVEN:
+        if is_sure and is_telling and j not in explained:
+            wider = shares_around(shares, middle, 2 * std + MARGIN * CELL)
+            least = min(share for _, share in wider)
             fewer += np.log((1 - FEWER * least) / (1 - least))
         if not is_sure:
             left = min(before, 1 - sum(weight * share for weight, share in found))
@@ -80,7 +94,8 @@ def plain_count(view, slots, detections):
         missed[j] = left
     lost = max(0.0, detections.lost + min(fewer, MOST_OF_SCAN))
     most_lost = max(lost, detections.most_lost)
-    return cost, after._replace(lost=lost, most_lost=most_lost)
+    first_new = max(detections.first_new, 0 if lost > 0 else len(view.ids))
+    return cost, after._replace(lost=lost, most_lost=most_lost, first_new=first_new)
 
 
 def test_missed_landmarks_cost_what_the_dense_equations_say():
@@ -89,15 +104,20 @@ def test_missed_landmarks_cost_what_the_dense_equations_say():
     for _ in range(200):
         view, slots = random_view(rng), rng.permutation(8)[: rng.integers(5)]
         counts = rng.integers(0, 30, (2, SECTORS, RINGS)) ** rng.uniform(0.2, 1)
+        if rng.random() < 0.3:
+            counts[:] = 30  # each landmark is shown
         earlier = {j: rng.uniform() for j in range(0, 8, 2)}
         known = counts.min(axis=0), counts.max(axis=0), earlier
         shown = {j: j % 4 for j in range(7)}
-        before = Detections(*known, shown, lost=3.0, most_lost=4.0)
-        cost, after = before.after(view, slots, LONGEST)
-        expected_cost, expected = plain_count(view, slots, before)
+        first_new = int(rng.integers(5, 12))
+        before = Detections(*known, shown, 2.0, 4.0, first_new)
+        explained = rng.permutation(8)[: rng.integers(4)]
+        cost, after = before.after(view, slots, explained, LONGEST)
+        expected_cost, expected = plain_count(view, slots, explained, before)
         assert cost == pytest.approx(expected_cost, rel=1e-9)
         assert after.lost == pytest.approx(expected.lost, rel=1e-9)
         assert after.most_lost == pytest.approx(expected.most_lost, rel=1e-9)
+        assert after.first_new == expected.first_new
         evidence.append(after.lost - before.lost)
         more = {j: min(shown.get(j, 0) + (j in slots), PROVEN) for j in range(8)}
         assert after.shown == more
@@ -109,7 +129,7 @@ def test_missed_landmarks_cost_what_the_dense_equations_say():
         assert set(after.missed).isdisjoint(slots.tolist())
         total += cost
     assert total > 100  # many were expected
-    assert min(evidence) == -3  # both limits
+    assert min(evidence) == -2  # both limits
     assert max(evidence) == MOST_OF_SCAN
     assert len(set(evidence)) > 50
 
@@ -119,7 +139,7 @@ def cost_of_misses(place, std, scans):
     mean, covariance = np.append(np.zeros(3), place), np.diag([0, 0, 0, std, std]) ** 2
     view, detections, costs = MapView(mean, covariance, (0,)), Detections.none(), []
     for _ in range(scans):
-        cost, detections = detections.after(view, np.array([-1]), LONGEST)
+        cost, detections = detections.after(view, np.array([-1]), NONE, LONGEST)
         costs.append(cost)
     return costs
 
@@ -240,15 +260,58 @@ def test_a_landmark_of_clutter_raises_no_alarm():
     view = MapView(np.array([0, 0, 0, 3.0, 0.5, -2, 1]), 1e-6 * np.eye(7), (0, 1))
     detections = Detections.none()
     for slot in [[0]] * 80:  # landmark 1 is never shown
-        _, detections = detections.after(view, np.array(slot), LONGEST)
+        _, detections = detections.after(view, np.array(slot), NONE, LONGEST)
     assert detections.most_lost == 0
+
+
+def after_scans(places, scans):
+    """Return the evidence after scans (slots shown, slots explained, times)."""
+    mean = np.append(np.zeros(3), places)
+    detections = Detections.none()
+    for ids, slots, explained, times in scans:
+        size = 3 + 2 * len(ids)
+        view = MapView(mean[:size], 1e-6 * np.eye(size), tuple(ids))
+        rows = np.array(slots, np.int64), np.array(explained, np.int64)
+        for _ in range(times):
+            _, detections = detections.after(view, *rows, LONGEST)
+    return detections
+
+
+def test_a_landmark_beside_a_reading_is_not_missed():
+    places = [(3.31, 0.66)]  # amid a cell
+    seen = ((0,), [0], [0], 40)
+    assert after_scans(places, [seen, ((0,), [-1], [], 5)]).lost > 2
+    assert after_scans(places, [seen, ((0,), [-1], [0], 5)]).lost == 0
+
+
+def test_landmarks_that_a_lost_run_maps_anew_do_not_clear_it():
+    places = [(3.31, 0.66), (3.31, -0.66)]
+    lost = [((0,), [0], [0], 40), ((0,), [-1], [], 3)]
+    evidence = after_scans(places, lost).lost
+    anew = after_scans(places, [*lost, ((0, 1), [1], [0, 1], 20)])
+    assert anew.lost == evidence > 0
+    again = after_scans(places, [*lost, ((0, 1), [0], [0], 20)])
+    assert (again.lost, again.first_new) == (0, 2)
+
+
+def test_a_landmark_at_the_edge_of_the_view_is_no_evidence():
+    expected = np.full((SECTORS, RINGS), 30.0)
+    seen = np.where(np.arange(RINGS) < 4, expected, 0.0)
+    before = Detections(seen, expected, {}, {0: PROVEN}, first_new=1)
+    evidence = []
+    for ring in (3.4, 3.6):
+        mean = np.array([0, 0, 0, ring * LONGEST / RINGS, 0.5])
+        view = MapView(mean, 1e-6 * np.eye(5), (0,))
+        evidence.append(before.after(view, np.array([-1]), NONE, LONGEST)[1].lost)
+    assert evidence[0] > 2
+    assert evidence[1] < 0.1
 
 
 def test_the_alarm_stays_once_the_map_is_seen_again():
     view = MapView(np.array([0, 0, 0, 3.0, 0.5]), 1e-6 * np.eye(5), (0,))
     detections, scores = Detections.none(), []
     for slot in [0] * 40 + [-1] * 8 + [0] * 40:
-        _, detections = detections.after(view, np.array([slot]), LONGEST)
+        _, detections = detections.after(view, np.array([slot]), NONE, LONGEST)
         scores.append(detections.lost)
     assert scores[39] == scores[-1] == 0
     assert scores[47] > LOST_SCORE
@@ -265,9 +328,9 @@ def with_headings(stds, ids=(7,)):
 
 
 def test_a_heading_that_stays_unknown_is_evidence_of_a_lost_run():
-    assert with_headings([0.1, 1.1, 1.1]).most_lost <= LOST_SCORE
-    assert with_headings([0.1, 1.1, 1.1, 1.1, 0.1]).most_lost > LOST_SCORE
-    assert with_headings([0.1, 1.1, 1.1, 0.9, 1.1, 1.1]).most_lost <= LOST_SCORE
+    assert with_headings([0.1, 1.0, 1.0]).most_lost <= LOST_SCORE
+    assert with_headings([0.1, 1.0, 1.0, 1.0, 0.1]).most_lost > LOST_SCORE
+    assert with_headings([0.1, 1.0, 1.0, 0.8, 1.0, 1.0]).most_lost <= LOST_SCORE
 
 
 @pytest.mark.parametrize("std", [1.6, np.pi, 10.0])
@@ -308,7 +371,14 @@ def test_a_robot_that_turns_blindly_is_probably_lost(association):
 
 
 @pytest.mark.parametrize(
-    "lost", [(-1, 2, 0.1, 0), (3, 2, 0.1, 0), (0, 2, -0.1, 0), (0, 2, 0.1, -1)]
+    "lost",
+    [
+        (-1, 2, 0, 0.1, 0),
+        (3, 2, 0, 0.1, 0),
+        (0, 2, -1, 0.1, 0),
+        (0, 2, 0, -0.1, 0),
+        (0, 2, 0, 0.1, -1),
+    ],
 )
 def test_a_saved_state_with_impossible_evidence_is_refused(lost):
     slam = circling("joint", steps=5)
