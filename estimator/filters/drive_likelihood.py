@@ -317,16 +317,7 @@ def follow_drive(
                 ledger[gain.SLOT, k] = slots[drive.landmarks[first + k]]
             examine(belief, readings, count, ledger, rules, workspace.rows, own)
             status, used, nis = update_belief(
-                belief.mean,
-                belief.covariance,
-                belief.reference,
-                size,
-                readings,
-                count,
-                ledger,
-                workspace.rows,
-                workspace.before,
-                rule_values,
+                belief, size, readings, count, ledger, workspace, rule_values
             )
             if status != DONE:
                 for rest in range(s, record.log_likelihoods.shape[1]):

@@ -184,7 +184,6 @@ def step_run(
     mean, covariance = runs.means[b], runs.covariances[b]
     reference, slots = runs.references[b], runs.slots[b]
     ledger, readings, ids, variance, workspace = room
-    rows, before = workspace
     odometry, measurements, visible = scan
     dx, dy, turn = odometry[0], odometry[1], odometry[2]
     m = gather(measurements, visible, slots, readings, ids, ledger)
@@ -196,17 +195,9 @@ def step_run(
         variance[i] = motion_values[i] * share
     size, linearisation = 3 + 2 * runs.mapped[b], as_rules(rule_values).linearisation
     predict(mean, covariance, reference, size, dx, dy, turn, variance, linearisation)
+    belief = mean, covariance, reference
     status, used, nis = update_belief(
-        mean,
-        covariance,
-        reference,
-        size,
-        readings,
-        m,
-        ledger,
-        rows,
-        before,
-        rule_values,
+        belief, size, readings, m, ledger, workspace, rule_values
     )
     if status != DONE:
         return -1, np.nan

@@ -155,10 +155,9 @@ def imagine_step(
     count = expect_readings(mean, size, settings, room.readings, room.ledger)
     if count == 0:
         return True
-    rows, before = room.workspace
     status, _, _ = update_belief(
-        *(mean, covariance, reference, size, room.readings, count, room.ledger),
-        *(rows, before, settings.rule_values),
+        *((mean, covariance, reference), size, room.readings, count, room.ledger),
+        *(room.workspace, settings.rule_values),
     )
     return bool(status == DONE)
 

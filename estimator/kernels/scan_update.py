@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from ...arrays import LARGEST, Array, IntArray
-from ...jit import jit, njit_inlined, njit_internal
+from ...jit import njit_inlined, njit_internal
 from ..models.bearing_range import (
     difference_jit,
     expected_reading_jit,
@@ -65,25 +65,22 @@ from .kalman_gain import (
 DONE, NOT_USABLE = -1, -2
 
 
-@jit
+@njit_internal
 def update_belief(
-    mean: Array,
-    covariance: Array,
-    reference: Array,
+    belief: tuple[Array, Array, Array],
     size: int,
     readings: Array,
     count: int,
     ledger: IntArray,
-    rows: Array,
-    before: Array,
+    workspace: tuple[Array, Array],
     rule_values: Array,
 ) -> tuple[int, int, float]:
     """Update one belief with one scan, in place.
 
     Parameters
     ----------
-    mean, covariance, reference
-        :class:`.kalman_gain.BeliefArrays`, with room for the landmarks to add.
+    belief : BeliefArrays
+        With room for the landmarks to add.
     size : int
         Length of the state.
     readings : ndarray, shape (at least count, 2)
@@ -92,8 +89,8 @@ def update_belief(
         Integers (LEDGER_HEIGHT, readings), whose row SLOT holds the place of each
         reading's landmark in the map.  On return its other rows are filled, and SLOT
         holds the places of added landmarks, too.
-    rows, before
-        A :class:`.kalman_gain.Workspace`, which then holds the record of the scan.
+    workspace : Workspace
+        It then holds the record of the scan.
     rule_values
         The filter's rules, as :func:`as_rules` reads them.
 
@@ -107,12 +104,11 @@ def update_belief(
     nis : float
         νᵀ S⁻¹ ν over them.
     """
-    belief, workspace = (mean, covariance, reference), (rows, before)
     status, used, nis = update_lower_half(
         belief, size, readings, count, ledger, workspace, rule_values
     )
     if size > LARGE and used > 0:
-        mirror(covariance, size)
+        mirror(belief[1], size)
     return status, used, nis
 
 
