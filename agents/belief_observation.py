@@ -21,7 +21,7 @@ from ..envs import LandmarkWorldEnv
 from ..envs.vector.landmark_world_vector import final_infos
 from ..estimator.filters.batch import BatchBeliefs, BatchSlam, BatchStorage, can_batch
 from ..estimator.filters.ekf import EkfSlam
-from ..estimator.interface import SlamEstimator, restore
+from ..estimator.interface import resume, snapshot
 from ..estimator.registry import find_estimator, make_batch, read_label
 from ..estimator.support import argument_checks
 from ..restorable import Restorable, State
@@ -375,12 +375,7 @@ class SeparateFilters(Restorable):
 
     def state(self) -> State:
         """Return the states of the filters, for `restore`."""
-        states = [
-            cast("EkfSlam", slam).map.block.copy()
-            if is_live
-            else cast("SlamEstimator", slam).state_dict()
-            for slam, is_live in zip(self.filters, self._live, strict=True)
-        ]
+        states = [snapshot(slam) for slam in self.filters]
         return states, self._steps[:], self._beliefs[:], self._stored[:]
 
     def restore(self, state: State) -> None:
@@ -388,11 +383,12 @@ class SeparateFilters(Restorable):
         states, *rest = state
         self._steps, self._beliefs, self._stored = (part[:] for part in rest)
         for run, (slam, own) in enumerate(zip(self.filters, states, strict=True)):
-            if self._live[run]:
-                cast("EkfSlam", slam).map.resume(own)
-                self._stored[run] = live_storage(cast("EkfSlam", slam), self._rows)
-            else:
-                restore(slam, own)
+            resume(slam, own)
+            if not self._live[run]:
+                continue
+            live = cast("EkfSlam", slam)
+            if self._stored[run].means.base is not live.map.block.base:  # it has grown
+                self._stored[run] = live_storage(live, self._rows)
 
     def reset(self, poses: Array, pose_std: Any, *, runs: BoolArray) -> None:
         """Start new runs in some worlds, at poses (B, 3) with deviations (3,)."""

@@ -438,6 +438,19 @@ def restore(estimator: Any, state: Mapping[str, Any]) -> None:
     getattr(estimator, "restore", estimator.load_state_dict)(state)
 
 
+def snapshot(estimator: Any) -> Any:
+    """Return the present state, for :func:`resume`; it stays as it is."""
+    return getattr(estimator, "snapshot", estimator.state_dict)()
+
+
+def resume(estimator: Any, before: Any) -> None:
+    """Return to a :func:`snapshot` of this estimator, or of one with its settings."""
+    if hasattr(estimator, "resume"):
+        estimator.resume(before)
+    else:
+        restore(estimator, before)
+
+
 class _HasMarginals(Protocol):
     @property
     def landmark_ids(self) -> Sequence[int]: ...

@@ -197,6 +197,15 @@ class MapFilter(ObservesPoses):
                 self.waiting = Waiting(state["waiting_ids"], state["waiting_readings"])
                 self._report = None
 
+    def snapshot(self) -> dict[str, Any]:
+        """Return the present state, for :meth:`resume`."""
+        return {**vars(self), "map": self.map.block.copy()}
+
+    def resume(self, snapshot: Mapping[str, Any]) -> None:
+        """Return to a state of this filter, or of one with the same settings."""
+        self.map.resume(snapshot["map"])
+        vars(self).update({"_report": None, **snapshot, "map": self.map})
+
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
         if self.waiting is None:

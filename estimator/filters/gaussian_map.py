@@ -23,7 +23,7 @@ from ..kernels.kalman_gain import BeliefArrays, Rules, Workspace, new_workspace
 from ..kernels.scan_update import DONE, update_lower_half
 from ..models.rigid_motion import ErrorFrame, predict
 from ..support import saved_states as saved
-from ..support.argument_checks import aligned_zeros, landmarks_that_fit
+from ..support.argument_checks import aligned_copy, aligned_zeros, landmarks_that_fit
 from ..support.undo import Undo
 
 set_attribute = object.__setattr__  # of frozen dataclasses
@@ -101,13 +101,16 @@ class GaussianMap:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Continue with a memory."""
-        self.resume(state["block"])
+        self._become(aligned_copy(state["block"]))
 
     def resume(self, memory: Array) -> None:
-        """Continue with a copy of a memory, on cache lines again."""
-        block = aligned_zeros(len(memory))
-        block[:] = memory
-        self._become(block)
+        """Continue with a copy of a memory, in place where its layout is the same."""
+        starts = slice(STARTS, NUMBERS)
+        if memory[starts].tobytes() != self.block[starts].tobytes():
+            self._become(aligned_copy(memory))
+        elif (last := self._last()) is not None:  # somebody still holds it
+            last.detach()
+        self._slots, self.block[:] = {}, memory
 
     def reset(self, pose: Array, pose_covariance: Array) -> None:
         """Start with an empty map at a pose (3,)."""
@@ -116,16 +119,14 @@ class GaussianMap:
     def adopt(self, values: Sequence[float]) -> None:
         """Continue by other rules and variances."""
         rooms = self.capacity, len(self.parts.scan_ids)
-        block = new_block(*rooms, np.array(values))
-        self.hold(self.used, self.slots, block=block)
+        self.hold(self.used, self.slots, block=new_block(*rooms, np.array(values)))
 
     @property
     def slots(self) -> dict[int, int]:
         """Place of each landmark in the state: column 3 + 2 slot."""
         count = int(self.parts.numbers[LANDMARKS])
         if len(self._slots) < count:  # a kernel has added landmarks
-            ids = self.parts.ids[:count].tolist()
-            self._slots = {i: slot for slot, i in enumerate(ids)}
+            self._slots = {i: k for k, i in enumerate(self.parts.ids[:count].tolist())}
         return self._slots
 
     @property
@@ -249,8 +250,7 @@ class GaussianMap:
         ids : ndarray of int64, shape (m,)
             The landmark of each reading.
         """
-        last = self._last()
-        if last is not None:  # somebody still holds it
+        if (last := self._last()) is not None:  # somebody still holds it
             last.detach()
         status = update(self.block, readings, ids)
         if status == NO_ROOM:

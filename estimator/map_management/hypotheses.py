@@ -396,6 +396,22 @@ class HypothesisSlam:
                 hypothesis.slam.load_state_dict(without_prefix(state, str(k)))
             self._keep(loaded)
 
+    def snapshot(self) -> tuple[Any, ...]:
+        """Return the present state of every hypothesis, for :meth:`resume`."""
+        kept = [(h.cost, h.slam.snapshot()) for h in self.hypotheses]
+        return kept, self.steps, self._report
+
+    def resume(self, before: tuple[Any, ...]) -> None:
+        """Return to a state of this filter, or of one with the same settings."""
+        kept, self.steps, self._report = before
+        slams = [h.slam for h in self.hypotheses[: len(kept)]]
+        slams += [self._pool.fresh() for _ in kept[len(slams) :]]
+        hypotheses = []
+        for (cost, own), slam in zip(kept, slams, strict=True):
+            slam.resume(own)
+            hypotheses.append(Hypothesis(cost, slam))
+        self._keep(hypotheses)
+
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
         slams = (h.slam.bookmark() for h in self.hypotheses)
@@ -486,7 +502,7 @@ class FilterPool:
     def copy(self, slam: ManagedSlam) -> ManagedSlam:
         """Return another filter that continues from the same state."""
         copied = self.fresh()
-        copied.copy_from(slam)
+        copied.resume(slam.snapshot())
         return copied
 
     def bookmark(self) -> Undo:

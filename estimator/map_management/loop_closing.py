@@ -21,6 +21,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
+from ...restorable import Restorable
 from ..association.constellations import Constellations, TwoPlaces, match_constellations
 from ..interface import MapView
 
@@ -44,7 +45,7 @@ TURN_STDS = 4.0
 SLACK = 0.2
 
 
-class LoopCloser:
+class LoopCloser(Restorable):
     """Recognises the landmarks around the robot in the map of one filter.
 
     Parameters
@@ -52,6 +53,8 @@ class LoopCloser:
     rules : Constellations or None
         None: no landmark is ever lost.
     """
+
+    changing = ("doubtful",)
 
     def __init__(self, rules: Constellations | None) -> None:
         self._rules = rules

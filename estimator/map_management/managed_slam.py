@@ -36,7 +36,8 @@ from ..interface import (
     mapped_ids,
     marginal,
     optional_members,
-    restore,
+    resume,
+    snapshot,
     taking_poses,
     view_map,
 )
@@ -390,13 +391,19 @@ class ManagedSlam:
         """Return the report of the last update once more."""
         return self._report
 
-    def copy_from(self, other: ManagedSlam) -> None:
-        """Continue as another filter of the same settings, decisions included."""
-        restore(self._filter, other.filter.state_dict())
-        self._pruner.load_state_dict(other._pruner.state_dict())
-        self._recent.copy_from(other._recent)
+    def snapshot(self) -> tuple[Any, ...]:
+        """Return the present state, decisions included, for :meth:`resume`."""
+        kept = self.candidates, self.steps, self._report
+        parts = self._pruner.state(), self._recent.state()
+        return snapshot(self._filter), *parts, *kept
+
+    def resume(self, before: tuple[Any, ...]) -> None:
+        """Return to a state of this filter, or of one with the same settings."""
+        within, pruner, recent, self.candidates, self.steps, self._report = before
+        resume(self._filter, within)
+        self._pruner.restore(pruner)
+        self._recent.restore(recent)
         self._editor.expire()
-        self.candidates = other.candidates
 
     def _remembered(self) -> dict[str, Any]:
         """Return all of the state except the filter's."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ...jit import jit
+from ...restorable import Restorable
 from ..association.scan_assignments import Noise
 from ..association.scan_association import ScanAssociation
 from ..filters.conditioning import separation
@@ -20,7 +21,7 @@ from .map_editor import MapEditor
 from .policy import LandmarkPolicy
 
 
-class MapPruner:
+class MapPruner(Restorable):
     """Removes and merges the landmarks of one filter by a policy.
 
     Parameters
@@ -36,6 +37,8 @@ class MapPruner:
     merger : LandmarkMerger
         Merges landmarks of this run.
     """
+
+    changing = ("_records", "merger", "_closer")
 
     def __init__(self, policy: LandmarkPolicy, editor: MapEditor, noise: Noise) -> None:
         self._policy, self._editor = policy, editor
@@ -186,7 +189,7 @@ RECORDS: saved_states.Table = {
 }
 
 
-class LandmarkMerger:
+class LandmarkMerger(Restorable):
     """Merges the landmarks of one filter that a policy considers to be the same.
 
     Two landmarks are merged if their estimates are close, the offset is accurate enough
@@ -200,6 +203,8 @@ class LandmarkMerger:
     records : LandmarkRecords
         Records of the mapped landmarks, which are joined with the landmarks.
     """
+
+    changing = ("apart", "aliases")
 
     def __init__(
         self, policy: LandmarkPolicy, editor: MapEditor, records: LandmarkRecords
@@ -294,7 +299,7 @@ def _renamed(pair: tuple[int, int], old: int, new: int) -> tuple[int, int]:
     return _ordered(i, j)
 
 
-class LandmarkRecords:
+class LandmarkRecords(Restorable):
     """Sightings, misses and information of the landmarks, in the order of the map.
 
     The information of a landmark is its block of the information matrix, summed over
@@ -315,6 +320,8 @@ class LandmarkRecords:
     >>> records.by_information([9, 7])
     [7, 9]
     """
+
+    changing = ("ids", "sightings", "misses", "information", "_slots")
 
     def __init__(self) -> None:
         self.ids: tuple[int, ...] = ()

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array, IntArray
+from ...restorable import Restorable
 from ..association.scan_association import LABEL_BITS, NO_LABEL, ScanAssociation
 from ..filters.conditioning import PoseReading
 from ..interface import (
@@ -33,7 +34,7 @@ from ..support.undo import Undo
 from .map_editor import MapEditor
 
 
-class RecentScans:
+class RecentScans(Restorable):
     """Feeds the scans of a run to a filter, and repeats the last ones where needed.
 
     Parameters
@@ -53,6 +54,8 @@ class RecentScans:
     of those that need the truth at every step.
     """
 
+    changing = ("scans", "motions", "decisions")
+
     def __init__(
         self, slam: SlamEstimator, editor: MapEditor, window: int, gate: float
     ) -> None:
@@ -67,11 +70,6 @@ class RecentScans:
         self.motions: tuple[Motion, ...] = ()
         #: About every scan since the start, or since a saved state was loaded.
         self.decisions: list[ScanDecisions] = []
-
-    def copy_from(self, other: RecentScans) -> None:
-        """Continue from the scans of another run with the same kind of filter."""
-        self.scans, self.motions = list(other.scans), other.motions
-        self.decisions = list(other.decisions)
 
     def bookmark(self) -> Undo:
         """Return what takes back later changes of what is remembered."""

@@ -482,6 +482,13 @@ def aligned_zeros(*shape: int) -> Array:
     return room[skipped : skipped + size].reshape(shape)
 
 
+def aligned_copy(array: Array) -> Array:
+    """Copy an array to memory that begins on a cache line."""
+    copy = aligned_zeros(*array.shape)
+    copy[:] = array
+    return copy
+
+
 def usable_cores() -> int:
     """Return the number of cores that this process may use, 1 where it is unknown."""
     if hasattr(os, "sched_getaffinity"):

@@ -13,8 +13,8 @@ class Restorable:
     """An object that can return to a state that it has had.
 
     A subclass names the attributes that change in `changing`. Arrays and generators are
-    copied, also in tuples and dictionaries, and so are lists, whose elements never
-    change.
+    copied, also in tuples and dictionaries, and so are lists and sets, whose elements
+    never change.
     """
 
     changing: ClassVar[tuple[str, ...]]
@@ -46,6 +46,7 @@ def copied(value: Any) -> Any:
 _COPIES: dict[type, Callable[[Any], Any]] = {
     np.ndarray: np.ndarray.copy,
     list: list.copy,
+    set: set.copy,
     np.random.Generator: lambda rng: rng.bit_generator.state,
     tuple: lambda parts: tuple(map(copied, parts)),
     dict: lambda parts: {key: copied(part) for key, part in parts.items()},

@@ -73,6 +73,33 @@ def test_filters_of_any_kind_return_with_their_world():
         check(ActiveSlamEnv("active_easy", estimator=estimator), 2, after=20)
 
 
+def test_filters_that_follow_several_hypotheses_return_with_their_world():
+    env = ActiveSlamEnv("active_hidden")
+    rng = np.random.default_rng(0)
+    actions = rng.uniform([0.2, -0.5], [0.5, 0.5], (40, 2))
+    env.reset(seed=4)
+    drive(env, actions[:20])
+    several, slam = env.state(), env._estimator
+    drive(env, actions[20:30])
+    fewer, counts = env.state(), [len(several_in(several)), len(slam.hypotheses)]
+    for state in (several, fewer, several):
+        env.restore(state)
+        assert len(slam.hypotheses) == len(several_in(state))
+    first = drive(env, actions[20:])
+    saved = slam.state_dict()
+    other = ActiveSlamEnv("active_hidden")
+    other.reset(seed=9)
+    other.restore(several)
+    assert same(first, drive(other, actions[20:]))
+    assert same(saved, other._estimator.state_dict())
+    assert max(counts) > 1, counts
+
+
+def several_in(state):
+    """Return the hypotheses in a state of a world that hides identities."""
+    return state[-1][0][0][0][0]
+
+
 def test_frames_return_with_their_world():
     env = ActiveSlamEnv("active_easy", render_mode="rgb_array")
     env.reset(seed=1)
