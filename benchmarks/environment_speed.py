@@ -1,4 +1,4 @@
-"""Time of a step of the landmark world, in units of a bare physics step.
+"""Time of a step of the landmark world, and of `state` and `restore`, in bare steps.
 
     python benchmarks/environment_speed.py
 
@@ -10,18 +10,24 @@ thread; a ratio is the median over the rounds.
 import math
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium
+import numpy as np
 from interleaved import bare_steps, microseconds, ratio, time_interleaved, verdict
 from rich.console import Console
 from rich.table import Table
 
+from slamgym.agents import ActiveSlamEnv, ActiveSlamVectorEnv
 from slamgym.envs import LandmarkWorldEnv
+from slamgym.envs.vector import LandmarkWorldVectorEnv
+from slamgym.sim_configs import list_presets
 
 Call = Callable[[], object]
 STEPS = 200  # steps per call, so that the loop around them costs nothing
 BARE = "bare Space.step"
+WORLDS = 16  # in a vector environment
 HALF_VIEW = {"max_range": 8.0, "field_of_view": math.pi}
 WALLS = [[x, -9.0, x + 1.0, -8.0] for x in range(-5, 5)]
 CASES: dict[str, tuple[dict[str, Any], float | None]] = {
@@ -85,8 +91,33 @@ def main() -> int:
         cost = f"{microseconds(times, name) / STEPS:.2f}"
         limit = "" if goal is None else f"<= {goal:.0f}"
         table.add_row(name, cost, f"{times_bare:.1f}", limit, word)
-    Console(width=100).print(table)
+    Console(width=100).print(table, states_table())
     return missed
+
+
+def states_table() -> Table:
+    """Time `state` and `restore` of every preset, single and as a world of several."""
+    table = Table(title="µs a world; in brackets × bare Space.step")
+    for column in ("preset", "state", "restore", f"of {WORLDS}: state", "restore"):
+        table.add_column(column, justify="left" if column == "preset" else "right")
+    for name in list_presets():
+        row = []
+        active = name.startswith("active_")
+        single = (ActiveSlamEnv if active else LandmarkWorldEnv)(name)
+        many = (ActiveSlamVectorEnv if active else LandmarkWorldVectorEnv)(WORLDS, name)
+        for env, worlds in ((single, 1), (many, WORLDS)):
+            env.reset(seed=0)
+            env.action_space.seed(0)
+            for _ in range(20):
+                env.step(env.action_space.sample() * np.float32(0.3))
+            state = env.state()
+            cases = {"state": env.state, "restore": partial(env.restore, state)}
+            times = time_interleaved({BARE: bare_steps(100), **cases}, rounds=7)
+            for case in cases:
+                bare = 100 * ratio(times, case, BARE) / worlds
+                row.append(f"{microseconds(times, case) / worlds:.1f} ({bare:.0f})")
+        table.add_row(name, *row)
+    return table
 
 
 if __name__ == "__main__":
