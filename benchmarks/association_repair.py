@@ -96,7 +96,7 @@ def row_of(world: Scenario, seed: int, hypotheses: int) -> list[float]:
 def main() -> None:
     """Print the table."""
     known = dict(worlds())
-    for name in ("coarse_loop", "lost_loop", "look_alike"):
+    for name in ("lost_loop", "look_alike"):
         data = load_scenario(name).model_dump()
         data["sensor"]["identities"] = False
         known[name] = load_scenario(data)
