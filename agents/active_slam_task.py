@@ -102,7 +102,8 @@ class ActiveSlamTask(Restorable):
         Numbers of landmarks in the present map, and of those known accurately.
     """
 
-    changing = ("episodes", "outcome", "mapped", "known", "_rows")
+    changing = ("episodes", "outcome")
+    replaced = ("mapped", "known", "_rows")
 
     def __init__(
         self,

@@ -14,20 +14,24 @@ class Restorable:
 
     A subclass names the attributes that change in `changing`. Arrays and generators are
     copied, also in tuples and dictionaries, and so are lists and sets, whose elements
-    never change.
+    never change. Attributes in `replaced` only ever get new values, which are shared.
     """
 
     changing: ClassVar[tuple[str, ...]]
+    replaced: ClassVar[tuple[str, ...]] = ()
 
     def state(self) -> State:
         """Return the present state, for `restore`."""
-        return tuple(copied(getattr(self, name)) for name in self.changing)
+        changing = [copied(getattr(self, name)) for name in self.changing]
+        return (*changing, *(getattr(self, name) for name in self.replaced))
 
     def restore(self, state: State) -> None:
         """Return to a state of this object, which stays usable for further calls."""
-        for name, value in zip(self.changing, state, strict=True):
+        shared = len(self.changing)
+        for name, value in zip(self.changing, state[:shared], strict=True):
             if not put_back(getattr(self, name), value):
                 setattr(self, name, copied(value))
+        vars(self).update(zip(self.replaced, state[shared:], strict=True))
 
 
 def copied(value: Any) -> Any:

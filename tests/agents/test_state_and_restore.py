@@ -59,6 +59,7 @@ def test_worlds_with_filters_continue_from_a_state_to_the_bit(name):
     check(ActiveSlamEnv(name), 3, after=after)
     worlds = 3 if name == "active_hidden" else 1000
     check(ActiveSlamVectorEnv(worlds, name), 5, after=after)
+    check(ActiveSlamVectorEnv(3, name, autoreset_mode="SameStep"), 6, after=after)
 
 
 def test_worlds_that_draw_their_settings_return_to_them():
