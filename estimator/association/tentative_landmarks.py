@@ -175,7 +175,7 @@ class TentativeLandmarks(NamedTuple):
         """Return some of them."""
         if which.all():
             return self
-        return TentativeLandmarks(*(part[which] for part in self))
+        return TentativeLandmarks._make(part[which] for part in self)
 
 
 class UnexplainedDensity(NamedTuple):
