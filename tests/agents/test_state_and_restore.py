@@ -81,11 +81,13 @@ def test_filters_that_follow_several_hypotheses_return_with_their_world():
     env.reset(seed=4)
     drive(env, actions[:20])
     several, slam = env.state(), env._estimator
+    records = slam.state_dict()
     drive(env, actions[20:30])
     fewer, counts = env.state(), [len(several_in(several)), len(slam.hypotheses)]
     for state in (several, fewer, several):
         env.restore(state)
         assert len(slam.hypotheses) == len(several_in(state))
+    assert same(slam.state_dict(), records)
     first = drive(env, actions[20:])
     saved = slam.state_dict()
     other = ActiveSlamEnv("active_hidden")

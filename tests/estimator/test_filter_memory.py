@@ -206,3 +206,18 @@ def test_a_repeated_landmark_is_refused_mapped_or_not(ids):
     with pytest.raises(ValueError, match="must not repeat within a scan, got"):
         slam.update([(0.0, 2.0), (0.1, 3.0), (0.2, 4.0)], ids)
     assert digest(slam) == before
+
+
+@pytest.mark.parametrize("name", ["ekf", "invariant", "robocentric"])
+def test_reports_that_are_kept_stay_as_they_are_when_a_filter_resumes(name):
+    slam = make_estimator(name, **NOISE)
+    slam.update([(0.5, 4.0)], [3])
+    before, kept = slam.snapshot(), []
+    for _ in range(2):
+        slam.predict((0.5, 0.1))
+        kept.append(slam.update([(0.4, 3.4)], [3]))
+        slam.resume(before)
+        slam.update([], [])
+    assert kept[0].innovation.any()
+    assert np.array_equal(kept[0].innovation, kept[1].innovation)
+    assert np.array_equal(kept[0].innovation_factor, kept[1].innovation_factor)
