@@ -111,7 +111,10 @@ def states_table() -> Table:
             for _ in range(20):
                 env.step(env.action_space.sample() * np.float32(0.3))
             state = env.state()
-            cases = {"state": env.state, "restore": partial(env.restore, state)}
+            cases: dict[str, Callable[[], object]] = {
+                "state": env.state,
+                "restore": partial(env.restore, state),
+            }
             times = time_interleaved({BARE: bare_steps(100), **cases}, rounds=7)
             for case in cases:
                 bare = 100 * ratio(times, case, BARE) / worlds
