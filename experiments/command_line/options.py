@@ -279,13 +279,14 @@ be 2 numbers >= 0 with commas between, got '0.2,-1'
         }
 
     def noise_arguments(self) -> list[str]:
-        """Return the arguments of the noise that the user gave, for another command.
+        """Return the noise that the user gave, as arguments for another command.
 
         Examples
         --------
-        >>> given = Options(range_std_per_metre=1.0, noise_at_rest=False)
+        >>> noise = "range_std_per_metre=0.1"
+        >>> given = Options(noise_at_rest=False, option_texts=[noise, "iterations=3"])
         >>> given.noise_arguments()
-        ['--range-std-per-metre=1.0', '--no-noise-at-rest']
+        ['--no-noise-at-rest', '--option=range_std_per_metre=0.1']
         """
         stds = "motion_std", "measurement_std", "initial_pose_std"
         given = self._given(*stds, "range_std_per_metre", "noise_at_rest")
@@ -296,7 +297,8 @@ be 2 numbers >= 0 with commas between, got '0.2,-1'
                 arguments.append(f"--{option}" if value else f"--no-{option}")
             else:
                 arguments.append(f"--{option}={value}")
-        return arguments
+        texts = [text for text in self.option_texts or () if "_std_" in text]
+        return arguments + [f"--option={text}" for text in texts]
 
     def named_options(self) -> dict[str, Any]:
         """Return the options of filters that the user gave by their own names.
