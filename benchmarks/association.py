@@ -6,13 +6,14 @@
     python benchmarks/association.py --world coarse_loop --resolution 1 --runs 100 \
         --methods "1 hypothesis" hypotheses
 
-For each world and method: the median error of the path with known and with hidden
-identities, the lost runs (more than 1 m worse than with known identities), readings
-assigned to a wrong landmark, landmarks mapped twice, the size of the map, precision and
-recall, and the time of a step as a multiple of that of the first method.  Below the
-table stands the share of lost runs of each method less that of the first one, over the
-same drives, with a 95 % interval (Agresti and Min, Biometrics 61, 2005).  With
-``--resolution``, landmarks nearer to each other than this count as one.
+For each world and method, the table lists the median error of the path with known and
+with hidden identities, the lost runs (more than 1 m worse than with known identities),
+the readings assigned to a wrong landmark, the landmarks mapped twice, the size of the
+map, precision and recall, and the time of a step as a multiple of that of the first
+method.  The lines below the table compare the share of lost runs of each method with
+that of the first one over the same drives: they state the difference with its 95 %
+interval (Agresti and Min, Statistics in Medicine 24, 2005).  With ``--resolution R``,
+true landmarks that are connected by gaps smaller than R [m] count as one.
 """
 
 from __future__ import annotations
@@ -176,7 +177,10 @@ def crowded_scan() -> float:
 
 
 def difference(lost: NDArray[np.bool_], of_first: NDArray[np.bool_]) -> str:
-    """Return the difference of the shares of lost runs, in percent."""
+    """Return how many percent of the runs more are lost than of the first method.
+
+    The 95 % interval of this difference follows in brackets.
+    """
     more, fewer = (lost & ~of_first).sum() + 0.5, (of_first & ~lost).sum() + 0.5
     runs = len(lost) + 2
     share = (more - fewer) / runs

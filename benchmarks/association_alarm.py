@@ -7,10 +7,11 @@ Readings have no identity.  Where lost runs are rare, they are provoked: by a si
 association, by odometry that misses 25 steps (kidnapped), by a motion noise three times
 that of the filter and by gaps without scans.  A run is lost if its path error is more
 than 1 m above that with known identities and NEES / 3 of its pose is above 3 on
-average; it is sound if neither holds.  It is turned if it would be lost, but one rigid
-motion of the whole path leaves an error of at most 0.5 m above that with known
-identities: its first scans have turned path and map together, and all later readings
-agree with both.  Intervals are 95 %, of Wilson.
+average; it is sound if neither holds.  A run that meets both conditions is turned, not
+lost, if the error of its path after the best rigid motion is at most 0.5 m above that
+with known identities, also after its best rigid motion.  The first scans have then
+rotated path and map together, and all later readings agree with both.  The intervals
+are Wilson's 95 % intervals.
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ class Followed(NamedTuple):
 
     error: float  # of the path [m]
     aligned: float  # after the rigid motion that fits the path best [m]
-    nees: float  # / 3, of the pose
+    nees: float  # NEES / 3 of the pose
 
 
 def follow(slam: Any, scans: list[Scan], *, known: bool) -> Followed:

@@ -1,4 +1,4 @@
-"""Time of a step of the landmark world, and of `state` and `restore`, in bare steps.
+"""Time steps, `state` and `restore` of worlds, in units of a bare physics step.
 
     python benchmarks/environment_speed.py
 
@@ -96,8 +96,8 @@ def main() -> int:
 
 
 def states_table() -> Table:
-    """Time `state` and `restore` of every preset, single and as a world of several."""
-    table = Table(title="µs a world; in brackets × bare Space.step")
+    """Time `state` and `restore` of every preset, for one world and for several."""
+    table = Table(title="µs per world; in brackets: in units of a bare Space.step")
     for column in ("preset", "state", "restore", f"of {WORLDS}: state", "restore"):
         table.add_column(column, justify="left" if column == "preset" else "right")
     for name in list_presets():
