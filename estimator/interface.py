@@ -439,12 +439,12 @@ def restore(estimator: Any, state: Mapping[str, Any]) -> None:
 
 
 def snapshot(estimator: Any) -> Any:
-    """Return the present state, for :func:`resume`; it stays as it is."""
+    """Return a copy of the present state for :func:`resume`."""
     return getattr(estimator, "snapshot", estimator.state_dict)()
 
 
 def resume(estimator: Any, before: Any) -> None:
-    """Return to a :func:`snapshot` of this estimator, or of one with its settings."""
+    """Return to a :func:`snapshot` of an estimator with the same settings."""
     if hasattr(estimator, "resume"):
         estimator.resume(before)
     else:

@@ -232,8 +232,8 @@ class AssociationPolicy:
     new_gate: float = 25.0
     #: Left out where two landmarks differ by less than this in −2 ln likelihood.
     ambiguity: float = 1.0
-    #: (k, n): seen in k of n successive scans, a landmark enters the map, unless the
-    #: scans that missed it make clutter likely.
+    #: (k, n): a landmark enters the map when k of n successive scans have shown it.  A
+    #: landmark without identity must also be unlikely to be clutter, unless k is 1.
     confirm: tuple[int, int] = (3, 8)
     #: Whether landmarks that come with an identity enter at first sight.
     trust_ids: bool = True

@@ -87,7 +87,7 @@ class ScanAssociation:
         self.explained: set[int] = set()
 
     def candidates_after(self, view: MapView) -> Candidates:
-        """Return the candidates after the scan, which has led to a belief."""
+        """Return the candidates after the scan, given the belief after it."""
         first = [label < 0 or label >> LABEL_BITS == self.scan for label in self.labels]
         is_new = [i is None and f for i, f in zip(self.row_ids, first, strict=True)]
         density = self._density.after(
@@ -137,8 +137,8 @@ class ScanAssociation:
     def _match_tentative(self, rows: IntArray, noise: Noise) -> None:
         """Match rows that no landmark explains with tentative ones; confirm these.
 
-        A row that is ambiguous beside one begins another one: an outlier may have begun
-        the first.
+        A row that is ambiguous because of a tentative landmark begins another one: the
+        first sighting of that landmark may have been an outlier.
         """
         tentative, readings = self._tentative, self._readings
         density = _assumed_density(self._policy, self._density, readings[rows])
@@ -207,24 +207,25 @@ class ScanAssociation:
 #     P(missed so often) = ε + (1 − ε) Π (1 − P_D)
 #
 # A run is probably lost if the scans show far fewer landmarks than its map promises.
-# Page's test [1]_ compares the P_D of landmarks that are in view for sure, the least
-# within two σ and half a cell, with a fraction ρ of it.  The half cell keeps landmarks
-# at the edge of the view out::
+# For landmarks that are in view for sure, Page's test [1]_ compares the rate P_D, the
+# least within two σ and half a cell, with a fraction ρ of it.  The half cell makes
+# landmarks at the edge of the view count little::
 #
 #     g ← max(0, g + min(c, Σ_seen ln ρ + Σ_missed ln (1 − ρ P_D) / (1 − P_D)))
 #
-# A scan adds at most c, since a single wrong pose may cause all its misses.  Some
-# landmarks are no evidence.  One that no two scans have shown since it entered the map
-# may be of clutter.  One that a reading beside it may belong to may have been seen.  A
-# lost run sees the landmarks that it maps anew: those that are newer than the last
-# scan at which g was 0.  P_D learns the rates of a lost run, too, so g falls again: the
-# largest g counts.
+# A scan adds at most c, since a single wrong pose may cause all its misses.  Three
+# kinds of landmarks are no evidence.  If fewer than two scans have shown a landmark
+# since it entered the map, it may be clutter.  If a landmark is not assigned a reading
+# that may belong to it, the scan may show it.  If a landmark entered the map after the
+# last scan at which g was 0, a lost filter may have mapped it a second time.  P_D
+# learns the rates of a lost run, too, so g falls again: the largest g counts.
 #
 # A lost run whose landmarks all stay in view misses none.  Many of these have lost the
 # heading: linearised equations do not hold where its standard deviation is a radian.
 # Scans in succession that leave the heading unknown count c / 2 each::
 #
-#     h ← h + c / 2  if min(σ²_θ, π²/3) > least + 0.8 rad² and there is a map,  else 0
+#     h ← h + c / 2  if min(σ²_θ, π²/3) > least + 0.8 rad² and there is a map
+#     h ← 0          otherwise
 #
 # π²/3 is the variance of a uniform heading: one that is unknown at the start is no
 # evidence.
@@ -446,7 +447,7 @@ WIDEST = np.pi / 4
 #: ρ: detection rate of a lost run, relative to that of its map.
 FEWER = 0.5
 
-#: A landmark is evidence if it is in view even this many cells away from its place.
+#: P_D of a missed landmark is the least up to this many cells beyond two σ.
 MARGIN = 0.5
 
 #: c: most evidence of being lost from one scan.
@@ -476,7 +477,8 @@ def _count(
 ) -> tuple[float, float]:
     """Count a scan; return its cost, and the evidence that the run is lost.
 
-    Known of every landmark is whether the scan shows it, and whether this is evidence.
+    For every landmark, ``known`` holds whether the scan shows it, and whether that is
+    evidence.
     """
     is_seen, is_telling = known
     seen, expected = counts
@@ -517,7 +519,7 @@ def _count(
 def _shares_around(
     shares: Array, place: Place, longest: float, margin: float
 ) -> tuple[float, float]:
-    """Return the least P_D within two σ and a margin [cells], and the mean P_D."""
+    """Return the least and the mean P_D within two σ and a margin [cells]."""
     sectors, rings = shares.shape
     width, depth = 2 * np.pi / sectors, longest / rings
     bearing, distance, turn, aside = place
@@ -534,7 +536,7 @@ def _shares_around(
 
 @jit
 def _place_in_scan(mean: Array, P: Array, j: int) -> Place:
-    """Return where a scan shows landmark j."""
+    """Return where a scan is expected to show landmark j."""
     c = 3 + 2 * j
     dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
     bearing, distance = expected_reading_jit(dx, dy, mean[2])

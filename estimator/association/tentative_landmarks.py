@@ -11,9 +11,9 @@ sightings change both::
 They do not depend on the belief of the filter or its frame.  A tentative landmark that
 is never confirmed leaves the belief unchanged.
 
-Each has the odds o of being a landmark rather than clutter.  They begin with the share
-of readings of no mapped landmark that proved to be of a new one; ρ is the density of
-all such readings::
+o are the odds that a tentative landmark is a landmark, not clutter.  They begin with
+the share of the readings that match no mapped landmark and proved to be of a new one.
+ρ is the density of all readings that match no mapped landmark::
 
     new       o ← share / (1 − share)
     sighting  o ← o N(ν; S) / ρ
@@ -121,14 +121,14 @@ class TentativeLandmarks(NamedTuple):
         return MapView(mean, covariance, tuple(range(t)))
 
     def with_misses(self, chance: Array) -> "TentativeLandmarks":
-        """Count the landmarks that this scan does not show; chance is 1 − P_D, (t,)."""
+        """Lower the odds of those that this scan misses; chance (t,) is 1 − P_D."""
         missed = self.seen & np.uint64(1) == 0
         return self._replace(odds=self.odds + np.where(missed, np.log(chance), 0.0))
 
     def with_sighting(
         self, which: int, reading: Array, noise: Noise, density: float
     ) -> "TentativeLandmarks":
-        """Correct one landmark by another reading (β, r) of it, where ρ is known."""
+        """Correct one landmark by another reading (β, r), where the density is ρ."""
         (x, y), C = self.places[which], self.covariances[which]
         distance = np.hypot(x, y)
         H = np.array(

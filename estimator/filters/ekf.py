@@ -202,7 +202,7 @@ class MapFilter(ObservesPoses):
         return {**vars(self), "map": self.map.block.copy()}
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
-        """Return to a state of this filter, or of one with the same settings."""
+        """Return to a :meth:`snapshot` of a filter with the same settings."""
         self.map.resume(snapshot["map"])
         vars(self).update({"_report": None, **snapshot, "map": self.map})
 

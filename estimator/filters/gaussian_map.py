@@ -41,7 +41,7 @@ LANDMARKS = 3  # number of landmarks in the map
 TABLED = 4  # how many of them are in the table
 STEPS = 5  # how many odometry readings and scans the belief has taken in
 SCANNED, IN_USE = 6, 7  # number of readings in the last scan, and of those in use
-LOWER = 8  # 1: of P, only the lower half and the rows of the pose are up to date
+LOWER = 8  # 1 if only the lower half of P and the rows of the pose are up to date
 STARTS = 13  # where each part begins, and the end
 NUMBERS = 24
 
@@ -108,7 +108,7 @@ class GaussianMap:
         starts = slice(STARTS, NUMBERS)
         if memory[starts].tobytes() != self.block[starts].tobytes():
             self._become(aligned_copy(memory))
-        elif (last := self._last()) is not None:  # somebody still holds it
+        elif (last := self._last()) is not None:  # somebody still holds the report
             last.detach()
         self._slots, self.block[:] = {}, memory
 
@@ -250,7 +250,7 @@ class GaussianMap:
         ids : ndarray of int64, shape (m,)
             The landmark of each reading.
         """
-        if (last := self._last()) is not None:  # somebody still holds it
+        if (last := self._last()) is not None:  # somebody still holds the report
             last.detach()
         status = update(self.block, readings, ids)
         if status == NO_ROOM:
@@ -395,7 +395,7 @@ def update_map(block: Array, readings: Array, ids: IntArray) -> int:
     Parameters
     ----------
     block : ndarray
-        The memory of the filter (:class:`Parts`); on return with a record of the scan.
+        The memory of the filter (:class:`Parts`), which then also records the scan.
     readings : ndarray, shape (m, 2)
         Rows (β, r) [rad, m].
     ids : ndarray of int64, shape (m,)

@@ -119,7 +119,7 @@ def search_assignments(
     Parameters
     ----------
     of_scan : tuple
-        What a :class:`Problem` holds; a plain tuple reaches a kernel faster.
+        The fields of a :class:`Problem`.  A plain tuple reaches a kernel faster.
     costs, marks : ndarray, shape (M,) and (M, m)
         Infinite and `UNPAIRED`; on return the assignments found, the cheapest first.
     spread, ceiling : float

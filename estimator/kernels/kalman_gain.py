@@ -58,9 +58,9 @@ def absorb(
     Returns
     -------
     int
-        -1: the lower half of P is right, for :func:`restore_upper`.  Or the first row
-        at which S is not positive definite: P is then spoilt, unless that row lies in
-        the first block.
+        -1 on success: the lower half of P is right, and :func:`restore_upper` completes
+        P.  Otherwise the first row at which S is not positive definite: P is then
+        invalid, unless that row lies in the first block.
     """
     system, bottom = rows[FIRST:], 2 * used
     begin_correction(size, rows, system, bottom)
@@ -241,7 +241,7 @@ def _refresh_for(covariance: Array, size: int, columns: IntArray) -> None:
 
 @njit_internal
 def refresh_pose(covariance: Array, size: int) -> None:
-    """Complete the rows of the pose, and the one below."""
+    """Complete the rows of the pose, and the row below them."""
     for row in range(0, 4, 2):
         refresh(covariance, size, row)
 
@@ -498,7 +498,7 @@ class Workspace(NamedTuple):
     """Room for one update; every row begins on a cache line."""
 
     rows: Array  # (FIRST + 2m + 2, capacity + META_WIDTH), two systems to iterate
-    before: Array  # P to restore after a failure; empty, or square with room for it
+    before: Array  # empty, or square with room for P, to restore it after a failure
 
 
 def new_workspace(

@@ -90,7 +90,7 @@ def update_belief(
         reading's landmark in the map.  On return its other rows are filled, and SLOT
         holds the places of added landmarks, too.
     workspace : Workspace
-        It then holds the record of the scan.
+        On return it holds the record of the scan.
     rule_values
         The filter's rules, as :func:`as_rules` reads them.
 
@@ -122,11 +122,11 @@ def update_lower_half(
     work_arrays: tuple[Array, Array],
     rule_values: Array,
 ) -> tuple[int, int, float]:
-    """Update one belief as :func:`update_belief`, but leave a large one incomplete.
+    """Update one belief as :func:`update_belief` does, but leave a large P incomplete.
 
-    Above a size of LARGE, only the lower half of P and the rows of the pose are right
-    after an update, and need be before it, with the rows of the landmarks of the scan.
-    To copy a large half takes as long as to compute it.
+    If the state is longer than LARGE, only the lower half of P and the rows of the pose
+    are right on return.  These, and the rows of the landmarks in the scan, must be
+    right before.  Copying a large half takes as long as computing it.
     """
     belief, workspace = BeliefArrays(*arrays), Workspace(*work_arrays)
     rows, rules = workspace.rows, as_rules(rule_values)

@@ -402,7 +402,7 @@ class HypothesisSlam:
         return kept, self.steps, self._report
 
     def resume(self, before: tuple[Any, ...]) -> None:
-        """Return to a state of this filter, or of one with the same settings."""
+        """Return to a :meth:`snapshot` of a filter with the same settings."""
         kept, self.steps, self._report = before
         slams = [h.slam for h in self.hypotheses[: len(kept)]]
         slams += [self._pool.fresh() for _ in kept[len(slams) :]]

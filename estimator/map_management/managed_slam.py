@@ -252,7 +252,7 @@ class ManagedSlam:
         return advance(self._filter, step, follow, undo, lambda: undo)
 
     def as_given(self, readings: Array, ids: Sequence[int]) -> ScanAssociation:
-        """Associate readings (m, 2) by their identities, without repetition."""
+        """Associate readings (m, 2) by their identities, which must differ."""
         plan = ScanAssociation(self._policy, self.candidates, readings)
         view = self._editor.map_view(self._policy.reach(readings))
         plan.translate(ids, view.mapped, self._pruner.merger.aliases)
@@ -398,7 +398,7 @@ class ManagedSlam:
         return snapshot(self._filter), *parts, *kept
 
     def resume(self, before: tuple[Any, ...]) -> None:
-        """Return to a state of this filter, or of one with the same settings."""
+        """Return to a :meth:`snapshot` of a filter with the same settings."""
         within, pruner, recent, self.candidates, self.steps, self._report = before
         resume(self._filter, within)
         self._pruner.restore(pruner)

@@ -359,11 +359,12 @@ class LandmarkRecords(Restorable):
         ids : sequence of int
             The landmarks, without repetition.
         readings : ndarray, shape (m, 2)
-            Of these landmarks, rows (β, r) [rad, m].
+            Readings of these landmarks, rows (β, r) [rad, m].
         heading : float
-            Of the robot [rad].
+            Heading of the robot [rad].
         noise : tuple of float
-            What :class:`Noise` holds; a plain tuple reaches a kernel faster.
+            The first four fields of :class:`Noise`.  A plain tuple reaches a kernel
+            faster.
         """
         slots = self.slots(ids)
         self.sightings[slots] += 1

@@ -14,7 +14,8 @@ class Restorable:
 
     A subclass names the attributes that change in `changing`. Arrays and generators are
     copied, also in tuples and dictionaries, and so are lists and sets, whose elements
-    never change. Attributes in `replaced` only ever get new values, which are shared.
+    never change. The values of attributes in `replaced` are never changed in place, so
+    states share them.
     """
 
     changing: ClassVar[tuple[str, ...]]
