@@ -155,7 +155,7 @@ class PoseReading(NamedTuple):
             raise ValueError(
                 f"covariance must be symmetric and positive definite, got {R.tolist()}"
             )
-        return cls(z, H, (R + R.T) / 2)
+        return cls(z.copy(), H.copy(), (R + R.T) / 2)
 
     def innovation(self, pose: Array) -> Array:
         """Return z − H (x, y, θ) at poses (..., 3), shape (..., k), angles wrapped."""

@@ -112,7 +112,8 @@ class RecentScans(Restorable):
     ) -> tuple[list[RecentScan], int | None]:
         """Return the last scans with a new one, and the first to repeat, if any."""
         row_ids, labels = tuple(plan.row_ids), tuple(plan.labels)
-        scan = RecentScan(plan.scan, self.motions, readings, row_ids, labels)
+        kept = readings.copy()  # the caller may reuse the array
+        scan = RecentScan(plan.scan, self.motions, kept, row_ids, labels)
         if not self._window:
             return [scan], None
         if scan.begins:

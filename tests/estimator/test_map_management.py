@@ -135,6 +135,20 @@ def test_a_landmark_enters_with_its_last_sighting_needed():
     assert slam.update(scan).associated_ids == (0, 1)
 
 
+@pytest.mark.parametrize("association", ["nearest", "joint", "hypotheses"])
+def test_the_caller_may_fill_the_same_array_with_every_scan(association):
+    policy = {"association": association, "backdate": True}
+    reusing, twin = make(management=policy), make(management=policy)
+    array = np.empty((6, 2))
+    for odometry, readings, _ in drive(1, 8):
+        array[:] = readings
+        for slam, scan in ((reusing, array), (twin, readings)):
+            slam.predict(odometry)
+            slam.update(scan)
+    assert len(twin.landmark_ids) == 6
+    assert_same_bits(reusing.belief(), twin.belief())
+
+
 def test_too_few_sightings_leave_no_trace():
     slam, bare = make(management={"confirm": (3, 4)}), make(management=None)
     clutter = [(1.0, 5.0)]

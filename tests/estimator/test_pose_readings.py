@@ -276,3 +276,14 @@ def test_a_drive_with_other_readings_has_its_own_readings_of_the_pose():
     other = made.with_scans([])
     other.observe_pose(0.2, [0, 0, 1], 1.0)
     assert (made.pose_components, other.pose_components) == (1, 2)
+
+
+def test_a_drive_keeps_a_reading_of_the_pose_whose_arrays_the_caller_fills_again():
+    made = Drive(MOTION_STD, MEASUREMENT_STD)
+    z, H = np.array([1.0, 2.0]), GPS.copy()
+    made.predict((1.0, 0.0))
+    made.observe_pose(z, H, np.eye(2))
+    z[:], H[:] = 9.0, 0.0
+    kept = made.pose_readings(1)[0]
+    assert kept.value.tolist() == [1.0, 2.0]
+    assert np.array_equal(kept.matrix, GPS)
