@@ -42,7 +42,7 @@ from ..models.sensors import (
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds, covariance_bytes, landmark_pairs
 from ..support.saved_states import with_prefix
-from ..support.undo import Undo, attributes, undo_all, undone_on_error
+from ..support.undo import Undo, attributes, undo_all, undone_on_error, with_copies
 from .conditioning import ObservesPoses, coincide
 from .delayed_landmarks import Waiting, collect, is_landmark, read_waiting
 from .gaussian_map import (
@@ -199,12 +199,13 @@ class MapFilter(ObservesPoses):
 
     def snapshot(self) -> dict[str, Any]:
         """Return the present state, for :meth:`resume`."""
-        return {**vars(self), "map": self.map.block.copy()}
+        return {**with_copies(vars(self)), "map": self.map.block.copy()}
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
         """Return to a :meth:`snapshot` of a filter with the same settings."""
         self.map.resume(snapshot["map"])
-        vars(self).update({"_report": None, **snapshot, "map": self.map})
+        own = {"_report": type(self)._report, **snapshot, "map": self.map}
+        vars(self).update(with_copies(own))
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""

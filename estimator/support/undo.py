@@ -1,6 +1,6 @@
 """Calls that change all of a state or nothing, also where an interrupt ends them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -72,11 +72,11 @@ def contents(*objects: object) -> Undo:
     >>> count.numbers
     [1]
     """
-    before = [(vars(each), _kept(vars(each))) for each in objects]
+    before = [(vars(each), with_copies(vars(each))) for each in objects]
 
     def undo() -> None:
         for values, old in before:
-            values.update(_kept(old))
+            values.update(with_copies(old))
 
     return undo
 
@@ -84,7 +84,8 @@ def contents(*objects: object) -> Undo:
 _CHANGED_IN_PLACE = frozenset((np.ndarray, list, dict, set))
 
 
-def _kept(values: dict[str, Any]) -> dict[str, Any]:
+def with_copies(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return attributes with copies of those that are arrays, lists, dicts or sets."""
     return {
         name: value.copy() if type(value) in _CHANGED_IN_PLACE else value
         for name, value in values.items()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from comparison import digest
 
-from slamgym.estimator import UpdateReport, make_estimator
+from slamgym.estimator import EkfSlam, UpdateReport, make_estimator
 from slamgym.estimator.filters.gaussian_map import LOWER
 from slamgym.estimator.kernels.kalman_gain import LARGE
 
@@ -221,3 +221,40 @@ def test_reports_that_are_kept_stay_as_they_are_when_a_filter_resumes(name):
     assert kept[0].innovation.any()
     assert np.array_equal(kept[0].innovation, kept[1].innovation)
     assert np.array_equal(kept[0].innovation_factor, kept[1].innovation_factor)
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_a_filter_resumes_with_the_report_that_it_had(name):
+    slam = make_estimator(name, **NOISE)
+    start = slam.snapshot()
+    slam.update([(0.5, 4.0)], [3])
+    after, added = slam.snapshot(), slam.report().added_ids
+    slam.resume(start)
+    assert slam.report() == UpdateReport()
+    slam.resume(after)
+    assert slam.report().added_ids == added == (3,)
+
+
+class Counting(EkfSlam):
+    """Counts the scans of each landmark in an array and lists their sizes."""
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        self.counts, self.sizes = np.zeros(9), []
+
+    def update(self, measurements, landmark_ids=None):
+        self.counts[landmark_ids] += 1
+        self.sizes.append(len(landmark_ids))
+        return super().update(measurements, landmark_ids)
+
+
+def test_a_snapshot_holds_copies_of_what_a_filter_of_your_own_changes_in_place():
+    one, other = Counting(**NOISE), Counting(**NOISE)
+    one.update([(0.5, 4.0)], [3])
+    before = one.snapshot()
+    for slam in (one, other, other):
+        slam.resume(before)
+        slam.update([(0.5, 4.0), (0.1, 5.0)], [3, 4])
+        assert slam.counts.tolist() == [0, 0, 0, 2, 1, 0, 0, 0, 0]
+        assert slam.sizes == [1, 2]
+    assert one.counts.tolist() == other.counts.tolist()
