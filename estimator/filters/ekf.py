@@ -204,8 +204,8 @@ class MapFilter(ObservesPoses):
     def resume(self, snapshot: Mapping[str, Any]) -> None:
         """Return to a :meth:`snapshot` of a filter with the same settings."""
         self.map.resume(snapshot["map"])
-        own = {"_report": type(self)._report, **snapshot, "map": self.map}
-        vars(self).update(with_copies(own))
+        vars(self).pop("_report", None)  # that of the class, unless a snapshot has one
+        vars(self).update(with_copies({**snapshot, "map": self.map}))
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
