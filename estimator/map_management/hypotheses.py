@@ -502,7 +502,7 @@ class FilterPool:
     def copy(self, slam: ManagedSlam) -> ManagedSlam:
         """Return another filter that continues from the same state."""
         copied = self.fresh()
-        copied.copy_from(slam)
+        copied.resume(slam.snapshot())
         return copied
 
     def bookmark(self) -> Undo:

@@ -36,7 +36,6 @@ from ..interface import (
     mapped_ids,
     marginal,
     optional_members,
-    restore,
     resume,
     snapshot,
     taking_poses,
@@ -391,14 +390,6 @@ class ManagedSlam:
     def report(self) -> UpdateReport | None:
         """Return the report of the last update once more."""
         return self._report
-
-    def copy_from(self, other: ManagedSlam) -> None:
-        """Continue as another filter of the same settings, decisions included."""
-        restore(self._filter, other.filter.state_dict())
-        self._pruner.load_state_dict(other._pruner.state_dict())
-        self._recent.copy_from(other._recent)
-        self._editor.expire()
-        self.candidates = other.candidates
 
     def snapshot(self) -> tuple[Any, ...]:
         """Return the present state, decisions included, for :meth:`resume`."""

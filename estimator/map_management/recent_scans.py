@@ -71,11 +71,6 @@ class RecentScans(Restorable):
         #: About every scan since the start, or since a saved state was loaded.
         self.decisions: list[ScanDecisions] = []
 
-    def copy_from(self, other: RecentScans) -> None:
-        """Continue from the scans of another run with the same kind of filter."""
-        self.scans, self.motions = list(other.scans), other.motions
-        self.decisions = list(other.decisions)
-
     def bookmark(self) -> Undo:
         """Return what takes back later changes of what is remembered."""
         scans, motions, decisions = list(self.scans), self.motions, self.decisions
