@@ -21,7 +21,6 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
-from ...restorable import Restorable
 from ..association.constellations import Constellations, TwoPlaces, match_constellations
 from ..interface import MapView
 
@@ -45,90 +44,76 @@ TURN_STDS = 4.0
 SLACK = 0.2
 
 
-class LoopCloser(Restorable):
-    """Recognises the landmarks around the robot in the map of one filter.
+def lost(view: MapView, rules: Constellations | None) -> BoolArray:
+    """Return which landmarks of a view are lost, shape (n,); none without rules.
+
+    Unless the rules say always, none is as long as no constellation can be recognised,
+    with few landmarks around the robot or in the map.
+    """
+    if rules is None or not view.ids:
+        return np.zeros(len(view.ids), dtype=np.bool_)
+    std, least = _relative_std(view), rules.least
+    is_lost = np.asarray(std > rules.lost_std)
+    local = np.count_nonzero(std <= LOCAL_STD * rules.lost_std)
+    elsewhere = len(view.mapped) - np.count_nonzero(~is_lost)
+    is_part = view.whole is not None  # landmarks near the robot may be left out
+    can_match = (local >= least or is_part) and elsewhere >= 2 * least
+    return is_lost & (can_match or rules.always)
+
+
+def without_lost(view: MapView, rules: Constellations | None, within: float) -> MapView:
+    """Return a view of the landmarks within a distance [m] that are not lost.
+
+    The view itself, if no landmark is lost.
+    """
+    is_lost = lost(view, rules)
+    if rules is None or not is_lost.any():
+        return view
+    away = np.hypot(*(view.landmarks - view.mean[:2]).T)
+    is_near = away <= within + NEAR_STDS * rules.lost_std
+    return _part(view, np.flatnonzero(~is_lost & is_near))
+
+
+def doubtful_after(
+    view: MapView, rules: Constellations, added: Collection[int], doubtful: set[int]
+) -> set[int]:
+    """Return the doubtful landmarks once some were added to the map."""
+    doubtful = doubtful & set(view.mapped)
+    new = np.array([k for k, i in enumerate(view.ids) if i in added], dtype=np.int64)
+    if not len(new) or not (is_lost := lost(view, rules)).any():
+        return doubtful
+    squared, _ = _offsets(view, new, np.flatnonzero(is_lost))
+    fitting = new[(squared <= OFFSET_GATE).any(axis=1)]
+    return doubtful | {view.ids[k] for k in fitting.tolist()}
+
+
+def same_landmarks(
+    view: MapView,
+    rules: Constellations,
+    added: Collection[int],
+    doubtful: set[int],
+    within: float,
+) -> Pairs:
+    """Return landmarks to merge after a scan.
 
     Parameters
     ----------
-    rules : Constellations or None
-        None: no landmark is ever lost.
+    view : MapView
+        The map around the robot.
+    rules : Constellations
+    added : collection of int
+        Landmarks that the scan has added to the map.
+    doubtful : set of int
+        Landmarks that may be older, lost ones.
+    within : float
+        Reach of the readings [m].
     """
-
-    changing = ("doubtful",)
-
-    def __init__(self, rules: Constellations | None) -> None:
-        self._rules = rules
-        #: Mapped landmarks that may be older, lost ones.
-        self.doubtful: set[int] = set()
-
-    def lost(self, view: MapView) -> BoolArray:
-        """Return which landmarks of a view are lost, shape (n,).
-
-        Unless the rules say always, none is as long as no constellation can be
-        recognised, with few landmarks around the robot or in the map.
-        """
-        if self._rules is None or not view.ids:
-            return np.zeros(len(view.ids), dtype=np.bool_)
-        std, least = _relative_std(view), self._rules.least
-        is_lost = np.asarray(std > self._rules.lost_std)
-        local = np.count_nonzero(std <= LOCAL_STD * self._rules.lost_std)
-        elsewhere = len(view.mapped) - np.count_nonzero(~is_lost)
-        is_part = view.whole is not None  # landmarks near the robot may be left out
-        can_match = (local >= least or is_part) and elsewhere >= 2 * least
-        return is_lost & (can_match or self._rules.always)
-
-    def without_lost(self, view: MapView, within: float) -> MapView:
-        """Return a view of the landmarks within a distance [m] that are not lost.
-
-        The view itself, if no landmark is lost.
-        """
-        is_lost = self.lost(view)
-        if self._rules is None or not is_lost.any():
-            return view
-        away = np.hypot(*(view.landmarks - view.mean[:2]).T)
-        is_near = away <= within + NEAR_STDS * self._rules.lost_std
-        return _part(view, np.flatnonzero(~is_lost & is_near))
-
-    def is_waiting(self, added: Collection[int]) -> bool:
-        """Return whether landmarks may have to be merged after some were added."""
-        return self._rules is not None and bool(added or self.doubtful)
-
-    def pairs(self, view: MapView, added: Collection[int], within: float) -> Pairs:
-        """Return landmarks to merge after a scan.
-
-        Parameters
-        ----------
-        view : MapView
-            The map around the robot.
-        added : collection of int
-            Landmarks that the scan has added to the map.
-        within : float
-            Reach of the readings [m].
-        """
-        if self._rules is None:
-            return []
-        is_lost = self.lost(view)
-        self._note_added(view, added, is_lost)
-        doubtful = [k for k, i in enumerate(view.ids) if i in self.doubtful]
-        if not doubtful:
-            return []
-        accurate = ACCURATE * self._rules.lost_std
-        found = _found_again(view, np.array(doubtful), is_lost, accurate)
-        if found or not added:
-            return found
-        return _recognised(view, is_lost, within, self._rules)
-
-    def _note_added(
-        self, view: MapView, added: Collection[int], is_lost: BoolArray
-    ) -> None:
-        """Remember new landmarks that may be lost ones; forget those that are gone."""
-        self.doubtful &= set(view.mapped)
-        new = np.array([k for k, i in enumerate(view.ids) if i in set(added)], int)
-        lost = np.flatnonzero(is_lost)
-        if len(new) and len(lost):
-            squared, _ = _offsets(view, new, lost)
-            doubtful = new[(squared <= OFFSET_GATE).any(axis=1)]
-            self.doubtful |= {view.ids[k] for k in doubtful.tolist()}
+    slots = [k for k, i in enumerate(view.ids) if i in doubtful]
+    if not slots:
+        return []
+    is_lost, accurate = lost(view, rules), ACCURATE * rules.lost_std
+    found = _found_again(view, np.array(slots), is_lost, accurate)
+    return found if found or not added else _recognised(view, is_lost, within, rules)
 
 
 def _found_again(

@@ -255,7 +255,7 @@ class ManagedSlam:
         """Associate readings (m, 2) by their identities, which must differ."""
         plan = ScanAssociation(self._policy, self.candidates, readings)
         view = self._editor.map_view(self._policy.reach(readings))
-        plan.translate(ids, view.mapped, self._pruner.merger.aliases)
+        plan.translate(ids, view.mapped, self._pruner.records.aliases)
         return plan
 
     def alternatives(self, readings: Array, ceiling: float = np.inf) -> list[Option]:
@@ -336,7 +336,7 @@ class ManagedSlam:
         """Merge two mapped landmarks by hand; both identities then name the first."""
         argument_checks.two_landmarks(kept, gone, self._slots)
         with undone_on_error(self.bookmark()):
-            self._pruner.merger.join([(kept, gone)])
+            self._pruner.join([(kept, gone)])
             self._recent.note_edits((), [(kept, gone)])
 
     @property
@@ -371,7 +371,7 @@ class ManagedSlam:
         saved_states.refuse_other_state(state, entries, estimator=type(self).__name__)
         candidates = Candidates.from_state_dict(without_prefix(state, "tentative"))
         with undone_on_error(self.bookmark()):
-            self._pruner.load_state_dict(without_prefix(state, "landmarks"))
+            self._pruner.records.load_state_dict(without_prefix(state, "landmarks"))
             self._recent.load_state_dict(without_prefix(state, "recent"))
             self._filter.load_state_dict(without_prefix(state, "filter"))
             self._editor.expire()
@@ -394,14 +394,14 @@ class ManagedSlam:
     def snapshot(self) -> tuple[Any, ...]:
         """Return the present state, decisions included, for :meth:`resume`."""
         kept = self.candidates, self.steps, self._report
-        parts = self._pruner.state(), self._recent.state()
+        parts = self._pruner.records.state(), self._recent.state()
         return snapshot(self._filter), *parts, *kept
 
     def resume(self, before: tuple[Any, ...]) -> None:
         """Return to a :meth:`snapshot` of a filter with the same settings."""
-        within, pruner, recent, self.candidates, self.steps, self._report = before
+        within, records, recent, self.candidates, self.steps, self._report = before
         resume(self._filter, within)
-        self._pruner.restore(pruner)
+        self._pruner.records.restore(records)
         self._recent.restore(recent)
         self._editor.expire()
 
@@ -409,7 +409,7 @@ class ManagedSlam:
         """Return all of the state except the filter's."""
         return {
             "estimator": np.array(type(self).__name__),
-            **with_prefix("landmarks", self._pruner.state_dict()),
+            **with_prefix("landmarks", self._pruner.records.state_dict()),
             **with_prefix("tentative", self.candidates.state_dict()),
             **with_prefix("recent", self._recent.state_dict()),
         }

@@ -16,13 +16,16 @@ from ..filters.conditioning import separation
 from ..interface import MapView
 from ..support import saved_states
 from ..support.undo import Undo, contents
-from .loop_closing import LoopCloser, Pairs
+from .loop_closing import Pairs, doubtful_after, lost, same_landmarks, without_lost
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy
 
 
-class MapPruner(Restorable):
+class MapPruner:
     """Removes and merges the landmarks of one filter by a policy.
+
+    Two landmarks are merged if their estimates are close, the offset is accurate enough
+    to tell two landmarks apart, it passes the gate, and no scan has shown both.
 
     Parameters
     ----------
@@ -34,32 +37,29 @@ class MapPruner(Restorable):
 
     Attributes
     ----------
-    merger : LandmarkMerger
-        Merges landmarks of this run.
+    records : LandmarkRecords
+        What this run has shown of the landmarks.
     """
-
-    changing = ("_records", "merger", "_closer")
 
     def __init__(self, policy: LandmarkPolicy, editor: MapEditor, noise: Noise) -> None:
         self._policy, self._editor = policy, editor
         bearing_std, range_std, per_metre = np.maximum(noise[:3], 1e-12).tolist()
         self._noise = bearing_std, range_std, per_metre, noise.bearing_std_metres
-        self.forget()
+        self.records = LandmarkRecords()
 
     def forget(self) -> None:
         """Start a new run."""
-        self._records = LandmarkRecords()
-        self.merger = LandmarkMerger(self._policy, self._editor, self._records)
-        self._closer = LoopCloser(self._policy.constellations)
+        self.records = LandmarkRecords()
 
-    def note_sightings(self, readings: Array, ids: Sequence[int]) -> None:
-        """Record the landmarks that the rows of a scan (m, 2) have shown."""
-        view = self._editor.map_view()
-        self._records.follow(view.mapped)
-        if not ids:
-            return
-        self._records.note_sightings(ids, readings, float(view.mean[2]), self._noise)
-        self.merger.note_scan(view, ids)
+    def bookmark(self) -> Undo:
+        """Return what takes back later changes of what is remembered."""
+        return contents(self, self.records)
+
+    def view_for(self, readings: Array) -> MapView:
+        """Return a view of the landmarks that readings (m, 2) may belong to."""
+        reach = self._policy.reach(readings)
+        view = self._editor.map_view(reach)
+        return without_lost(view, self._policy.constellations, reach)
 
     def expected(self, scan: Array) -> set[int]:
         """Return the landmarks that a scan (m, 2) should show; changes nothing."""
@@ -67,12 +67,12 @@ class MapPruner(Restorable):
         if policy.remove_after is None or policy.view is None or not view.ids:
             return set()
         mask = policy.view.expects(view.mean[:3].copy(), view.landmarks, scan)
-        mask &= ~self._closer.lost(view)
+        mask &= ~lost(view, policy.constellations)
         return {view.ids[slot] for slot in np.flatnonzero(mask).tolist()}
 
     def prune(
         self, readings: Array, plan: ScanAssociation, seen: set[int], missed: set[int]
-    ) -> tuple[list[int], list[tuple[int, int]]]:
+    ) -> tuple[list[int], Pairs]:
         """Remove and merge landmarks; return the removed ids and pairs (kept, gone).
 
         Parameters
@@ -84,174 +84,74 @@ class MapPruner(Restorable):
         seen, missed : set of int
             Landmarks that the scan has shown, and those that it should have shown.
         """
-        row_ids = plan.row_ids
+        self._note_sightings(readings, plan.row_ids, seen)
+        removed = self._remove_missing(missed)
+        merged = self._merge_duplicates(seen)
+        merged += self._close_loops(plan.confirmed, readings)
+        return removed + self._keep_capacity(seen), merged
+
+    def remove(self, ids: list[int]) -> list[int]:
+        """Remove landmarks from the map and from the records; return them."""
+        if ids:
+            self._editor.remove(ids)
+            self.records.follow(self._editor.map_view().mapped)
+            self.records.forget_pairs(ids)
+        return ids
+
+    def join(self, pairs: Pairs) -> None:
+        """Merge pairs of landmarks; both identities then name the first."""
+        self.records.follow(self._editor.map_view().mapped)
+        self._editor.merge_pairs(pairs)
+        for kept, gone in pairs:
+            self.records.join(kept, gone)
+        self.records.follow(self._editor.map_view().mapped)
+
+    def _joined(self, pairs: Pairs) -> bool:
+        """Merge pairs, or return False: nothing was merged, later scans try again."""
+        try:
+            self.join(pairs)
+        except np.linalg.LinAlgError:
+            return False
+        return True
+
+    def _note_sightings(
+        self, readings: Array, row_ids: Sequence[int | None], seen: set[int]
+    ) -> None:
+        """Record the landmarks that a scan has shown, and that they differ."""
+        view, within = self._editor.map_view(), self._policy.merge_within
+        self.records.follow(view.mapped)
         rows = [row for row, i in enumerate(row_ids) if i in seen]
         ids = [i for i in row_ids if i is not None and i in seen]
-        self.note_sightings(readings[rows], ids)
-        removed = self.remove_missing(missed)
-        merged = self.merger.merge(seen)
-        merged += self.close_loops(plan.confirmed, readings)
-        return removed + self.keep_capacity(seen), merged
+        if not ids:
+            return
+        heading = float(view.mean[2])
+        self.records.note_sightings(ids, readings[rows], heading, self._noise)
+        if within is not None:
+            places = view.landmarks[self._places(view, ids)]
+            close = _distances(places, places) < 2 * within
+            for i, j in np.argwhere(np.triu(close, 1)).tolist():
+                self.records.apart.add(_ordered(ids[i], ids[j]))
 
-    def remove_missing(self, missed: set[int]) -> list[int]:
+    def _remove_missing(self, missed: set[int]) -> list[int]:
         """Count a miss for each landmark of ``missed``; remove those missed too often.
 
         ``missed`` are the landmarks that this scan should have shown and did not.
         """
-        most, records = self._policy.remove_after, self._records
+        most, records = self._policy.remove_after, self.records
         if most is None:
             return []
         records.misses[records.slots(missed)] += 1
         overdue = np.flatnonzero(records.misses >= most)
         return self.remove([records.ids[k] for k in overdue.tolist()])
 
-    def close_loops(self, added: Collection[int], readings: Array) -> Pairs:
-        """Merge landmarks around the robot with an older part of the map.
-
-        Parameters
-        ----------
-        added : collection of int
-            Landmarks, seen without identity, that the last scan has added.
-        readings : ndarray, shape (m, 2)
-            This scan.
-        """
-        if not self._closer.is_waiting(added):
-            return []
-        within = self._policy.reach(readings)
-        pairs = self._closer.pairs(self._editor.map_view(within), added, within)
-        try:
-            if pairs:
-                self.merger.join(pairs)
-        except np.linalg.LinAlgError:  # nothing was merged; later scans try again
-            return []
-        return pairs
-
-    def view_for(self, readings: Array) -> MapView:
-        """Return a view of the landmarks that readings (m, 2) may belong to."""
-        reach = self._policy.reach(readings)
-        return self._closer.without_lost(self._editor.map_view(reach), reach)
-
-    def keep_capacity(self, seen: set[int]) -> list[int]:
-        """Remove the landmarks of least information, first among those not seen."""
-        capacity = self._policy.capacity
-        if capacity is None:
-            return []
-        ids = list(self._editor.map_view().mapped)
-        if len(ids) <= capacity:
-            return []
-        ranked = self._records.by_information(ids)
-        ranked.sort(key=seen.__contains__)
-        return self.remove(ranked[: len(ids) - capacity])
-
-    def remove(self, ids: list[int]) -> list[int]:
-        """Remove landmarks from the map and from the records; return them."""
-        if ids:
-            self._editor.remove(ids)
-            self._records.follow(self._editor.map_view().mapped)
-            self.merger.forget(ids)
-        return ids
-
-    def bookmark(self) -> Undo:
-        """Return what takes back later changes of what is remembered."""
-        return contents(self, self._records, self.merger, self._closer)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return copies of all records, as arrays."""
-        merger = self.merger
-        found = {
-            **vars(self._records),
-            "apart": sorted(merger.apart),
-            "aliases": list(merger.aliases.items()),
-            "doubtful": sorted(self._closer.doubtful),
-        }
-        return saved_states.write(found, RECORDS)
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned; refuse what does not fit."""
-        saved = saved_states.read(state, RECORDS, "landmarks.")
-        apart, aliases = saved.pop("apart"), saved.pop("aliases")
-        self._closer.doubtful = set(saved.pop("doubtful"))
-        self.merger.apart = {(i, j) for i, j in apart.tolist()}
-        self.merger.aliases = dict(aliases.tolist())
-        self._records.follow(saved.pop("ids"))
-        vars(self._records).update(saved)
-
-
-#: What a saved state holds about the landmarks of a map.
-RECORDS: saved_states.Table = {
-    "ids": (saved_states.IDS, "n"),
-    "sightings": (saved_states.COUNTS, "n"),
-    "misses": (saved_states.COUNTS, "n"),
-    "information": (saved_states.NUMBERS, "n", 3),
-    "apart": (saved_states.WHOLE, -1, 2),
-    "aliases": (saved_states.WHOLE, -1, 2),
-    "doubtful": (saved_states.IDS, -1),
-}
-
-
-class LandmarkMerger(Restorable):
-    """Merges the landmarks of one filter that a policy considers to be the same.
-
-    Two landmarks are merged if their estimates are close, the offset is accurate enough
-    to tell two landmarks apart, it passes the gate, and no scan has shown both.
-
-    Parameters
-    ----------
-    policy : LandmarkPolicy
-    editor : MapEditor
-        Edits the filter's map.
-    records : LandmarkRecords
-        Records of the mapped landmarks, which are joined with the landmarks.
-    """
-
-    changing = ("apart", "aliases")
-
-    def __init__(
-        self, policy: LandmarkPolicy, editor: MapEditor, records: LandmarkRecords
-    ) -> None:
-        self._policy, self._editor, self._records = policy, editor, records
-        #: Landmarks known to differ.
-        self.apart: set[tuple[int, int]] = set()
-        #: Landmarks merged into others: gone to kept.
-        self.aliases: dict[int, int] = {}
-
-    def note_scan(self, view: MapView, ids: Sequence[int]) -> None:
-        """Record that landmarks seen in one scan are different ones."""
-        if self._policy.merge_within is None:
-            return
-        places = view.landmarks[self._places(view, ids)]
-        close = _distances(places, places) < 2 * self._policy.merge_within
-        for i, j in np.argwhere(np.triu(close, 1)).tolist():
-            self.apart.add(_ordered(ids[i], ids[j]))
-
-    def merge(self, seen: set[int]) -> list[tuple[int, int]]:
+    def _merge_duplicates(self, seen: set[int]) -> Pairs:
         """Merge landmarks just seen with their duplicates; return (kept, gone)."""
-        merged: list[tuple[int, int]] = []
-        while (pair := self._duplicate(seen)) is not None:
+        merged: Pairs = []
+        while (pair := self._duplicate(seen)) is not None and self._joined([pair]):
             kept, gone = pair
-            try:
-                self.join([pair])
-            except np.linalg.LinAlgError:  # nothing was merged; later scans try again
-                break
             seen = (seen - {gone}) | {kept}
             merged.append(pair)
         return merged
-
-    def join(self, pairs: Sequence[tuple[int, int]]) -> None:
-        """Merge pairs of landmarks; both identities then name the first."""
-        self._records.follow(self._editor.map_view().mapped)
-        self._editor.merge_pairs(pairs)
-        for kept, gone in pairs:
-            self._records.join(kept, gone)
-            earlier = {i: kept for i, j in self.aliases.items() if j == gone}
-            self.aliases |= {gone: kept, **earlier}
-            self.apart = {_renamed(pair, gone, kept) for pair in self.apart}
-        self._records.follow(self._editor.map_view().mapped)
-
-    def forget(self, ids: Iterable[int]) -> None:
-        """Drop what is known about landmarks that have been removed."""
-        gone = set(ids)
-        self.apart = {pair for pair in self.apart if gone.isdisjoint(pair)}
 
     def _duplicate(self, seen: set[int]) -> tuple[int, int] | None:
         """Find two landmarks that are one; keep the first of them in the map."""
@@ -270,18 +170,49 @@ class LandmarkMerger(Restorable):
     def _places(self, view: MapView, ids: Sequence[int]) -> IntArray:
         """Return the places of landmarks in the order of a view."""
         if view.whole is None:
-            return self._records.slots(ids)
+            return self.records.slots(ids)
         places = {i: place for place, i in enumerate(view.ids)}
         return np.array([places[i] for i in ids], dtype=np.int64)
 
     def _is_one(self, view: MapView, kept: int, gone: int) -> bool:
-        if _ordered(view.ids[kept], view.ids[gone]) in self.apart:
+        if _ordered(view.ids[kept], view.ids[gone]) in self.records.apart:
             return False
         between = separation(view.mean, view.covariance, kept, gone)
         return (
             between.largest_std <= self._policy.worst_separation_std
             and between.squared <= self._policy.merge_gate
         )
+
+    def _close_loops(self, added: Collection[int], readings: Array) -> Pairs:
+        """Merge landmarks around the robot with an older part of the map.
+
+        Parameters
+        ----------
+        added : collection of int
+            Landmarks, seen without identity, that the last scan has added.
+        readings : ndarray, shape (m, 2)
+            This scan.
+        """
+        rules, records = self._policy.constellations, self.records
+        if rules is None or not (added or records.doubtful):
+            return []
+        within = self._policy.reach(readings)
+        view = self._editor.map_view(within)
+        records.doubtful = doubtful_after(view, rules, added, records.doubtful)
+        pairs = same_landmarks(view, rules, added, records.doubtful, within)
+        return pairs if pairs and self._joined(pairs) else []
+
+    def _keep_capacity(self, seen: set[int]) -> list[int]:
+        """Remove the landmarks of least information, first among those not seen."""
+        capacity = self._policy.capacity
+        if capacity is None:
+            return []
+        ids = list(self._editor.map_view().mapped)
+        if len(ids) <= capacity:
+            return []
+        ranked = self.records.by_information(ids)
+        ranked.sort(key=seen.__contains__)
+        return self.remove(ranked[: len(ids) - capacity])
 
 
 def _distances(some: Array, others: Array) -> Array:
@@ -300,7 +231,9 @@ def _renamed(pair: tuple[int, int], old: int, new: int) -> tuple[int, int]:
 
 
 class LandmarkRecords(Restorable):
-    """Sightings, misses and information of the landmarks, in the order of the map.
+    """What a run has shown of the landmarks of its map.
+
+    Sightings, misses and information are in the order of the map.
 
     The information of a landmark is its block of the information matrix, summed over
     all its readings with the pose of the robot taken as known::
@@ -321,7 +254,10 @@ class LandmarkRecords(Restorable):
     [7, 9]
     """
 
-    changing = ("ids", "sightings", "misses", "information", "_slots")
+    changing = (
+        *("ids", "sightings", "misses", "information", "_slots"),
+        *("apart", "aliases", "doubtful"),
+    )
 
     def __init__(self) -> None:
         self.ids: tuple[int, ...] = ()
@@ -329,6 +265,12 @@ class LandmarkRecords(Restorable):
         self.misses: IntArray = np.zeros(0, dtype=np.int64)
         self.information: Array = np.zeros((0, 3))
         self._slots: dict[int, int] = {}
+        #: Landmarks known to differ.
+        self.apart: set[tuple[int, int]] = set()
+        #: Landmarks merged into others: gone to kept.
+        self.aliases: dict[int, int] = {}
+        #: Landmarks that may be older, lost ones.
+        self.doubtful: set[int] = set()
 
     def follow(self, ids: Sequence[int]) -> None:
         """Adopt the order of the map: keep records of its landmarks, start new ones."""
@@ -381,12 +323,45 @@ class LandmarkRecords(Restorable):
         self.sightings[i] += self.sightings[j]
         self.information[i] += self.information[j]
         self.misses[i] = min(self.misses[i], self.misses[j])
+        earlier = {i: kept for i, j in self.aliases.items() if j == gone}
+        self.aliases |= {gone: kept, **earlier}
+        self.apart = {_renamed(pair, gone, kept) for pair in self.apart}
+
+    def forget_pairs(self, ids: Sequence[int]) -> None:
+        """Drop which landmarks are known to differ from removed ones."""
+        self.apart = {pair for pair in self.apart if set(ids).isdisjoint(pair)}
 
     def by_information(self, ids: Sequence[int]) -> list[int]:
         """Sort landmarks by information, the least first, of equals the newest."""
         xx, xy, yy = self.information[self.slots(ids)[::-1]].T
         order = np.argsort(xx * yy - xy * xy, kind="stable")
         return [ids[len(ids) - 1 - k] for k in order.tolist()]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of all, as arrays."""
+        tables = {"apart": sorted(self.apart), "aliases": list(self.aliases.items())}
+        found = vars(self) | tables | {"doubtful": sorted(self.doubtful)}
+        return saved_states.write(found, RECORDS)
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned; refuse what does not fit."""
+        saved = saved_states.read(state, RECORDS, "landmarks.")
+        self.follow(saved["ids"])
+        apart, aliases = (saved[name].tolist() for name in ("apart", "aliases"))
+        sets = {"apart": {(i, j) for i, j in apart}, "doubtful": {*saved["doubtful"]}}
+        vars(self).update(saved | sets, ids=self.ids, aliases=dict(aliases))
+
+
+#: What a saved state holds about the landmarks of a map.
+RECORDS: saved_states.Table = {
+    "ids": (saved_states.IDS, "n"),
+    "sightings": (saved_states.COUNTS, "n"),
+    "misses": (saved_states.COUNTS, "n"),
+    "information": (saved_states.NUMBERS, "n", 3),
+    "apart": (saved_states.WHOLE, -1, 2),
+    "aliases": (saved_states.WHOLE, -1, 2),
+    "doubtful": (saved_states.IDS, -1),
+}
 
 
 @jit

@@ -8,7 +8,7 @@ from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import LandmarkPolicy, make_estimator
 from slamgym.estimator.association.constellations import Constellations
 from slamgym.estimator.interface import MapView
-from slamgym.estimator.map_management.loop_closing import LoopCloser
+from slamgym.estimator.map_management.loop_closing import lost
 from slamgym.estimator.map_management.policy import as_policy
 from slamgym.sim_configs import action_sequence, load_scenario
 
@@ -209,7 +209,7 @@ def test_landmarks_are_lost_only_where_a_constellation_can_be_recognised(local):
     mean = np.append(np.zeros(3), np.arange(2.0 * count))
     variance = np.repeat([9.0] * 14 + [0.01] * local, 2)
     view = MapView(mean, np.diag(np.append(np.zeros(3), variance)), tuple(range(count)))
-    always = LoopCloser(Constellations(always=True)).lost(view)
+    always = lost(view, Constellations(always=True))
     assert always.tolist() == [True] * 14 + [False] * local
-    found = LoopCloser(Constellations()).lost(view)
+    found = lost(view, Constellations())
     assert found.tolist() == (always.tolist() if local >= 6 else [False] * count)
