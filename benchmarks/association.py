@@ -100,9 +100,10 @@ def worlds() -> dict[str, Scenario]:
 
 
 def policy_of(method: str, world: Scenario) -> dict[str, Any]:
-    """Return the policy of a method, or with a wrong density of clutter."""
-    if method in METHODS | COUNTS:
-        return (METHODS | COUNTS)[method]
+    """Return the policy of a method, or that of a wrong density of clutter."""
+    known = METHODS | COUNTS
+    if method in known:
+        return known[method]
     sensor = world.sensor
     area = sensor.field_of_view * (sensor.max_range - sensor.min_range)
     density = WRONG_DENSITIES[method] * max(sensor.clutter, 0.05) / area
@@ -177,7 +178,7 @@ def crowded_scan() -> float:
 
 
 def difference(lost: NDArray[np.bool_], of_first: NDArray[np.bool_]) -> str:
-    """Return how many percent of the runs more are lost than of the first method.
+    """Return how many more runs are lost than with the first method, in percent.
 
     The 95 % interval of this difference follows in brackets.
     """

@@ -28,7 +28,7 @@ from slamgym.evaluation import pose_nees, position_accuracy
 from slamgym.sim_configs import Scenario, load_scenario
 
 PRESETS = (
-    "lost_loop look_alike active_hidden coarse_loop loop active_easy active_medium "
+    "lost_loop look_alike active_hidden loop active_easy active_medium "
     "active_hard active_rooms active_uncertain dropout dense six_landmarks slippery "
     "unknown_heading fault_odometry_turn"
 )

@@ -108,7 +108,8 @@ class GaussianMap:
         starts = slice(STARTS, NUMBERS)
         if memory[starts].tobytes() != self.block[starts].tobytes():
             self._become(aligned_copy(memory))
-        elif (last := self._last()) is not None:  # somebody still holds the report
+            return
+        if (last := self._last()) is not None:  # somebody still holds the report
             last.detach()
         self._slots, self.block[:] = {}, memory
 

@@ -283,11 +283,13 @@ be 2 numbers >= 0 with commas between, got '0.2,-1'
 
         Examples
         --------
-        >>> noise = "range_std_per_metre=0.1"
+        >>> noise = "range_noise_at=reading"
         >>> given = Options(noise_at_rest=False, option_texts=[noise, "iterations=3"])
         >>> given.noise_arguments()
-        ['--no-noise-at-rest', '--option=range_std_per_metre=0.1']
+        ['--no-noise-at-rest', '--option=range_noise_at=reading']
         """
+        from ...estimator.models.sensors import NUMBERS
+
         stds = "motion_std", "measurement_std", "initial_pose_std"
         given = self._given(*stds, "range_std_per_metre", "noise_at_rest")
         arguments = []
@@ -297,8 +299,11 @@ be 2 numbers >= 0 with commas between, got '0.2,-1'
                 arguments.append(f"--{option}" if value else f"--no-{option}")
             else:
                 arguments.append(f"--{option}={value}")
-        texts = [text for text in self.option_texts or () if "_std_" in text]
-        return arguments + [f"--option={text}" for text in texts]
+        noises = {*NUMBERS, "noise_at_rest"}
+        for text in self.option_texts or ():
+            if text.partition("=")[0].strip() in noises:
+                arguments.append(f"--option={text}")
+        return arguments
 
     def named_options(self) -> dict[str, Any]:
         """Return the options of filters that the user gave by their own names.

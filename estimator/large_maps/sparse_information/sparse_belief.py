@@ -159,7 +159,6 @@ class SparseBelief:
             cross = -T @ near[np.ix_(border, here)]
             covariance[np.ix_(outside, inside)] = cross
             covariance[np.ix_(inside, outside)] = cross.T
-        if len(outside):
             points = means(self.map_, local)[pairs(slots)]
         else:
             points = local.points[pairs(place[slots])]
