@@ -106,12 +106,12 @@ class GaussianMap:
     def resume(self, memory: Array) -> None:
         """Continue with a copy of a memory, in place where its layout is the same."""
         starts = slice(STARTS, NUMBERS)
-        if memory[starts].tobytes() != self.block[starts].tobytes():
+        if memory[starts].tobytes() == self.block[starts].tobytes():
+            if (last := self._last()) is not None:  # somebody still holds the report
+                last.detach()
+            self._slots, self.block[:] = {}, memory
+        else:
             self._become(aligned_copy(memory))
-            return
-        if (last := self._last()) is not None:  # somebody still holds the report
-            last.detach()
-        self._slots, self.block[:] = {}, memory
 
     def reset(self, pose: Array, pose_covariance: Array) -> None:
         """Start with an empty map at a pose (3,)."""
@@ -508,17 +508,8 @@ def move_pose(
     values, size = parts.values, 3 + 2 * parts.numbers[LANDMARKS]
     for i in range(3):
         values[MOVED + i] = weight * values[MOTION + i]
-    predict(
-        parts.mean,
-        parts.covariance,
-        parts.reference,
-        size,
-        forward,
-        sideways,
-        turn,
-        values[MOVED : MOVED + 3],
-        int(values[0]),
-    )
+    variance, linearisation = values[MOVED : MOVED + 3], int(values[0])
+    predict(*parts[2:5], size, forward, sideways, turn, variance, linearisation)
     parts.numbers[STEPS] += 1
 
 
