@@ -93,8 +93,10 @@ class ScanAssociation:
         density = self._density.after(
             self._readings, np.array(is_new, dtype=np.bool_), len(self.confirmed)
         )
+        evidence = self._detections.evidence.with_heading(view)
+        detections = self._detections._replace(evidence=evidence)
         known = self._tentative, self._waiting, self._next_id, self.scan + 1
-        return Candidates(*known, density, self._detections.with_heading(view))
+        return Candidates(*known, density, detections)
 
     def assign(
         self, rows: IntArray, slots: IntArray, view: MapView, noise: Noise
@@ -235,6 +237,49 @@ class ScanAssociation:
 # .. [1] E. S. Page, Continuous inspection schemes, Biometrika 41, 1954.
 
 
+class LostEvidence(NamedTuple):
+    """Evidence that the run is lost."""
+
+    #: g: a logarithm of a ratio of likelihoods.
+    present: float = 0.0
+    #: The largest evidence so far.
+    largest: float = 0.0
+    #: Landmarks from this identity on are newer than the last scan at which g was 0.
+    first_new: int = 0
+    #: Least variance of the heading so far [rad²].
+    surest: float = UNIFORM
+    #: How many scans in succession have left the heading unknown.
+    unknown: int = 0
+
+    def after(self, more: float, mapped: Sequence[int]) -> LostEvidence:
+        """Add the evidence of a scan before which these landmarks were in the map."""
+        present = max(0.0, self.present + min(more, MOST_OF_SCAN))
+        first_new = self.first_new
+        if present == 0:
+            first_new = max(first_new, 1 + max(mapped, default=-1))
+        largest = max(self.largest, present)
+        return self._replace(present=present, largest=largest, first_new=first_new)
+
+    def with_heading(self, view: MapView) -> LostEvidence:
+        """Count a scan after which the belief is ``view``.
+
+        Examples
+        --------
+        >>> evidence = LostEvidence()
+        >>> for variance in (0.01, 0.9, 1.0, 1.1):
+        ...     view = MapView(np.zeros(5), variance * np.eye(5), (7,))
+        ...     evidence = evidence.with_heading(view)
+        >>> evidence.unknown, evidence.largest > LOST_SCORE
+        (3, True)
+        """
+        variance = min(float(view.covariance[2, 2]), UNIFORM)
+        surest = min(self.surest, variance)
+        is_unknown = len(view.mapped) > 0 and variance - surest > UNKNOWN
+        unknown = self.unknown + 1 if is_unknown else 0
+        largest = max(self.largest, MOST_OF_SCAN / 2 * unknown)
+        return self._replace(surest=surest, unknown=unknown, largest=largest)
+
+
 class Detections(NamedTuple):
     """How many expected landmarks the scans have shown.
 
@@ -259,21 +304,13 @@ class Detections(NamedTuple):
     missed: Mapping[int, float]
     #: In how many scans a landmark was shown, up to `PROVEN`.
     shown: Mapping[int, int]
-    #: g, evidence that the run is lost: a logarithm of a ratio of likelihoods.
-    lost: float = 0.0
-    #: The largest evidence so far.
-    most_lost: float = 0.0
-    #: Landmarks from this identity on are newer than the last scan at which g was 0.
-    first_new: int = 0
-    #: Least variance of the heading so far [rad²].
-    surest: float = UNIFORM
-    #: How many scans in succession have left the heading unknown.
-    unknown: int = 0
+    #: That the run is lost.
+    evidence: LostEvidence
 
     @classmethod
     def none(cls) -> Detections:
         """Return the state before the first scan."""
-        return cls(NO_COUNTS, NO_COUNTS, {}, {})
+        return cls(NO_COUNTS, NO_COUNTS, {}, {}, LostEvidence())
 
     def after(
         self, view: MapView, slots: IntArray, explained: IntArray, longest: float
@@ -291,26 +328,23 @@ class Detections(NamedTuple):
         longest : float
             Longest range read so far [m].
         """
-        is_seen = np.zeros(len(view.ids), dtype=np.bool_)
+        ids, is_seen = view.ids, np.zeros(len(view.ids), dtype=np.bool_)
         is_seen[slots[slots >= 0]] = True
-        missed = np.array([self.missed.get(i, 1.0) for i in view.ids])
-        counts = self.seen.copy(), self.expected.copy()
-        shown = np.array([self.shown.get(i, 0) for i in view.ids], dtype=np.int64)
-        is_telling = (shown >= PROVEN) & (np.array(view.ids) < self.first_new)
+        missed = np.array([self.missed.get(i, 1.0) for i in ids])
+        shown = np.array([self.shown.get(i, 0) for i in ids], dtype=np.int64)
+        is_telling = (shown >= PROVEN) & (np.array(ids) < self.evidence.first_new)
         is_telling[explained] &= is_seen[explained]
-        known, P = (is_seen, is_telling), view.covariance
+        counts, known = (self.seen.copy(), self.expected.copy()), (is_seen, is_telling)
+        P = view.covariance
         cost, fewer = _count(view.mean, P, known, longest, counts, missed)
         shown = np.minimum(shown + is_seen, PROVEN)
-        lost = max(0.0, self.lost + min(fewer, MOST_OF_SCAN))
-        every = {**self.missed, **dict(zip(view.ids, missed.tolist(), strict=True))}
-        some = {i: left for i, left in every.items() if left < 1}
-        proven = {**self.shown, **dict(zip(view.ids, shown.tolist(), strict=True))}
-        most_lost, first_new = max(self.most_lost, lost), self.first_new
-        if lost == 0:
-            first_new = max(first_new, 1 + max(view.ids, default=-1))
-        seen, expected = counts
-        found = Detections(seen, expected, some, proven, lost, most_lost, first_new)
-        return cost, found._replace(surest=self.surest, unknown=self.unknown)
+        left = {**self.missed, **dict(zip(ids, missed.tolist(), strict=True))}
+        return cost, Detections(
+            *counts,
+            {i: chance for i, chance in left.items() if chance < 1},
+            {**self.shown, **dict(zip(ids, shown.tolist(), strict=True))},
+            self.evidence.after(fewer, view.mapped),
+        )
 
     def chance_to_miss(self, view: MapView, longest: float) -> Array:
         """Return the probability that a scan does not show a landmark, shape (n,)."""
@@ -318,25 +352,6 @@ class Detections(NamedTuple):
         counts = self.seen.copy(), self.expected.copy()
         _count(view.mean, view.covariance, (none, none), longest, counts, chance)
         return chance
-
-    def with_heading(self, view: MapView) -> Detections:
-        """Count a scan after which the belief is ``view``.
-
-        Examples
-        --------
-        >>> detections = Detections.none()
-        >>> for variance in (0.01, 0.9, 1.0, 1.1):
-        ...     view = MapView(np.zeros(5), variance * np.eye(5), (7,))
-        ...     detections = detections.with_heading(view)
-        >>> detections.unknown, detections.most_lost > LOST_SCORE
-        (3, True)
-        """
-        variance = min(float(view.covariance[2, 2]), UNIFORM)
-        surest = min(self.surest, variance)
-        is_unknown = len(view.mapped) > 0 and variance - surest > UNKNOWN
-        unknown = self.unknown + 1 if is_unknown else 0
-        most_lost = max(self.most_lost, MOST_OF_SCAN / 2 * unknown)
-        return self._replace(surest=surest, unknown=unknown, most_lost=most_lost)
 
 
 @dataclass(frozen=True)
@@ -358,6 +373,7 @@ class Candidates:
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all, as arrays."""
+        seen, expected, missed, shown, evidence = self.detections
         waiting = [(i, scan) for i, scans in self.waiting.items() for scan in scans]
         found = {
             **vars(self),
@@ -365,11 +381,11 @@ class Candidates:
             "waiting": waiting,
             "density": self.density[:4],
             "unexplained": self.density.cells,
-            "detected": self.detections.seen,
-            "expected": self.detections.expected,
-            "missed": list(self.detections.missed.items()),
-            "shown": list(self.detections.shown.items()),
-            "lost": self.detections[4:],
+            "detected": seen,
+            "expected": expected,
+            "missed": list(missed.items()),
+            "shown": list(shown.items()),
+            "lost": evidence,
         }
         return saved_states.write(found, CANDIDATES)
 
@@ -402,18 +418,18 @@ class Candidates:
             raise ValueError("state['tentative.missed'] must be probabilities")
         shown = dict(saved["shown"].tolist())
         lost, most_lost, first_new, surest, unknown = saved["lost"].tolist()
-        if min(lost, first_new, surest, unknown) < 0 or lost > most_lost:
+        evidence = LostEvidence(lost, most_lost, int(first_new), surest, int(unknown))
+        if min(evidence) < 0 or lost > most_lost:
             raise ValueError(
                 "state['tentative.lost'] must be >= 0, the first at most the second"
             )
-        evidence = lost, most_lost, int(first_new), surest, int(unknown)
         return cls(
             TentativeLandmarks(*(saved[key] for key in TENTATIVE)),
             waiting,
             int(saved["next_id"]),
             int(saved["scan"]),
             UnexplainedDensity(*density.tolist())._replace(cells=saved["unexplained"]),
-            Detections(seen, expected, missed, shown, *evidence),
+            Detections(seen, expected, missed, shown, evidence),
         )
 
 

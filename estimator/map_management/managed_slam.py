@@ -152,8 +152,8 @@ class ManagedSlam:
 
     @property
     def lost_score(self) -> float:
-        """Evidence that the run is lost, see `Detections` [-]; 0 at the start."""
-        return self.candidates.detections.most_lost
+        """Evidence that the run is lost, see `LostEvidence` [-]; 0 at the start."""
+        return self.candidates.detections.evidence.largest
 
     @property
     def probably_lost(self) -> bool:

@@ -23,6 +23,7 @@ from slamgym.estimator.association.scan_association import (
     SUREST,
     WIDEST,
     Detections,
+    LostEvidence,
 )
 from slamgym.estimator.interface import MapView
 from slamgym.estimator.map_management.hypotheses import Hypothesis
@@ -62,7 +63,7 @@ def plain_count(view, slots, explained, detections):
     shares = (seen + 2 * np.minimum(sector[:, None], ring)) / (tries + 2)
     shares = np.minimum(shares, SUREST)
     cost, missed, fewer = 0.0, {}, 0.0
-    after = Detections(seen.copy(), tries.copy(), missed, {})
+    after = Detections(seen.copy(), tries.copy(), missed, {}, LostEvidence())
     for j, (bearing, distance) in enumerate(expected):
         std = np.sqrt(np.diagonal(joint)[2 * j : 2 * j + 2])
         middle = np.array([bearing + np.pi, distance])
@@ -73,7 +74,9 @@ def plain_count(view, slots, explained, detections):
         if is_sure:
             after.expected[a % SECTORS, b] += 1
             after.seen[a % SECTORS, b] += j in slots
-        is_telling = detections.shown.get(j, 0) >= PROVEN and j < detections.first_new
+        is_telling = (
+            detections.shown.get(j, 0) >= PROVEN and j < detections.evidence.first_new
+        )
         if is_sure and is_telling and j in slots:
             fewer += np.log(FEWER)
         if j in slots or distance - 2 * std[1] >= LONGEST:
@@ -92,10 +95,11 @@ def plain_count(view, slots, explained, detections):
             (HIDDEN + (1 - HIDDEN) * left) / (HIDDEN + (1 - HIDDEN) * before)
         )
         missed[j] = left
-    lost = max(0.0, detections.lost + min(fewer, MOST_OF_SCAN))
-    most_lost = max(lost, detections.most_lost)
-    first_new = max(detections.first_new, 0 if lost > 0 else len(view.ids))
-    return cost, after._replace(lost=lost, most_lost=most_lost, first_new=first_new)
+    before = detections.evidence
+    lost = max(0.0, before.present + min(fewer, MOST_OF_SCAN))
+    most_lost = max(lost, before.largest)
+    first_new = max(before.first_new, 0 if lost > 0 else len(view.ids))
+    return cost, after._replace(evidence=LostEvidence(lost, most_lost, first_new))
 
 
 def test_missed_landmarks_cost_what_the_dense_equations_say():
@@ -110,15 +114,13 @@ def test_missed_landmarks_cost_what_the_dense_equations_say():
         known = counts.min(axis=0), counts.max(axis=0), earlier
         shown = {j: j % 4 for j in range(7)}
         first_new = int(rng.integers(5, 12))
-        before = Detections(*known, shown, 2.0, 4.0, first_new)
+        before = Detections(*known, shown, LostEvidence(2.0, 4.0, first_new))
         explained = rng.permutation(8)[: rng.integers(4)]
         cost, after = before.after(view, slots, explained, LONGEST)
         expected_cost, expected = plain_count(view, slots, explained, before)
         assert cost == pytest.approx(expected_cost, rel=1e-9)
-        assert after.lost == pytest.approx(expected.lost, rel=1e-9)
-        assert after.most_lost == pytest.approx(expected.most_lost, rel=1e-9)
-        assert after.first_new == expected.first_new
-        evidence.append(after.lost - before.lost)
+        assert after.evidence == pytest.approx(expected.evidence, rel=1e-9)
+        evidence.append(after.evidence.present - before.evidence.present)
         more = {j: min(shown.get(j, 0) + (j in slots), PROVEN) for j in range(8)}
         assert after.shown == more
         np.testing.assert_array_equal(after.seen, expected.seen)
@@ -261,7 +263,7 @@ def test_a_landmark_of_clutter_raises_no_alarm():
     detections = Detections.none()
     for slot in [[0]] * 80:  # landmark 1 is never shown
         _, detections = detections.after(view, np.array(slot), NONE, LONGEST)
-    assert detections.most_lost == 0
+    assert detections.evidence.largest == 0
 
 
 def after_scans(places, scans):
@@ -274,35 +276,43 @@ def after_scans(places, scans):
         rows = np.array(slots, np.int64), np.array(explained, np.int64)
         for _ in range(times):
             _, detections = detections.after(view, *rows, LONGEST)
-    return detections
+    return detections.evidence
 
 
 def test_a_landmark_beside_a_reading_is_not_missed():
     places = [(3.31, 0.66)]  # amid a cell
     seen = ((0,), [0], [0], 40)
-    assert after_scans(places, [seen, ((0,), [-1], [], 5)]).lost > 2
-    assert after_scans(places, [seen, ((0,), [-1], [0], 5)]).lost == 0
+    assert after_scans(places, [seen, ((0,), [-1], [], 5)]).present > 2
+    assert after_scans(places, [seen, ((0,), [-1], [0], 5)]).present == 0
 
 
 def test_landmarks_that_a_lost_run_maps_anew_do_not_clear_it():
     places = [(3.31, 0.66), (3.31, -0.66)]
     lost = [((0,), [0], [0], 40), ((0,), [-1], [], 3)]
-    evidence = after_scans(places, lost).lost
+    evidence = after_scans(places, lost).present
     anew = after_scans(places, [*lost, ((0, 1), [1], [0, 1], 20)])
-    assert anew.lost == evidence > 0
+    assert anew.present == evidence > 0
     again = after_scans(places, [*lost, ((0, 1), [0], [0], 20)])
-    assert (again.lost, again.first_new) == (0, 2)
+    assert (again.present, again.first_new) == (0, 2)
+
+
+def test_a_mapped_landmark_outside_the_view_is_not_newer_than_the_view():
+    mean = np.array([0, 0, 0, 3.31, 0.66])
+    view = MapView(mean, 1e-6 * np.eye(5), (0,), whole=(0, 5))
+    _, after = Detections.none().after(view, np.array([0]), NONE, LONGEST)
+    assert after.evidence.first_new == 6
 
 
 def test_a_landmark_at_the_edge_of_the_view_is_no_evidence():
     expected = np.full((SECTORS, RINGS), 30.0)
     seen = np.where(np.arange(RINGS) < 4, expected, 0.0)
-    before = Detections(seen, expected, {}, {0: PROVEN}, first_new=1)
+    before = Detections(seen, expected, {}, {0: PROVEN}, LostEvidence(first_new=1))
     evidence = []
     for ring in (3.4, 3.6):
         mean = np.array([0, 0, 0, ring * LONGEST / RINGS, 0.5])
         view = MapView(mean, 1e-6 * np.eye(5), (0,))
-        evidence.append(before.after(view, np.array([-1]), NONE, LONGEST)[1].lost)
+        _, after = before.after(view, np.array([-1]), NONE, LONGEST)
+        evidence.append(after.evidence.present)
     assert evidence[0] > 2
     assert evidence[1] < 0.1
 
@@ -312,34 +322,34 @@ def test_the_alarm_stays_once_the_map_is_seen_again():
     detections, scores = Detections.none(), []
     for slot in [0] * 40 + [-1] * 8 + [0] * 40:
         _, detections = detections.after(view, np.array([slot]), NONE, LONGEST)
-        scores.append(detections.lost)
+        scores.append(detections.evidence.present)
     assert scores[39] == scores[-1] == 0
     assert scores[47] > LOST_SCORE
-    assert detections.most_lost == max(scores)
+    assert detections.evidence.largest == max(scores)
 
 
 def with_headings(stds, ids=(7,)):
     """Return the evidence after scans that leave these deviations of the heading."""
-    detections = Detections.none()
+    evidence = LostEvidence()
     for std in stds:
         view = MapView(np.zeros(5), std**2 * np.eye(5), ids)
-        detections = detections.with_heading(view)
-    return detections
+        evidence = evidence.with_heading(view)
+    return evidence
 
 
 def test_a_heading_that_stays_unknown_is_evidence_of_a_lost_run():
-    assert with_headings([0.1, 1.0, 1.0]).most_lost <= LOST_SCORE
-    assert with_headings([0.1, 1.0, 1.0, 1.0, 0.1]).most_lost > LOST_SCORE
-    assert with_headings([0.1, 1.0, 1.0, 0.8, 1.0, 1.0]).most_lost <= LOST_SCORE
+    assert with_headings([0.1, 1.0, 1.0]).largest <= LOST_SCORE
+    assert with_headings([0.1, 1.0, 1.0, 1.0, 0.1]).largest > LOST_SCORE
+    assert with_headings([0.1, 1.0, 1.0, 0.8, 1.0, 1.0]).largest <= LOST_SCORE
 
 
 @pytest.mark.parametrize("std", [1.6, np.pi, 10.0])
 def test_a_heading_that_is_unknown_from_the_start_is_no_evidence(std):
-    assert with_headings([std, std, std + 1, std + 1, std + 1]).most_lost == 0
+    assert with_headings([std, std, std + 1, std + 1, std + 1]).largest == 0
 
 
 def test_a_heading_is_no_evidence_before_there_is_a_map():
-    assert with_headings([0.1, 2.0, 2.0, 2.0, 2.0], ids=()).most_lost == 0
+    assert with_headings([0.1, 2.0, 2.0, 2.0, 2.0], ids=()).largest == 0
 
 
 @pytest.mark.parametrize("association", ["joint", "hypotheses"])
