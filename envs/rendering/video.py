@@ -22,6 +22,8 @@ def check_video(path: str | Path, fps: float = 30.0) -> None:
         For a suffix other than .gif and .mp4, or an fps that is not positive.
     ImportError
         For .mp4 without imageio-ffmpeg.
+    FileNotFoundError
+        If the folder does not exist.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in (".gif", ".mp4"):
@@ -30,6 +32,8 @@ def check_video(path: str | Path, fps: float = 30.0) -> None:
         raise ValueError(f"fps must be a finite number > 0, got {fps}")
     if suffix == ".mp4":
         _import_ffmpeg()
+    if not Path(path).absolute().parent.is_dir():
+        raise FileNotFoundError(f"the folder of {path} does not exist")
 
 
 def write_video(

@@ -79,12 +79,13 @@ def test_failure_leaves_the_former_file_and_nothing_else(tmp_path, suffix):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def never():
+    pytest.fail("a frame was made")
+    yield
+
+
 @pytest.mark.parametrize("name", ["run.avi", "run", "gif"])
 def test_unknown_suffix_is_refused_before_any_frame_is_made(tmp_path, name):
-    def never():
-        pytest.fail("a frame was made")
-        yield
-
     with pytest.raises(ValueError, match=r"file must end in \.gif or \.mp4, got"):
         write_video(never(), tmp_path / name)
 
@@ -116,6 +117,6 @@ def test_fps_must_be_positive(tmp_path, fps):
         write_video(moving_square(), tmp_path / "run.gif", fps=fps)
 
 
-def test_missing_folder_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="nowhere"):
-        write_video(moving_square(), tmp_path / "nowhere" / "run.gif")
+def test_missing_folder_is_named_before_any_frame_is_made(tmp_path):
+    with pytest.raises(FileNotFoundError, match="the folder of .*nowhere"):
+        write_video(never(), tmp_path / "nowhere" / "run.gif")
