@@ -118,5 +118,5 @@ def test_fps_must_be_positive(tmp_path, fps):
 
 
 def test_missing_folder_is_named_before_any_frame_is_made(tmp_path):
-    with pytest.raises(FileNotFoundError, match="the folder of .*nowhere"):
+    with pytest.raises(FileNotFoundError, match=r"the folder of .*nowhere"):
         write_video(never(), tmp_path / "nowhere" / "run.gif")
