@@ -22,9 +22,10 @@ from ..kernels.assignment_search import (
     fill_distances,
     fill_expected,
     largest_change,
+    reading_covariance,
     search_assignments,
 )
-from ..models.bearing_range import wrap_angle, wrap_angle_jit
+from ..models.bearing_range import reading_slopes_jit, wrap_angle, wrap_angle_jit
 from ..support import argument_checks
 
 #: Assignments of a scan e^8 times less likely than the best one are not considered.
@@ -423,15 +424,8 @@ def _compare(
                 continue
             if not is_complete:  # what the readings share, for few landmarks only
                 is_complete = True
-                xy = P[0, 1] + P[c, c + 1] - P[0, c + 1] - P[1, c]
-                gx, gy = P[2, c] - P[2, 0], P[2, c + 1] - P[2, 1]
-                ex, ey = dx / distance, dy / distance
-                ax, ay = -ey / distance, ex / distance
-                s_rr = ex * ex * xx + 2 * ex * ey * xy + ey * ey * yy
-                s_br = ax * ex * xx + (ax * ey + ay * ex) * xy + ay * ey * yy
-                s_br -= ex * gx + ey * gy
-                s_bb = ax * ax * xx + 2 * ax * ay * xy + ay * ay * yy
-                s_bb += P[2, 2] - 2 * (ax * gx + ay * gy)
+                slopes = reading_slopes_jit(dx, dy)
+                s_bb, s_br, s_rr = reading_covariance(P, c, slopes)
                 bearing = np.arctan2(dy, dx) - heading
             nu_b = wrap_angle_jit(readings[k, 0] - bearing)
             q = likely_variances_jit(noise, readings[k, 1], distance, s_rr)

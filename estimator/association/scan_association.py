@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit
 from ..interface import MapView
+from ..kernels.assignment_search import reading_covariance
 from ..models.bearing_range import (
     expected_reading_jit,
     reading_slopes_jit,
@@ -556,15 +557,7 @@ def _place_in_scan(mean: Array, P: Array, j: int) -> Place:
     c = 3 + 2 * j
     dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
     bearing, distance = expected_reading_jit(dx, dy, mean[2])
-    slopes = reading_slopes_jit(dx, dy)
-    xx = P[0, 0] + P[c, c] - 2 * P[0, c]
-    yy = P[1, 1] + P[c + 1, c + 1] - 2 * P[1, c + 1]
-    xy = P[0, 1] + P[c, c + 1] - P[0, c + 1] - P[1, c]
-    gx, gy = P[2, c] - P[2, 0], P[2, c + 1] - P[2, 1]
-    x, y = slopes[2], slopes[3]
-    aside = x * x * xx + 2 * x * y * xy + y * y * yy
-    x, y = slopes[0], slopes[1]
-    turn = x * x * xx + 2 * x * y * xy + y * y * yy + P[2, 2] - 2 * (x * gx + y * gy)
+    turn, _, aside = reading_covariance(P, c, reading_slopes_jit(dx, dy))
     std = np.sqrt(max(turn, 0.0)), np.sqrt(max(aside, 0.0))
     return wrap_angle_jit(bearing) + np.pi, distance, 2 * std[0], 2 * std[1]
 
