@@ -126,10 +126,6 @@ def cost_of(report: UpdateReport) -> float:
     return report.nis + 2 * float(np.log(report.innovation_factor.diagonal()).sum())
 
 
-def _the_plan(plan: ScanAssociation) -> ScanAssociation:
-    return plan
-
-
 class HypothesisSlam:
     """A managed filter that follows several associations side by side.
 
@@ -234,16 +230,8 @@ class HypothesisSlam:
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], dt multiplies its noise variance."""
         motion = argument_checks.pair("odometry", odometry)
-        slams = [hypothesis.slam for hypothesis in self.hypotheses]
-        begun, steps = [slam.steps for slam in slams], self.steps + 1
-
-        def finish() -> None:
-            for slam, before in zip(slams, begun, strict=True):
-                if slam.steps == before:
-                    slam.predict(motion, dt)
-            self.steps = steps
-
-        self._carry_out(finish, slams)
+        slams = self._slams
+        self._carry_out(slams, lambda k: slams[k].predict(motion, dt), lambda: None)
 
     def observe_pose(
         self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
@@ -255,25 +243,18 @@ class HypothesisSlam:
         `EkfSlam.observe_pose`.
         """
         given = PoseReading.checked(reading, matrix, covariance)
-        before, steps = self.hypotheses, self.steps + 1
-        slams = [h.slam for h in before]
-        begun = [slam.steps for slam in slams]
+        before, slams = self.hypotheses, self._slams
 
-        def finish() -> UpdateReport:
-            for slam, count in zip(slams, begun, strict=True):
-                if slam.steps == count:
-                    slam.observe_pose(*given)
+        def then() -> UpdateReport:
             reports = [slam.report() or UpdateReport() for slam in slams]
-            costs = [h.cost + cost_of(r) for h, r in zip(before, reports, strict=True)]
-            if not reports[0].degrees_of_freedom:
-                costs = [h.cost for h in before]
+            costs = [h.cost for h in before]
+            if reports[0].degrees_of_freedom:
+                pairs = zip(costs, reports, strict=True)
+                costs = [cost + cost_of(report) for cost, report in pairs]
             order = np.argsort(costs, kind="stable").tolist()
-            least = costs[order[0]]
-            self._keep([Hypothesis(costs[k] - least, slams[k]) for k in order])
-            self._report, self.steps = reports[order[0]], steps
-            return self._report
+            return self._take_over([Hypothesis(costs[k], slams[k]) for k in order])
 
-        return self._carry_out(finish, slams)
+        return self._carry_out(slams, lambda k: slams[k].observe_pose(*given), then)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -317,28 +298,53 @@ class HypothesisSlam:
         slams: Sequence[ManagedSlam],
     ) -> UpdateReport:
         """Update filters by their associations, and continue with the best of them."""
-        begun, steps = [slam.steps for slam in slams], self.steps + 1
-        taken: tuple[UpdateReport, list[Hypothesis]] | None = None
+        errors: dict[int, Exception] = {}
+        before = self._slams
 
-        def finish() -> UpdateReport:
-            nonlocal taken
-            if taken is None:
-                branches = zip(costs, plans, slams, begun, strict=True)
-                taken = self._advance(readings, branches)
-            self._report, hypotheses = taken
-            least = hypotheses[0].cost
-            kept = [Hypothesis(h.cost - least, h.slam) for h in hypotheses]
-            self._keep(kept, slams)
-            self.steps = steps
-            return self._report
+        def take(k: int) -> None:
+            try:
+                slams[k].take(readings, lambda: plans[k])
+            except (np.linalg.LinAlgError, MemoryError) as error:
+                errors[k] = error
 
-        return self._carry_out(finish, slams)
+        def then() -> UpdateReport:
+            branches = enumerate(zip(costs, slams, strict=True))
+            kept = [Hypothesis(c, slam) for k, (c, slam) in branches if k not in errors]
+            if not kept:
+                raise errors[0]
+            return self._take_over(distinct(kept, self._policy.hypotheses))
+
+        report = self._carry_out(slams, take, then)
+        self._keep(self.hypotheses, [*before, *slams])
+        return report
+
+    def _take_over(self, hypotheses: list[Hypothesis]) -> UpdateReport:
+        """Continue with hypotheses, the best first; return the report of this one."""
+        least = hypotheses[0].cost
+        self.hypotheses = [Hypothesis(h.cost - least, h.slam) for h in hypotheses]
+        self._report = self.best.report() or UpdateReport()
+        return self._report
 
     def _carry_out(
-        self, finish: Callable[[], Answer], slams: Sequence[ManagedSlam]
+        self,
+        slams: Sequence[ManagedSlam],
+        step: Callable[[int], object],
+        then: Callable[[], Answer],
     ) -> Answer:
-        """Return the result of a function that continues where it was interrupted."""
-        begun = [slam.steps for slam in slams]
+        """Take one step with each of some filters; return what follows from all steps.
+
+        An interrupt finds no filter moved, or lets the others follow.
+        """
+        begun, steps = [slam.steps for slam in slams], self.steps + 1
+
+        def finish() -> Answer:
+            for k, slam in enumerate(slams):
+                if slam.steps == begun[k]:
+                    step(k)
+            answer = then()
+            self.steps = steps
+            return answer
+
         try:
             return finish()
         except BaseException:
@@ -437,41 +443,25 @@ class HypothesisSlam:
 
     def _branches(self, origins: Sequence[int]) -> list[ManagedSlam]:
         """Return a filter for each option, copied where a hypothesis splits."""
-        slams = [self.hypotheses[k].slam for k in origins]
-        first = [k not in origins[:n] for n, k in enumerate(origins)]
-        return [
-            slam if is_first else self._pool.copy(slam)
-            for slam, is_first in zip(slams, first, strict=True)
-        ]
+        slams: list[ManagedSlam] = []
+        for k in origins:
+            slam = self.hypotheses[k].slam
+            slams.append(self._pool.copy(slam) if slam in slams else slam)
+        return slams
 
-    def _advance(
-        self,
-        readings: Array,
-        branches: Iterable[tuple[float, ScanAssociation, ManagedSlam, int]],
-    ) -> tuple[UpdateReport, list[Hypothesis]]:
-        """Update the filters that have not taken a step since; drop those that fail."""
-        reports, kept, errors = [], [], []
-        for cost, plan, slam, steps in branches:
-            try:
-                if slam.steps == steps:
-                    slam.take(readings, partial(_the_plan, plan))
-                reports.append(slam.report() or UpdateReport())
-                kept.append(Hypothesis(cost, slam))
-            except (np.linalg.LinAlgError, MemoryError) as error:
-                errors.append(error)
-        if not kept:
-            raise errors[0]
-        return reports[0], distinct(kept, self._policy.hypotheses)
+    @property
+    def _slams(self) -> list[ManagedSlam]:
+        return [hypothesis.slam for hypothesis in self.hypotheses]
 
     def _keep(
         self, hypotheses: list[Hypothesis], others: Sequence[ManagedSlam] = ()
     ) -> None:
         """Continue with these hypotheses, and reuse all other filters."""
-        slams = [*(h.slam for h in self.hypotheses), *others]
-        known = {id(slam): slam for slam in slams}
-        kept = {id(h.slam) for h in hypotheses}
-        self._pool.free(slam for key, slam in known.items() if key not in kept)
+        slams = {id(slam): slam for slam in (*self._slams, *others)}
         self.hypotheses = hypotheses
+        for slam in self._slams:
+            slams.pop(id(slam), None)
+        self._pool.free(slams.values())
 
     def __repr__(self) -> str:
         count = len(self.hypotheses)
