@@ -175,7 +175,7 @@ class TentativeLandmarks(NamedTuple):
         """Return some of them."""
         if which.all():
             return self
-        return TentativeLandmarks._make(part[which] for part in self)
+        return self._replace(**{k: part[which] for k, part in self._asdict().items()})
 
 
 class UnexplainedDensity(NamedTuple):

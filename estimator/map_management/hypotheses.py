@@ -35,6 +35,7 @@ from ..support.undo import (
     undone_on_error,
 )
 from .managed_slam import ManagedSlam
+from .map_editor import is_near
 from .policy import LandmarkPolicy, as_policy
 
 #: Cost, the hypothesis that it continues, and what completes the association.
@@ -88,14 +89,16 @@ def distinct(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
     """
     if len(hypotheses) == 1:
         return [*hypotheses]
-    chosen: list[int] = []
-    near = _overlaps([h.slam.map_view() for h in hypotheses])
-    for k, hypothesis in enumerate(hypotheses):
+    views = [h.slam.map_view() for h in hypotheses]
+    labels = [h.slam.candidates.tentative.labels for h in hypotheses]
+    near, chosen = _overlaps(views), list[int]()
+    for k, view in enumerate(views):
         if (
             len(chosen) < most
             and near[k, chosen].sum() < PER_BASIN
             and not any(
-                hypotheses[n].slam.resembles(hypothesis.slam, SAME) for n in chosen
+                np.array_equal(labels[n], labels[k]) and is_near(views[n], view, SAME)
+                for n in chosen
             )
         ):
             chosen.append(k)

@@ -47,7 +47,7 @@ from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
-from .map_editor import MapEditor, is_near
+from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy
 from .pruning import MapPruner
 from .recent_scans import RecentScan, RecentScans
@@ -187,7 +187,7 @@ class ManagedSlam:
         def follow(_: object) -> None:
             self._editor.expire()
             self.candidates = candidates
-            self._recent.note_motion(*reading, dt)
+            self._recent.note_motions((*reading, dt))
             self.steps += 1
 
         step = partial(self._filter.predict, reading, dt)
@@ -242,7 +242,7 @@ class ManagedSlam:
 
         def follow(report: UpdateReport) -> UpdateReport:
             self._editor.expire()
-            self._recent.note_pose(given)
+            self._recent.note_motions(*given.rows())
             self._report = report
             self.steps += 1
             return report
@@ -266,12 +266,6 @@ class ManagedSlam:
         argument_checks.refuse_not_finite(readings)
         known, view = self.candidates, self._pruner.view_for(readings)
         return associate(self._policy, known, readings, view, self._sensor, ceiling)
-
-    def resembles(self, other: ManagedSlam, tolerance: float) -> bool:
-        """Return whether another run has the same landmarks, and nearly their means."""
-        labels, others = (s.candidates.tentative.labels for s in (self, other))
-        views = self._editor.map_view(), other._editor.map_view()
-        return np.array_equal(labels, others) and is_near(*views, tolerance)
 
     def take(
         self, readings: Array, associate: Callable[[], ScanAssociation]
@@ -360,15 +354,20 @@ class ManagedSlam:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the filter's state and the records of landmarks, as arrays."""
-        return self._remembered() | with_prefix("filter", self._filter.state_dict())
+        return {
+            "estimator": np.array(type(self).__name__),
+            **with_prefix("landmarks", self._pruner.records.state_dict()),
+            **with_prefix("tentative", self.candidates.state_dict()),
+            **with_prefix("recent", self._recent.state_dict()),
+            **with_prefix("filter", self._filter.state_dict()),
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit under the same settings.
 
         An error leaves all as before.
         """
-        entries = [k for k in self._remembered() if k.count(".") < 2]
-        saved_states.refuse_other_state(state, entries, estimator=type(self).__name__)
+        saved_states.refuse_other_state(state, (), estimator=type(self).__name__)
         candidates = Candidates.from_state_dict(without_prefix(state, "tentative"))
         with undone_on_error(self.bookmark()):
             self._pruner.records.load_state_dict(without_prefix(state, "landmarks"))
@@ -404,15 +403,6 @@ class ManagedSlam:
         self._pruner.records.restore(records)
         self._recent.restore(recent)
         self._editor.expire()
-
-    def _remembered(self) -> dict[str, Any]:
-        """Return all of the state except the filter's."""
-        return {
-            "estimator": np.array(type(self).__name__),
-            **with_prefix("landmarks", self._pruner.records.state_dict()),
-            **with_prefix("tentative", self.candidates.state_dict()),
-            **with_prefix("recent", self._recent.state_dict()),
-        }
 
     def __repr__(self) -> str:
         return f"Managed {self._filter!r}"

@@ -10,13 +10,12 @@ of another landmark: they are dropped, and the scans are repeated once more.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...arrays import Array, IntArray
+from ...arrays import Array
 from ...restorable import Restorable
 from ..association.scan_association import LABEL_BITS, NO_LABEL, ScanAssociation
 from ..filters.conditioning import PoseReading
@@ -82,52 +81,50 @@ class RecentScans(Restorable):
 
         return undo
 
-    def note_motion(self, distance: float, turn: float, dt: float) -> None:
-        """Remember a motion since the last scan."""
+    def note_motions(self, *motions: Motion) -> None:
+        """Remember odometry since the last scan, or rows of a reading of the pose."""
         if self._window:
-            self.motions += ((distance, turn, dt),)
-
-    def note_pose(self, reading: PoseReading) -> None:
-        """Remember a reading of the pose since the last scan."""
-        if self._window:
-            self.motions += tuple(reading.rows())
+            self.motions += motions
 
     def note_edits(
         self, removed: Sequence[int], merged: Sequence[tuple[int, int]]
     ) -> None:
         """Remember which landmarks were removed and merged after the last scan."""
-        if self.decisions and (removed or merged):
-            made = self.decisions[-1]
-            self.decisions[-1] = made._replace(
-                removed=(*made.removed, *removed), merged=(*made.merged, *merged)
-            )
-        if self.scans and (removed or merged):
-            last = self.scans[-1]
-            self.scans[-1] = replace(
-                last, removed=(*last.removed, *removed), merged=(*last.merged, *merged)
-            )
+        noted: tuple[list[Any], ...] = self.decisions, self.scans
+        for scans in noted:
+            if scans and (removed or merged):
+                last = scans[-1]
+                scans[-1] = last._replace(
+                    removed=(*last.removed, *removed), merged=(*last.merged, *merged)
+                )
 
     def with_scan(
         self, readings: Array, plan: ScanAssociation
     ) -> tuple[list[RecentScan], int | None]:
         """Return the last scans with a new one, and the first to repeat, if any."""
-        row_ids, labels = tuple(plan.row_ids), tuple(plan.labels)
         kept = readings.copy()  # the caller may reuse the array
-        scan = RecentScan(plan.scan, self.motions, kept, row_ids, labels)
+        decided = tuple(plan.row_ids), tuple(plan.labels)
+        scan = RecentScan(plan.scan, self.motions, kept, *decided)
         if not self._window:
             return [scan], None
         if scan.begins:
-            scan = replace(scan, before=self._slam.state_dict())
+            scan = scan._replace(before=self._slam.state_dict())
         scans = [*self.scans, scan][-self._window - 1 :]
         return scans, _relabel(scans, plan.confirmed)
 
     def feed(
         self, scans: list[RecentScan], first: int | None, plan: ScanAssociation
     ) -> UpdateReport:
-        """Update the filter with the last scan, and with earlier sightings if any."""
+        """Update the filter with the last scan, and with earlier sightings if any.
+
+        The scans are repeated until no sighting contradicts those before it.
+        """
         if first is None:
             return scans[-1].feed(self._slam)
-        return self._apply_earlier(scans, first, {*plan.confirmed})
+        reports = self._repeat(scans, first)
+        while _drop_contradicted(scans, reports, {*plan.confirmed}, self._gate):
+            reports = self._repeat(scans, first)
+        return reports[-1]
 
     def note_scan(
         self,
@@ -154,15 +151,6 @@ class RecentScans(Restorable):
                 ids = tuple(new if label != NO_LABEL else i for i, new, label in pairs)
                 self.decisions[place] = made._replace(row_ids=ids)
 
-    def _apply_earlier(
-        self, scans: list[RecentScan], first: int, confirmed: set[int]
-    ) -> UpdateReport:
-        """Repeat the scans since one until no sighting contradicts those before it."""
-        reports = self._repeat(scans, first)
-        while _drop_contradicted(scans, reports, confirmed, self._gate):
-            reports = self._repeat(scans, first)
-        return reports[-1]
-
     def _repeat(self, scans: list[RecentScan], first: int) -> list[UpdateReport]:
         """Repeat the scans since one, and renew the states kept before them."""
         before = scans[first].before
@@ -174,7 +162,7 @@ class RecentScans(Restorable):
             scans[k - 1].edit(self._editor)
             move(self._slam, scans[k].motions)
             if scans[k].before is not None:
-                scans[k] = replace(scans[k], before=self._slam.state_dict())
+                scans[k] = scans[k]._replace(before=self._slam.state_dict())
             reports.append(scans[k].feed(self._slam))
         return reports
 
@@ -199,7 +187,7 @@ class RecentScans(Restorable):
             RecentScan.from_state_dict(without_prefix(state, str(k)))
             for k in range(count)
         ]
-        self.motions = rows_of(saved["motions"])
+        self.motions = _as_tuples(saved["motions"].tolist())
         self.decisions = []
 
 
@@ -239,7 +227,7 @@ def _relabel(scans: list[RecentScan], confirmed: Mapping[int, int]) -> int | Non
     for k in range(shown[0], len(scans) - 1):
         pairs = zip(scans[k].row_ids, scans[k].labels, strict=True)
         ids = tuple(names.get(label, i) for i, label in pairs)
-        scans[k] = replace(scans[k], row_ids=ids)
+        scans[k] = scans[k]._replace(row_ids=ids)
     return shown[0]
 
 
@@ -310,8 +298,7 @@ def move(slam: Any, motions: Sequence[Motion]) -> None:
             slam.observe_pose(*PoseReading.of_rows([*islice(rows, int(1 - 2 * dt))]))
 
 
-@dataclass(frozen=True)
-class RecentScan:
+class RecentScan(NamedTuple):
     """One scan, the motion before it, and its association."""
 
     number: int
@@ -351,7 +338,7 @@ class RecentScan:
         row = self.row_ids.index(landmark_id)
         row_ids, labels = list(self.row_ids), list(self.labels)
         row_ids[row], labels[row] = None, NO_LABEL
-        return replace(self, row_ids=tuple(row_ids), labels=tuple(labels))
+        return self._replace(row_ids=tuple(row_ids), labels=tuple(labels))
 
     def edit(self, editor: MapEditor) -> None:
         """Remove and merge landmarks as after the scan."""
@@ -363,24 +350,18 @@ class RecentScan:
     def state_dict(self) -> dict[str, Any]:
         """Return all as arrays."""
         row_ids = [NO_LANDMARK if i is None else i for i in self.row_ids]
-        saved = saved_states.write(vars(self) | {"row_ids": row_ids}, SCAN)
+        saved = saved_states.write(self._asdict() | {"row_ids": row_ids}, SCAN)
         return saved | with_prefix("before", self.before or {})
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any]) -> RecentScan:
         """Restore what :meth:`state_dict` returned."""
         saved = saved_states.read(state, SCAN)
-        row_ids = saved["row_ids"].tolist()
-        return cls(
-            int(saved["number"]),
-            rows_of(saved["motions"]),
-            saved["readings"],
-            tuple(None if i == NO_LANDMARK else i for i in row_ids),
-            tuple(saved["labels"].tolist()),
-            without_prefix(state, "before") or None,
-            tuple(saved["removed"].tolist()),
-            rows_of(saved["merged"]),
-        )
+        found = {key: _as_tuples(array.tolist()) for key, array in saved.items()}
+        row_ids = tuple(None if i == NO_LANDMARK else i for i in found["row_ids"])
+        before = without_prefix(state, "before") or None
+        kept = {"readings": saved["readings"], "row_ids": row_ids, "before": before}
+        return cls(**found | kept)
 
 
 def _groups(pairs: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:
@@ -402,6 +383,6 @@ def _groups(pairs: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:
     return groups
 
 
-def rows_of(array: Array | IntArray) -> tuple[Any, ...]:
-    """Return the rows of an array as tuples."""
-    return tuple(map(tuple, array.tolist()))
+def _as_tuples(numbers: Any) -> Any:
+    """Return lists of numbers as tuples."""
+    return tuple(map(_as_tuples, numbers)) if isinstance(numbers, list) else numbers

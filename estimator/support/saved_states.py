@@ -64,7 +64,7 @@ def read(
     Traceback (most recent call last):
     ValueError: state['mean'] must have shape (5,), got shape (4,)
     """
-    refuse_other_state(state, table, **(of or {}))
+    refuse_other_state(state, table, prefix, **(of or {}))
     found = {}
     for key, (kind, *shape) in table.items():
         lengths = tuple(_length(size, sizes) for size in shape)
@@ -96,14 +96,18 @@ def _length(size: Size, known: Mapping[str, int]) -> int:
 
 
 def refuse_other_state(
-    state: Mapping[str, Any], entries: Iterable[str], **classes: str
+    state: Mapping[str, Any], entries: Iterable[str], prefix: str = "", **classes: str
 ) -> None:
-    """Refuse a saved state that lacks an entry, or is of other classes than these."""
+    """Refuse a saved state that lacks an entry, or is of other classes than these.
+
+    The prefix precedes the keys in the message.
+    """
     if not isinstance(state, Mapping):
         raise ValueError(f"state must be a mapping, got {state!r}")
     for key in (*classes, *entries):
         if key not in state:
-            raise ValueError(f"state must hold {key!r}, got {sorted(map(str, state))}")
+            held = sorted(map(str, state))
+            raise ValueError(f"state must hold {prefix + key!r}, got {held}")
     for key, name in classes.items():
         if str(state[key]) != name:
             raise ValueError(f"state is of {state[key]}, not of {name}")
