@@ -410,7 +410,7 @@ class Explorers(Restorable):
         """
         task, beliefs = self._task, self._filters.storage()
         error = map_rmse if self._record is None else matched_rmse
-        success, rmse = task.outcome.success.copy(), error(beliefs, landmarks)
+        success, rmse = task.outcome.success, error(beliefs, landmarks)
         infos: dict[str, AnyArray] = {
             "mapped": task.mapped,
             "known": task.known,

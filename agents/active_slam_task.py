@@ -102,8 +102,8 @@ class ActiveSlamTask(Restorable):
         Numbers of landmarks in the present map, and of those known accurately.
     """
 
-    changing = ("episodes", "outcome")
-    replaced = ("mapped", "known", "_rows")
+    changing = ("episodes",)
+    replaced = ("outcome", "mapped", "known", "_rows")
 
     def __init__(
         self,
@@ -164,7 +164,7 @@ class ActiveSlamTask(Restorable):
         """Begin episodes in some worlds, (B,), after their first scan."""
         rows = self._rows or self._empty_rows()
         self._rows = {key: row.copy() for key, row in rows.items()}
-        self.outcome.success[worlds] = False
+        self.outcome = self.outcome._replace(success=self.outcome.success & ~worlds)
         self.mapped, self.known = self.mapped.copy(), self.known.copy()
         self._advance(beliefs, worlds, ~worlds)
 

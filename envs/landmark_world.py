@@ -99,9 +99,11 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": _FPS}  # noqa: RUF012
     changing: ClassVar[tuple[str, ...]] = (
-        *("_np_random", "_np_random_seed", "_drawn_scenario", "_sensor", "_starts"),
-        *("_noise", "_landmarks", "_body", "_start_estimate", "_motion_noise"),
-        *("_sensor_noise", "_steps_left", "_renderer", "_key"),
+        *("_np_random", "_body", "_motion_noise", "_sensor_noise", "_renderer"),
+    )
+    replaced = (
+        *("_np_random_seed", "_drawn_scenario", "_sensor", "_starts", "_noise", "_key"),
+        *("_landmarks", "_start_estimate", "_steps_left"),
     )
     _spec: EnvSpec | None = None
 

@@ -59,7 +59,8 @@ class NoiseRows(Restorable, Generic[Row]):
     (0.1, 0.2)
     """
 
-    changing = ("_draw", "_next", "_block", "_to_come")
+    changing = ("_to_come",)
+    replaced = ("_draw", "_next", "_block")
 
     def __init__(
         self, draw: Callable[[IntArray], Iterable[Row]], first: int = 0

@@ -413,13 +413,14 @@ class HypothesisSlam:
     def resume(self, before: tuple[Any, ...]) -> None:
         """Return to a :meth:`snapshot` of a filter with the same settings."""
         kept, self.steps, self._report = before
-        slams = [h.slam for h in self.hypotheses[: len(kept)]]
+        slams = [h.slam for h in self.hypotheses]
         slams += [self._pool.fresh() for _ in kept[len(slams) :]]
         hypotheses = []
-        for (cost, own), slam in zip(kept, slams, strict=True):
+        for (cost, own), slam in zip(kept, slams, strict=False):
             slam.resume(own)
             hypotheses.append(Hypothesis(cost, slam))
-        self._keep(hypotheses)
+        self._pool.free(slams[len(kept) :])
+        self.hypotheses = hypotheses
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""

@@ -254,10 +254,8 @@ class LandmarkRecords(Restorable):
     [7, 9]
     """
 
-    changing = (
-        *("ids", "sightings", "misses", "information", "_slots"),
-        *("apart", "aliases", "doubtful"),
-    )
+    changing = ("sightings", "misses", "information", "apart")
+    replaced = ("ids", "_slots", "aliases", "doubtful")
 
     def __init__(self) -> None:
         self.ids: tuple[int, ...] = ()
@@ -324,7 +322,7 @@ class LandmarkRecords(Restorable):
         self.information[i] += self.information[j]
         self.misses[i] = min(self.misses[i], self.misses[j])
         earlier = {i: kept for i, j in self.aliases.items() if j == gone}
-        self.aliases |= {gone: kept, **earlier}
+        self.aliases = {**self.aliases, gone: kept, **earlier}
         self.apart = {_renamed(pair, gone, kept) for pair in self.apart}
 
     def forget_pairs(self, ids: Sequence[int]) -> None:

@@ -53,7 +53,8 @@ class RecentScans(Restorable):
     of those that need the truth at every step.
     """
 
-    changing = ("scans", "motions", "decisions")
+    changing = ("scans", "decisions")
+    replaced = ("motions",)
 
     def __init__(
         self, slam: SlamEstimator, editor: MapEditor, window: int, gate: float

@@ -28,11 +28,11 @@ class Restorable:
 
     def restore(self, state: State) -> None:
         """Return to a state of this object, which stays usable for further calls."""
-        shared = len(self.changing)
-        for name, value in zip(self.changing, state[:shared], strict=True):
-            if not put_back(getattr(self, name), value):
-                setattr(self, name, copied(value))
-        vars(self).update(zip(self.replaced, state[shared:], strict=True))
+        attributes, values = vars(self), iter(state)
+        for name, value in zip(self.changing, values, strict=False):
+            if not put_back(attributes[name], value):
+                attributes[name] = copied(value)
+        attributes.update(zip(self.replaced, values, strict=True))
 
 
 def copied(value: Any) -> Any:

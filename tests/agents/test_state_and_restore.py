@@ -100,7 +100,8 @@ def test_filters_that_follow_several_hypotheses_return_with_their_world():
 
 def several_in(state):
     """Return the hypotheses in a state of a world that hides identities."""
-    return state[-1][0][0][0][0]
+    explorers = state[ActiveSlamEnv.changing.index("_explorers")]
+    return explorers[0][0][0][0]
 
 
 def test_frames_return_with_their_world():
