@@ -13,23 +13,19 @@ Here readings are stored as (all bearings, all ranges), so that both are contigu
 Every function accepts leading axes for worlds that are simulated together.
 """
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..arrays import Array, BoolArray, ComplexArray, IntArray
+from ..jit import jit
 from ..sim_configs import Scenario
 from ..suggestions import imported
-from .noise_streams import SensorNoise, SensorSettings, largest_noise
-from .robot import wrap_bearings
+from .noise_streams import SensorNoise, SensorSettings
+from .robot import wrapped_bearing
 
-_PI = np.array(np.pi)  # 0-d arrays compare twice as fast as Python floats
-_UNSEEN = np.array(0.0)
 _LAST = np.array(np.inf)  # sorts after every other row
-
-Limit = float | Array | None
 
 
 class AnonymousScan(NamedTuple):
@@ -56,20 +52,12 @@ class BearingRangeSensor:
 
     def __init__(self, scenario: Scenario) -> None:
         sensor = scenario.sensor
-        self._max_range: Limit = _limit(sensor.max_range, above=math.inf)
-        self._half_view: Limit = _limit(sensor.field_of_view / 2, above=math.pi)
-        self._grows = sensor.range_std_per_metre > 0
         self._settings = SensorSettings.of(sensor)
         self._reads_places, self._wraps = _reading_of_places(sensor.kind)
         self._reads_ranges = sensor.kind == "range"
         self._reads_one = sensor.kind in ("bearing", "range")
         faults = scenario.present_faults
-        biases = np.array([faults.bearing_bias, faults.range_bias])
-        self._bias = biases if biases.any() else None
-        largest = largest_noise(faults.sensor_dof) * sensor.std[0]
-        largest += abs(faults.bearing_bias)
-        self._may_wrap = sensor.field_of_view / 2 + largest >= math.pi
-        self._may_wrap &= "bearing" in sensor.kind
+        self._bias = faults.bearing_bias, faults.range_bias
         hides = sensor.occlusion and scenario.walls
         self._sight = LineOfSight(scenario.walls) if hides else None
 
@@ -109,78 +97,98 @@ class BearingRangeSensor:
             Landmarks that the sensor reads.
         """
         error, nearest, _, _ = noise
-        max_range, half_view = self._max_range, self._half_view
-        if settings is not None:
-            max_range, half_view = settings.max_range, settings.field_of_view / 2
         relative = (landmarks - position) * inverse_heading
         readings = np.empty(error.shape)  # without noise at first
+        mask = np.empty(nearest.shape, dtype=np.bool_)
         y, x = relative.imag, relative.real
         if y.ndim > 1:  # contiguous copies are twice as fast for many
             y, x = y.copy(), x.copy()
         np.arctan2(y, x, readings[0])
         np.abs(relative, readings[1])
-        mask = _in_view(readings, nearest, max_range, half_view)
+        places = readings
+        if self._reads_places is not None:
+            places, readings = readings, np.empty(error.shape)
+            readings[0], readings[1] = self._reads_places(x, y)
+        at = np.s_[..., None, :] if mask.ndim == 1 else np.s_[...]  # one world or more
+        _disturb(
+            *(places[at], readings[at], error[at], nearest[at], mask[at]),
+            *((settings or self._settings).numbers, self._bias, self._wraps),
+        )
         if self._sight is not None:
             mask &= ~self._sight.blocked(landmarks, position)
-        if self._reads_places is not None:
-            readings[0], readings[1] = self._reads_places(x, y)
-            readings += error
-            for row in self._wraps:
-                wrap_bearings(readings[row])
-        else:
-            self._disturb(readings, error, settings or self._settings)
-        if np.count_nonzero(mask) < mask.size:
-            readings = np.where(mask, readings, _UNSEEN)
-        return readings, mask
-
-    def _disturb(self, readings: Array, error: Array, settings: SensorSettings) -> None:
-        """Turn true bearings and ranges into what the sensor reads, in place."""
-        bearings = readings[0]
-        if self._grows:
-            std = settings.range_std + settings.growth * readings[1]
-            error = np.stack([error[0], error[1] * std])
-        readings += error
-        if self._bias is not None:
-            bearings += self._bias[0]
-            readings[1] += self._bias[1]
-        if self._may_wrap and np.count_nonzero(np.abs(bearings) >= _PI):
-            wrap_bearings(bearings)
+            readings = np.where(mask, readings, 0.0)
         if self._reads_one:
             if self._reads_ranges:
-                bearings[...] = readings[1]
+                readings[0] = readings[1]
             readings[1] = 0.0
+        return readings, mask
 
 
-def _reading_of_places(kind: str) -> tuple[Any, list[int]]:
+@jit
+def _disturb(  # noqa: PLR0917 (numba takes arrays more quickly than tuples of them)
+    places: Array,
+    readings: Array,
+    error: Array,
+    nearest: Array,
+    mask: BoolArray,
+    settings: Array,
+    bias: tuple[float, float],
+    wraps: tuple[bool, bool],
+) -> None:
+    """Turn readings without noise into what the sensors of K worlds read, in place.
+
+    Parameters
+    ----------
+    places : ndarray, shape (2, K, N)
+        True (β, r) [rad, m]; may be `readings`.
+    readings, error : ndarray, shape (2, K, N)
+        Without noise, and what is added; zeros where unseen.
+    nearest : ndarray, shape (K, N)
+        See `SensorNoise`.
+    mask : bool ndarray, shape (K, N)
+        Receives which landmarks the sensors read.
+    settings : ndarray, shape (K or 1, 7)
+        See `SensorSettings`.
+    bias : (float, float)
+        Added to the readings.
+    wraps : (bool, bool)
+        Which numbers of a reading are angles.
+    """
+    for world in range(len(mask)):
+        _, _, std, growth, _, max_range, field_of_view = settings[
+            min(world, len(settings) - 1)
+        ]
+        for i in range(mask.shape[1]):
+            bearing, distance = places[0, world, i], places[1, world, i]
+            in_view = abs(bearing) <= field_of_view / 2
+            in_reach = nearest[world, i] < distance <= max_range
+            mask[world, i] = in_view and in_reach
+            for part in range(2):
+                reading = 0.0
+                if mask[world, i]:
+                    add = error[part, world, i]
+                    if part == 1 and growth > 0.0:
+                        add *= std + growth * distance
+                    reading = readings[part, world, i] + add
+                    if bias[0] != 0.0 or bias[1] != 0.0:
+                        reading += bias[part]
+                    if wraps[part]:
+                        reading = wrapped_bearing(reading)
+                readings[part, world, i] = reading
+
+
+def _reading_of_places(kind: str) -> tuple[Any, tuple[bool, bool]]:
     """Return what maps (x, y) to a reading, and which of its numbers are angles.
 
     This is None for the sensors of bearings and ranges.  A kind "module:SENSOR" is a
     sensor that the user has written.
     """
     if ":" not in kind:
-        return (lambda x, y: (x, y)) if kind == "position" else None, []
+        of_places = (lambda x, y: (x, y)) if kind == "position" else None
+        return of_places, ("bearing" in kind, False)
     refusal = f"cannot import sensor.kind = '{kind}': "
     h, wraps = (imported(f"{kind}.{part}", refusal) for part in ("h", "wraps"))
-    return (lambda x, y: h(x, y)[0]), [
-        row for row, is_angle in enumerate(wraps) if is_angle
-    ]
-
-
-def _in_view(
-    readings: Array, nearest: Array, max_range: Limit, half_view: Limit
-) -> BoolArray:
-    """Return which noise-free readings, (2, …, N), the sensor can take."""
-    mask: BoolArray = readings[1] > nearest
-    if max_range is not None:
-        mask &= readings[1] <= max_range
-    if half_view is not None:
-        mask &= np.abs(readings[0]) <= half_view
-    return mask
-
-
-def _limit(value: float, above: float) -> Array | None:
-    """Return a limit as a 0-d array, or None if it has no effect."""
-    return np.array(value) if value < above else None
+    return (lambda x, y: h(x, y)[0]), (bool(wraps[0]), bool(wraps[1]))
 
 
 def hide_identities(

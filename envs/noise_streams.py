@@ -9,11 +9,13 @@ effect, and a world has the same noise alone and among others.
 import math
 from collections.abc import Callable, Iterable
 from functools import partial
+from itertools import repeat
 from typing import Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
 
 from ..arrays import Array, IntArray, WordArray
+from ..jit import jit
 from ..restorable import Restorable
 from ..sim_configs import Scenario
 from ..sim_configs.scenario import Sensor
@@ -79,23 +81,12 @@ class NoiseRows(Restorable, Generic[Row]):
 
 
 class SensorSettings(NamedTuple):
-    """Settings of the sensors of K worlds that differ, or of one world, K = 1.
+    """Settings of the sensors of K worlds that differ, or of one world, K = 1."""
 
-    Numbers are columns, shape (K, 1), or plain for one world.
-    """
-
-    #: Of unit noise, shape (K, 2); (σβ, σr) [rad, m], 1 instead of σr where that grows
-    #: with the range.
-    scale: Array
-    #: σr at range 0 [m].
-    range_std: float | Array
-    #: k in σr(r) = σr + k r; of K worlds, zero in all or none.
-    growth: float | Array
-    dropout: float | Array
-    #: P(at most k false readings), shape (K, C).
-    counts_below: Array
-    max_range: float | Array
-    field_of_view: float | Array
+    #: Rows (sβ, sr, σr, k, dropout, max_range, field_of_view), shape (K, 7).
+    #: sβ [rad] and sr [m] scale unit noise; sr = 1 where σr(r) = σr + k r has k > 0.
+    numbers: Array
+    counts_below: Array  # P(at most k false readings), shape (K, C)
 
     @classmethod
     def of(cls, sensor: Sensor) -> "SensorSettings":
@@ -103,23 +94,20 @@ class SensorSettings(NamedTuple):
         first, std = sensor.std
         if sensor.kind == "range":
             first, std = std, first  # its noise is that of the range
-        scale = np.array([[first, 1.0 if sensor.range_std_per_metre else std]])
-        return cls(
-            scale,
-            0.0 if sensor.kind == "position" else std,
-            sensor.range_std_per_metre,
-            sensor.dropout,
-            _poisson_cdf(sensor.clutter, sensor.max_clutter)[None],
-            sensor.max_range,
-            sensor.field_of_view,
-        )
+        growth = sensor.range_std_per_metre
+        scales = first, 1.0 if growth else std
+        noise = *scales, 0.0 if sensor.kind == "position" else std, growth
+        view = sensor.dropout, sensor.max_range, sensor.field_of_view
+        below = _poisson_cdf(sensor.clutter, sensor.max_clutter)
+        return cls(np.array([[*noise, *view]]), below[None])
 
 
 class WorldNoise:
     """Draws the noise of the worlds of a scenario.
 
     Row k of what it draws is the noise of the step ``steps[k]`` of the episode with the
-    key ``keys[k]``: of K steps of one world, or of one step of K worlds.
+    key ``keys[k]``, or of the only key: of K steps of one world, or of one step of K
+    worlds.
 
     Parameters
     ----------
@@ -132,13 +120,14 @@ class WorldNoise:
         self._faults = scenario.present_faults
         self._landmarks = count = scenario.landmarks.count
         hidden, rows = not sensor.identities, sensor.max_clutter
-        self._widths = {  # of uniform numbers per step; one and two for each false row
-            streams.DROPOUT: count if sensor.dropout else 0,
-            streams.CLUTTER: 1 + 2 * rows if hidden and sensor.clutter else 0,
-            streams.ORDER: count + rows if hidden else 0,
-        }
-        self._grows = sensor.range_std_per_metre > 0
-        self._nearest = np.nextafter(sensor.min_range, -1.0)
+        self._widths: dict[int, int] = {}  # of uniform numbers per step
+        if sensor.dropout:
+            self._widths[streams.DROPOUT] = count
+        if hidden and sensor.clutter:
+            self._widths[streams.CLUTTER] = 1 + 2 * rows  # one, and two per false row
+        if hidden:
+            self._widths[streams.ORDER] = count + rows
+        self._nearest = math.nextafter(sensor.min_range, -1.0)
         self._settings = SensorSettings.of(sensor)
         self._motion_std = np.array(scenario.motion.std)
 
@@ -149,7 +138,7 @@ class WorldNoise:
 
         Parameters
         ----------
-        keys : uint64 ndarray, shape (K, 2)
+        keys : uint64 ndarray, shape (K or 1, 2)
         steps : int64 ndarray, shape (K,)
         std : ndarray, shape (K, 3), optional
             Of each world, where worlds differ.
@@ -157,7 +146,8 @@ class WorldNoise:
         unit = np.empty((len(steps), 3))
         streams.draw_normals(keys, steps, streams.MOTION, unit[None])
         noise: Array = heavy_tails(unit, self._faults.motion_dof)
-        return noise * (self._motion_std if std is None else std)
+        noise *= self._motion_std if std is None else std
+        return noise
 
     def sensor(
         self, keys: WordArray, steps: IntArray, settings: SensorSettings | None = None
@@ -167,19 +157,19 @@ class WorldNoise:
         unit = np.empty((2, len(steps), self._landmarks))
         streams.draw_normals(keys, steps, streams.MEASUREMENT, unit)
         unit = heavy_tails(unit, self._faults.sensor_dof)
-        dropout, clutter, order = (
-            _uniform(keys, steps, stream, width)
+        drawn = {
+            stream: _uniform(keys, steps, stream, width)
             for stream, width in self._widths.items()
-        )
-        growth, bias = settings.growth if self._grows else None, self._faults.range_bias
-        nearest = _nearest_readable(unit[1], settings.range_std, growth, bias)
-        np.maximum(nearest, self._nearest, out=nearest)
-        if dropout is not None:
-            nearest[dropout < settings.dropout] = np.inf
-        error = unit * settings.scale.T[:, :, None]
-        if order is None:
-            return error, nearest, None, None
-        return error, nearest, self._clutter(len(steps), clutter, settings), order
+        }
+        nearest = np.empty(unit.shape[1:])
+        bias = self._faults.range_bias
+        _scale(unit, settings.numbers, bias, self._nearest, nearest)
+        if streams.DROPOUT in drawn:
+            nearest[drawn[streams.DROPOUT] < settings.numbers[:, 4:5]] = np.inf
+        if streams.ORDER not in drawn:
+            return unit, nearest, None, None
+        clutter = self._clutter(len(steps), drawn.get(streams.CLUTTER), settings)
+        return unit, nearest, clutter, drawn[streams.ORDER]
 
     def _clutter(
         self, count: int, drawn: Array | None, settings: SensorSettings
@@ -193,9 +183,10 @@ class WorldNoise:
         if drawn is None:
             return np.zeros((2, count, rows))
         counts = (settings.counts_below <= drawn[..., :1]).sum(axis=-1, keepdims=True)
-        width = settings.max_range - sensor.min_range
-        bearings = (drawn[..., 1::2] - 0.5) * settings.field_of_view
-        ranges = settings.max_range - drawn[..., 2::2] * width  # above min_range
+        max_range, field_of_view = settings.numbers[:, 5:6], settings.numbers[:, 6:]
+        bearings = (drawn[..., 1::2] - 0.5) * field_of_view
+        width = max_range - sensor.min_range
+        ranges = max_range - drawn[..., 2::2] * width  # above min_range
         present = np.arange(rows) < counts
         return np.where(present, np.stack([bearings, ranges]), 0.0)
 
@@ -214,17 +205,14 @@ class WorldNoise:
         return NoiseRows(partial(self._sensor_by_step, key))
 
     def _motion_by_step(self, key: WordArray, steps: IntArray) -> list[list[float]]:
-        rows: list[list[float]] = self.motion(
-            key.repeat(len(steps), axis=0), steps
-        ).tolist()
+        rows: list[list[float]] = self.motion(key, steps).tolist()
         return rows
 
     def _sensor_by_step(self, key: WordArray, steps: IntArray) -> Iterable[SensorNoise]:
-        keys = key.repeat(len(steps), axis=0)
-        error, nearest, clutter, order = self.sensor(keys, steps)
+        error, nearest, clutter, order = self.sensor(key, steps)
         fields = _by_step(error), nearest, _by_step(clutter), order
-        rows = ([None] * len(steps) if field is None else field for field in fields)
-        return cast("Iterable[SensorNoise]", zip(*rows, strict=True))
+        rows = (repeat(None) if field is None else field for field in fields)
+        return cast("Iterable[SensorNoise]", zip(*rows, strict=False))
 
 
 class PoseSensors:
@@ -271,10 +259,8 @@ class PoseSensors:
         }
 
 
-def _uniform(keys: WordArray, steps: IntArray, stream: int, width: int) -> Array | None:
-    """Draw uniform numbers, shape (K, width), or None for no width."""
-    if not width:
-        return None
+def _uniform(keys: WordArray, steps: IntArray, stream: int, width: int) -> Array:
+    """Draw uniform numbers, shape (K, width)."""
     drawn = np.empty((len(steps), width))
     streams.draw_uniforms(keys, steps, stream, drawn)
     return drawn
@@ -285,15 +271,26 @@ def _by_step(pairs: Array | None) -> Array | None:
     return None if pairs is None else np.ascontiguousarray(pairs.transpose(1, 0, 2))
 
 
-def _nearest_readable(
-    unit: Array, std: float | Array, per_metre: float | Array | None, bias: float
-) -> Array:
-    """Return the range r above which r + (σ + k r) ε + bias > 0, with unit noise ε."""
-    if per_metre is None:
-        return -std * unit - bias
-    slope = 1.0 + per_metre * unit
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(slope > 0.0, (-std * unit - bias) / slope, np.inf)
+@jit
+def _scale(
+    unit: Array, settings: Array, bias: float, smallest: float, nearest: Array
+) -> None:
+    """Turn unit noise ε, (2, K, N), into errors; write the range r of `SensorNoise`.
+
+    This is the range above which r + (σr + k r) ε + bias > 0, at least `smallest`.
+    """
+    for row in range(len(nearest)):
+        numbers = settings[min(row, len(settings) - 1)]
+        std, growth = numbers[2], numbers[3]
+        for i in range(nearest.shape[1]):
+            noise = unit[1, row, i]
+            reach = -std * noise - bias
+            if growth > 0.0:
+                slope = 1.0 + growth * noise
+                reach = reach / slope if slope > 0.0 else np.inf
+            nearest[row, i] = max(reach, smallest)
+            unit[0, row, i] *= numbers[0]
+            unit[1, row, i] *= numbers[1]
 
 
 def _poisson_cdf(mean: float, largest: int) -> Array:

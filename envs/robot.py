@@ -631,17 +631,10 @@ def wrap_angle(angle: Number) -> Number:
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
-def wrap_bearings(bearings: Array) -> None:
-    """Wrap angles to [-π, π) in place; angles inside the interval keep every bit.
-
-    Examples
-    --------
-    >>> bearings = np.array([0.1, np.pi, 1.0 - 2 * np.pi])
-    >>> wrap_bearings(bearings)
-    >>> bearings.round(12)
-    array([ 0.1       , -3.14159265,  1.        ])
-    """
-    outside = (bearings >= np.pi) | (bearings < -np.pi)
-    wrapped = wrap_angle(bearings[outside])
-    wrapped[wrapped >= np.pi] = -np.pi  # a tiny negative remainder rounds up to 2π
-    bearings[outside] = wrapped
+@njit_internal
+def wrapped_bearing(angle: float) -> float:
+    """Wrap an angle to [-π, π); one inside the interval keeps every bit."""
+    if not (angle >= math.pi or angle < -math.pi):
+        return angle
+    wrapped = (angle + math.pi) % (2 * math.pi) - math.pi
+    return wrapped if wrapped < math.pi else -math.pi  # a remainder rounds up to 2π

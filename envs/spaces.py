@@ -177,6 +177,8 @@ def clipped_actions(
     array = _real_numbers(actions, limits.shape, refusal).astype(np.float64)
     if moving is not None:
         array[~moving] = 0.0
+    if np.count_nonzero(np.abs(array) <= limits) == array.size:
+        return array
     finite = np.isfinite(array)
     if np.count_nonzero(finite) < finite.size:
         world = int(np.flatnonzero(~finite.all(axis=1))[0])

@@ -82,8 +82,7 @@ class EpisodeStarts:
         draw_normals(keys, steps, START, drawn[None])
         drawn *= self._std
         drawn += self._pose
-        centre = np.empty(drawn.shape)
-        centre[:] = self._pose
+        centre = self._pose[None].repeat(len(keys), axis=0)
         return (drawn, centre) if self._draws_truth else (centre, drawn)
 
     def landmarks(self, keys: WordArray) -> ComplexArray:
@@ -115,8 +114,8 @@ def draw_normals(keys: WordArray, steps: IntArray, stream: int, out: Array) -> N
 
     Parameters
     ----------
-    keys : uint64 ndarray, shape (K, 2)
-        The key of each row.
+    keys : uint64 ndarray, shape (K, 2) or (1, 2)
+        The key of each row, or of all.
     steps : int64 ndarray, shape (K,)
     stream : int
         Its number, as `MOTION`.
@@ -125,7 +124,8 @@ def draw_normals(keys: WordArray, steps: IntArray, stream: int, out: Array) -> N
     """
     parts, rows, width = out.shape
     for row in range(rows):
-        k0, k1, step = keys[row, 0], keys[row, 1], steps[row]
+        k0, k1 = keys[min(row, len(keys) - 1)]
+        step = steps[row]
         part, column = 0, 0
         for block in range((parts * width + 3) // 4):
             for word in random_block(k0, k1, block + 1, step, stream):
@@ -142,7 +142,8 @@ def draw_uniforms(keys: WordArray, steps: IntArray, stream: int, out: Array) -> 
     """Fill an array, (K, W), with uniform numbers in [0, 1); see `draw_normals`."""
     rows, width = out.shape
     for row in range(rows):
-        k0, k1, step = keys[row, 0], keys[row, 1], steps[row]
+        k0, k1 = keys[min(row, len(keys) - 1)]
+        step = steps[row]
         column = 0
         for block in range((width + 3) // 4):
             for word in random_block(k0, k1, block + 1, step, stream):

@@ -66,7 +66,7 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
     ((3, 28, 2), (3, 3))
     """
 
-    changing: ClassVar[tuple[str, ...]] = ("_seeds", "_worlds", "_steps_left", "_ended")
+    changing: ClassVar[tuple[str, ...]] = ("_seeds", "_worlds", "_ended")
     _renderers: Sequence[EpisodeRenderer] = ()  # for close after a failed constructor
 
     def __init__(
@@ -103,7 +103,6 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
         self._worlds = WorldBatch(self.scenario, num_envs)
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int] = [-1] * num_envs
-        self._steps_left = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
 
     def reset(
@@ -154,18 +153,17 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
             Before `reset`. Without autoreset also for worlds that have ended.
         """
         resetting = self._ended
-        moving = ~resetting
-        if np.count_nonzero(resetting):
+        moving, some_begin = ~resetting, np.count_nonzero(resetting) > 0
+        if some_begin:
             self._refuse_without_autoreset(resetting)
             self._worlds.step(actions, moving, self._generators())
         else:
             self._worlds.step(actions)
-        self._steps_left -= 1
         self._show(moving)
-        if np.count_nonzero(resetting):
+        if some_begin:
             self._note_begun(resetting)
         rewards, terminated = self._reward(actions, moving)
-        truncated = ~terminated & (self._steps_left <= 0)
+        truncated = ~terminated & (self._worlds.steps >= self._steps)
         ended, final = terminated | truncated, {}
         self._ended = ended
         if self.autoreset_mode == AutoresetMode.SAME_STEP and np.count_nonzero(ended):
@@ -287,7 +285,6 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
         self._follow(worlds)
 
     def _note_begun(self, worlds: BoolArray) -> None:
-        self._steps_left[worlds] = self._steps
         self._ended = self._ended & ~worlds
         if self._renderers:
             landmarks = self._worlds.landmarks
@@ -417,7 +414,8 @@ def with_masks(infos: Infos, worlds: BoolArray | None, count: int) -> Infos:
     {'collision': array([ True, False]), '_collision': array([ True, False])}
     """
     masked = {}
-    masks = np.ones((len(infos), count), dtype=np.bool_)
+    masks = np.empty((len(infos), count), dtype=np.bool_)
+    masks.fill(True)
     for row, (key, value) in enumerate(infos.items()):
         if worlds is None:
             masked[key], masked[f"_{key}"] = value, masks[row]
