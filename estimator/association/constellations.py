@@ -115,7 +115,8 @@ def match_constellations(
     if _has_rival(places, match, pairs, agree, rules):
         return None
     match = extended(places, match)
-    return match if is_same_place(places, match) else None
+    is_same = is_plausible(places, match) and is_filled(places, match)
+    return match if is_same else None
 
 
 def _candidates(feasible: BoolArray) -> IntArray:
@@ -238,7 +239,7 @@ class Misfit(NamedTuple):
 
 def turn_between(places: TwoPlaces, match: Match) -> float:
     """Return φ, by which the matched local landmarks have to be turned [rad]."""
-    a, b = (_complex(points) for points in _matched(places, match))
+    a, b = _matched(places, match)
     return float(np.angle(np.vdot(a - a.mean(), b - b.mean())))
 
 
@@ -247,15 +248,10 @@ def moved_gaps(places: TwoPlaces, match: Match) -> Array:
 
     The matched landmarks of the local map are turned and shifted onto their partners.
     """
-    a, b = (_complex(points) for points in _matched(places, match))
+    a, b = _matched(places, match)
     turn = np.exp(1j * turn_between(places, match))
     moved = b.mean() + turn * (_complex(places.local) - a.mean())
     return np.asarray(np.abs(moved[:, None] - _complex(places.older)[None]))
-
-
-def is_same_place(places: TwoPlaces, match: Match) -> bool:
-    """Test shape and displacement of a match, and what lies between its landmarks."""
-    return is_plausible(places, match) and is_filled(places, match)
 
 
 def is_plausible(places: TwoPlaces, match: Match) -> bool:
@@ -317,7 +313,7 @@ def extended(places: TwoPlaces, match: Match) -> Match:
 def is_filled(places: TwoPlaces, match: Match) -> bool:
     """Return whether most landmarks between the matched ones have a partner."""
     phi = turn_between(places, match)
-    a, b = (_complex(points) for points in _matched(places, match))
+    a, b = _matched(places, match)
     moved = np.exp(1j * phi) * (_complex(places.local) - a.mean())
     older = _complex(places.older) - b.mean()
     radius = np.abs(older[match.older]).max()
@@ -328,7 +324,7 @@ def is_filled(places: TwoPlaces, match: Match) -> bool:
 
 def _offsets(places: TwoPlaces, match: Match, phi: float) -> tuple[Array, Array]:
     """Return r, shape (2k,), and its covariance S."""
-    a, b = (_complex(points) for points in _matched(places, match))
+    a, b = _matched(places, match)
     r = (a - b) / left_jacobian(np.array(-phi))
     columns = 2 * np.concatenate([match.local, len(places.local) + match.older])
     columns = (columns[:, None] + np.arange(2)).ravel()
@@ -350,8 +346,8 @@ def _chi_square(r: Array, S: Array, rows: slice) -> float:
     return float(r[rows] @ np.linalg.solve(part, r[rows]))
 
 
-def _matched(places: TwoPlaces, match: Match) -> tuple[Array, Array]:
-    return places.local[match.local], places.older[match.older]
+def _matched(places: TwoPlaces, match: Match) -> tuple[ComplexArray, ComplexArray]:
+    return _complex(places.local[match.local]), _complex(places.older[match.older])
 
 
 def _complex(points: Array) -> ComplexArray:

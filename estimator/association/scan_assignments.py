@@ -85,9 +85,7 @@ def assign_scan(
     most : int, optional
         How many assignments at most, if fewer than the policy considers.
     """
-    fit = innovation_distances(
-        view.mean, view.covariance, len(view.ids), readings, noise, policy.new_gate
-    )
+    fit = innovation_distances(view, readings, noise, policy.new_gate)
     explained = np.flatnonzero(np.isfinite(fit.squared).any(axis=0))
     if policy.association == "nearest":
         gates = {"match": policy.match_gate, "new": policy.new_gate}
@@ -164,7 +162,8 @@ def _limits(policy: AssociationPolicy, rows: int) -> Array:
     """Return the largest νᵀ S⁻¹ ν of 0 … m pairs together."""
     limits = np.full(rows + 1, np.inf)
     if policy.association == "compatibility":
-        limits[1:] = chdtri(2.0 * np.arange(1, rows + 1), policy.pair_tail)
+        tail = exp(-policy.pair_gate / 2)  # P(χ² > pair_gate), 2 degrees of freedom
+        limits[1:] = chdtri(2.0 * np.arange(1, rows + 1), tail)
     return limits
 
 
@@ -252,11 +251,6 @@ class AssociationPolicy:
         argument_checks.at_least("ambiguity", self.ambiguity, 0.0)
         argument_checks.flag("trust_ids", self.trust_ids)
         object.__setattr__(self, "confirm", _k_of_n(self.confirm))
-
-    @property
-    def pair_tail(self) -> float:
-        """P(χ²₂ > pair_gate): the level of joint tests of several pairs."""
-        return exp(-self.pair_gate / 2)
 
 
 def _k_of_n(value: Any) -> tuple[int, int]:
@@ -350,14 +344,9 @@ class Distances(NamedTuple):
 
 
 def innovation_distances(
-    mean: Array,
-    covariance: Array,
-    landmarks: int,
-    readings: Array,
-    noise: Noise,
-    largest: float,
+    view: MapView, readings: Array, noise: Noise, largest: float
 ) -> Distances:
-    """Compare every reading with every landmark of a belief.
+    """Compare every reading with every landmark of a map.
 
     ::
 
@@ -369,10 +358,8 @@ def innovation_distances(
 
     Parameters
     ----------
-    mean, covariance : ndarray
-        (x, y, θ, l1x, …) and P; there may be more behind the landmarks.
-    landmarks : int
-        How many landmarks these hold, n.
+    view : MapView
+        (x, y, θ, l1x, …) and P of n landmarks.
     readings : ndarray, shape (m, 2)
         Rows (β, r) [rad, m].
     noise : Noise
@@ -384,15 +371,15 @@ def innovation_distances(
     --------
     >>> mean = np.array([0, 0, 0, 5.0, 0, 0, 5.0])
     >>> readings = np.array([(0.0, 5.2), (1.57, 4.9)])
-    >>> P = 0.01 * np.eye(7)
-    >>> fit = innovation_distances(mean, P, 2, readings, Noise(0.1, 0.1), largest=25)
+    >>> view = MapView(mean, 0.01 * np.eye(7), (1, 2))
+    >>> fit = innovation_distances(view, readings, Noise(0.1, 0.1), largest=25)
     >>> (fit.squared < 9.21).tolist()
     [[True, False], [False, True]]
     """
-    shape = (len(readings), landmarks)
+    shape = (len(readings), len(view.ids))
     fit = Distances(np.full(shape, np.inf), np.full(shape, np.inf))
     if fit.squared.size:
-        _compare(mean, covariance, readings, tuple(noise), largest, tuple(fit))
+        _compare(*view[:2], readings, tuple(noise), largest, tuple(fit))
     return fit
 
 

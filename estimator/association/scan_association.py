@@ -616,10 +616,7 @@ def _unexplained_density(
     tentative = candidates.tentative.next_scan(policy.confirm[1])
     if not len(tentative.seen):
         return density
-    mean, covariance, slots = tentative.view()[:3]
-    fit = innovation_distances(
-        mean, covariance, len(slots), readings, noise, policy.new_gate
-    )
+    fit = innovation_distances(tentative.view(), readings, noise, policy.new_gate)
     share = np.where(tentative.sightings > 1, 1.0, candidates.density.landmark_share)
     again = share * np.exp(-fit.unlikelihood / 2) / (2 * np.pi)
     return np.asarray(density + again.max(axis=1))

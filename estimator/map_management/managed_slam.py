@@ -126,10 +126,7 @@ class ManagedSlam:
         #: Number of steps taken.
         self.steps = 0
         self._report: UpdateReport | None = None
-        window = self._policy.confirm[1] if self._policy.backdate else 0
-        self._recent = RecentScans(
-            self._filter, self._editor, window, self._policy.pair_gate
-        )
+        self._recent = RecentScans(self._filter, self._editor, self._policy)
         for name, member in optional_members(self._filter).items():
             setattr(self, name, member)
 

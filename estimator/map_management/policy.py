@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from math import inf, isfinite, pi, sqrt
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -122,12 +122,11 @@ def as_policy(value: LandmarkPolicy | Mapping[str, Any] | bool) -> LandmarkPolic
     given = dict(value)
     if isinstance(given.get("constellations"), bool):
         given["constellations"] = {} if given["constellations"] else None
-    if isinstance(given.get("view"), Mapping):
-        given["view"] = _made(FieldOfView, "management.view", given["view"])
-    if isinstance(rules := given.get("constellations"), Mapping):
-        name = "management.constellations"
-        given["constellations"] = _made(Constellations, name, rules)
-    return _made(LandmarkPolicy, "management", given)
+    for name, kind in (("view", FieldOfView), ("constellations", Constellations)):
+        if isinstance(part := given.get(name), Mapping):
+            given[name] = _made(kind, f"management.{name}", part)
+    policy: LandmarkPolicy = _made(LandmarkPolicy, "management", given)
+    return policy
 
 
 def policy_of(slam: object) -> LandmarkPolicy:
@@ -230,10 +229,7 @@ def _checked_answer(visible: Visibility, pose: Array, landmarks: Array) -> BoolA
     return answer
 
 
-Made = TypeVar("Made", LandmarkPolicy, FieldOfView, Constellations)
-
-
-def _made(kind: type[Made], name: str, given: Mapping[str, Any]) -> Made:
+def _made(kind: type[Any], name: str, given: Mapping[str, Any]) -> Any:
     known = [field.name for field in fields(kind)]
     for key in given:
         if key not in known:

@@ -31,6 +31,7 @@ from ..support import saved_states
 from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo
 from .map_editor import MapEditor
+from .policy import LandmarkPolicy
 
 
 class RecentScans(Restorable):
@@ -42,10 +43,8 @@ class RecentScans(Restorable):
         The filter.
     editor : MapEditor
         Of its map.
-    window : int
-        Number of scans within which a landmark is confirmed; 0: keep no scans.
-    gate : float
-        Largest νᵀ S⁻¹ ν of a sighting, given the other readings of its scan.
+    policy : LandmarkPolicy
+        If it backdates, scans are kept as long as they may confirm a landmark.
 
     Notes
     -----
@@ -57,11 +56,11 @@ class RecentScans(Restorable):
     replaced = ("motions",)
 
     def __init__(
-        self, slam: SlamEstimator, editor: MapEditor, window: int, gate: float
+        self, slam: SlamEstimator, editor: MapEditor, policy: LandmarkPolicy
     ) -> None:
+        self._slam, self._editor, self._gate = slam, editor, policy.pair_gate
         can_repeat = not isinstance(slam, SupportsTruth | SupportsLocalView)
-        self._slam, self._editor = slam, editor
-        self._window, self._gate = window if can_repeat else 0, gate
+        self._window = policy.confirm[1] if policy.backdate and can_repeat else 0
         self.forget()
 
     def forget(self) -> None:

@@ -19,6 +19,7 @@ from slamgym.estimator.association.tentative_landmarks import (
     TentativeLandmarks,
     UnexplainedDensity,
 )
+from slamgym.estimator.interface import MapView
 from slamgym.estimator.kernels import scan_update as screening
 from slamgym.estimator.kernels.kalman_gain import (
     ADDED,
@@ -88,9 +89,8 @@ def test_distances_are_those_of_the_dense_model_and_none_is_forgotten(seed):
     readings[3, 0] += 4 * np.pi
     room = np.zeros((40, 40))
     room[:27, :27] = P
-    fit = innovation_distances(
-        np.append(mean, np.zeros(13)), room, 12, readings, NOISE, 25.0
-    )
+    view = MapView(np.append(mean, np.zeros(13)), room, range(12))
+    fit = innovation_distances(view, readings, NOISE, 25.0)
     within = 0
     for k in range(12):
         for j in range(12):

@@ -549,10 +549,10 @@ def test_a_foreign_or_damaged_state_is_refused():
     busy_run(slam, 8)
     saved, before = slam.state_dict(), digest(slam)
     damaged = saved | {"landmarks.apart": np.zeros((2, 3), dtype=int)}
-    partial = {key: saved[key] for key in saved if key != "landmarks.misses"}
+    lacking = {key: saved[key] for key in saved if key != "landmarks.misses"}
     for state, message in (
         (other.state_dict(), "state is of EkfSlam, not of ManagedSlam"),
-        (partial, r"state must hold 'landmarks\.misses'"),
+        (lacking, r"state must hold 'landmarks\.misses'"),
         (make("invariant", TIDY).state_dict(), "state is of InvariantEkfSlam"),
         (damaged, r"apart'\] must have shape \(-1, 2\)"),
     ):
