@@ -397,33 +397,28 @@ class Candidates:
         waiting: dict[int, list[int]] = {}
         for landmark_id, scan in saved["waiting"].tolist():
             waiting.setdefault(landmark_id, []).append(scan)
-        density, seen, expected = (
-            saved[key] for key in ("density", "detected", "expected")
-        )
-        C = saved["covariances"]
-        if not saved_states.is_semidefinite((C + C.transpose(0, 2, 1)) / 2):
-            raise ValueError(
-                "state['tentative.covariances'] must be positive semidefinite"
-            )
-        if density.min() <= 0:
-            raise ValueError(f"state['tentative.density'] must be > 0, got {density}")
-        if saved["unexplained"].min() < 0:
-            raise ValueError("state['tentative.unexplained'] must be >= 0")
-        if not ((seen >= 0) & (seen <= expected)).all():
-            raise ValueError(
-                "state['tentative.detected'] must be >= 0, and at most "
-                "state['tentative.expected']"
-            )
         missed = {int(i): left for i, left in saved["missed"].tolist()}
-        if not all(0 <= left <= 1 for left in missed.values()):
-            raise ValueError("state['tentative.missed'] must be probabilities")
         shown = dict(saved["shown"].tolist())
         lost, most_lost, first_new, surest, unknown = saved["lost"].tolist()
         evidence = LostEvidence(lost, most_lost, int(first_new), surest, int(unknown))
-        if min(evidence) < 0 or lost > most_lost:
-            raise ValueError(
-                "state['tentative.lost'] must be >= 0, the first at most the second"
-            )
+        density, C = saved["density"], saved["covariances"]
+        likely = saved_states.is_semidefinite((C + C.transpose(0, 2, 1)) / 2)
+        seen, expected = saved["detected"], saved["expected"]
+        for name, wanted, is_so in (
+            ("covariances", "positive semidefinite", likely),
+            ("density", "> 0", density.min() > 0),
+            ("unexplained", ">= 0", saved["unexplained"].min() >= 0),
+            (
+                "detected",
+                ">= 0, and at most 'expected'",
+                (seen >= 0) & (seen <= expected),
+            ),
+            ("missed", "probabilities", [0 <= left <= 1 for left in missed.values()]),
+            ("lost", ">= 0", min(evidence) >= 0),
+            ("lost", "at most the largest so far", lost <= most_lost),
+        ):
+            if not np.all(is_so):
+                raise ValueError(f"state['tentative.{name}'] must be {wanted}")
         return cls(
             TentativeLandmarks(*(saved[key] for key in TENTATIVE)),
             waiting,

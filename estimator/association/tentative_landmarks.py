@@ -20,8 +20,6 @@ the share of the readings that match no mapped landmark and proved to be of a ne
     miss      o ← o (1 − P_D)
 """
 
-from itertools import compress
-from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -233,10 +231,9 @@ class UnexplainedDensity(NamedTuple):
         self, readings: Array, is_new: BoolArray, landmarks: int = 0
     ) -> "UnexplainedDensity":
         """Count one more scan (m, 2), its rows of no landmark, and those confirmed."""
-        finite = [isfinite(b) and isfinite(r) for b, r in readings.tolist()]
-        ranges = compress(readings[:, 1].tolist(), finite)
-        longest, new = max([self.longest, *ranges]), int(np.count_nonzero(is_new))
-        cells = self.cells
+        finite = np.isfinite(readings).all(axis=1)
+        longest = max(self.longest, float(readings[finite, 1].max(initial=0.0)))
+        new, cells = int(np.count_nonzero(is_new)), self.cells
         if new:
             cells = cells.copy()
             np.add.at(cells, _cells(readings[is_new & finite], longest), 1.0)

@@ -186,6 +186,15 @@ def test_a_tentative_landmark_stays_as_it_is_while_a_robot_without_noise_rests()
     assert (np.linalg.det(slam.state_dict()[key]) > np.linalg.det(before[key])).all()
 
 
+def test_a_saved_tentative_landmark_of_negative_variance_is_refused():
+    slam = make(management={})
+    slam.update(polar([(3, 4)]))
+    key = "tentative.covariances"
+    state = slam.state_dict()
+    with pytest.raises(ValueError, match=r"covariances'\] must be positive semidef"):
+        slam.load_state_dict(state | {key: -state[key]})
+
+
 def test_identities_need_confirmation_where_they_are_not_trusted():
     slam = make(management={"confirm": (2, 3), "trust_ids": False})
     scan = polar([(5, 1), (4, -2)])

@@ -381,17 +381,23 @@ def test_a_robot_that_turns_blindly_is_probably_lost(association):
 
 
 @pytest.mark.parametrize(
-    "lost",
+    ("name", "value"),
     [
-        (-1, 2, 0, 0.1, 0),
-        (3, 2, 0, 0.1, 0),
-        (0, 2, -1, 0.1, 0),
-        (0, 2, 0, -0.1, 0),
-        (0, 2, 0, 0.1, -1),
+        ("lost", (-1, 2, 0, 0.1, 0)),
+        ("lost", (3, 2, 0, 0.1, 0)),
+        ("lost", (0, 2, -1, 0.1, 0)),
+        ("lost", (0, 2, 0, -0.1, 0)),
+        ("lost", (0, 2, 0, 0.1, -1)),
+        ("density", (1, 2, 0, 1)),
+        ("unexplained", np.full((SECTORS, RINGS), -1)),
+        ("detected", np.full((SECTORS, RINGS), -1)),
+        ("detected", np.full((SECTORS, RINGS), 100)),
+        ("missed", [(0, 1.1)]),
+        ("missed", [(0, -0.1), (1, 0.5)]),
     ],
 )
-def test_a_saved_state_with_impossible_evidence_is_refused(lost):
+def test_a_saved_state_with_impossible_detections_is_refused(name, value):
     slam = circling("joint", steps=5)
-    state = slam.state_dict() | {"tentative.lost": np.array(lost, float)}
-    with pytest.raises(ValueError, match="lost"):
+    state = slam.state_dict() | {f"tentative.{name}": np.array(value, float)}
+    with pytest.raises(ValueError, match=rf"tentative\.{name}'\] must be"):
         slam.load_state_dict(state)
