@@ -461,11 +461,9 @@ class HypothesisSlam:
         self, hypotheses: list[Hypothesis], others: Sequence[ManagedSlam] = ()
     ) -> None:
         """Continue with these hypotheses, and reuse all other filters."""
-        slams = {id(slam): slam for slam in (*self._slams, *others)}
+        slams = *self._slams, *others
         self.hypotheses = hypotheses
-        for slam in self._slams:
-            slams.pop(id(slam), None)
-        self._pool.free(slams.values())
+        self._pool.free(slam for slam in slams if slam not in self._slams)
 
     def __repr__(self) -> str:
         count = len(self.hypotheses)
@@ -506,6 +504,6 @@ class FilterPool:
     def free(self, slams: Iterable[ManagedSlam]) -> None:
         """Take filters back."""
         for slam in slams:
-            slam.reset(np.zeros(3), np.zeros(3))  # frees its scans
-            if all(slam is not other for other in self._spare):
+            if slam not in self._spare:
+                slam.reset(np.zeros(3), np.zeros(3))  # frees its scans
                 self._spare.append(slam)
