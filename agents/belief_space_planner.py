@@ -22,6 +22,7 @@ References
 """
 
 import math
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -88,7 +89,9 @@ class BeliefSpacePlanner:
         """Choose (v, ω) [m/s, rad/s]; see `Baseline.act`."""
         settings = self._settings
         self._look(knowledge)
-        plans, tours = _arcs(knowledge, settings), np.empty((0, 2, 2))
+        robot, dt = knowledge.scenario.robot, knowledge.scenario.dt
+        plans = _arcs(robot.max_speed * dt, robot.max_turn_rate * dt, settings)
+        tours = np.empty((0, 2, 2))
         arcs = len(plans)
         if settings.goals:
             tours = _tours(knowledge, self._chance, settings.goals)
@@ -206,10 +209,12 @@ def _is_free(knowledge: AgentKnowledge, poses: Array) -> BoolArray:
     return np.asarray((gap >= min(clearance, here - 1e-9)).all(axis=1))
 
 
-def _arcs(knowledge: AgentKnowledge, settings: PlannerSettings) -> Array:
-    """Return plans that turn, drive straight on, and turn on the spot, (K, T, 2)."""
-    robot, dt = knowledge.scenario.robot, knowledge.scenario.dt
-    longest, turning = robot.max_speed * dt, robot.max_turn_rate * dt
+@cache
+def _arcs(longest: float, turning: float, settings: PlannerSettings) -> Array:
+    """Return plans that turn, drive straight on, and turn on the spot, (K, T, 2).
+
+    A step drives at most `longest` [m] and turns at most by `turning` [rad].
+    """
     plans = []
     for drive, steps in ((1.0, 1), (1.0, 4), (0.0, 3), (0.0, settings.horizon)):
         for straight in settings.straight if steps < settings.horizon else (0,):
@@ -276,7 +281,9 @@ def _driven(knowledge: AgentKnowledge, tours: Array, steps: int) -> Array:
         distance = np.hypot(dx, dy)
         arrived = distance < 0.5 * longest
         error = wrap_angle(np.arctan2(dy, dx) - heading)
-        turn = np.clip(np.where(arrived, turning, error), -turning, turning)
+        turn = np.minimum(
+            np.maximum(np.where(arrived, turning, error), -turning), turning
+        )
         ahead = (np.abs(error) < _ALIGNED) & ~arrived
         drive = np.where(ahead, np.minimum(distance, longest), 0.0)
         plans[:, t, 0], plans[:, t, 1] = drive, turn

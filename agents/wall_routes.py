@@ -13,6 +13,7 @@ e               end of a wall [m]
 """
 
 import math
+from collections.abc import Iterable
 from functools import cached_property
 from typing import NamedTuple
 
@@ -26,6 +27,8 @@ from ..sim_configs import Scenario
 from .active_slam_kernels import SECTORS, cells_in_view
 from .belief_features import Bounds, world_bounds
 from .estimator_choice import BeliefOfMap, FollowingEstimator
+
+Pair = tuple[int, int]
 
 CLEARANCE = 1.0  # of goals on a floor without inner walls [m]
 _GAP = 0.5  # kept between the robot and walls on a route [m]
@@ -100,9 +103,8 @@ class WallRoutes:
 
         Around inner walls, those of the cells that the points are in.
         """
-        straight = np.hypot(
-            *(as_points(self._cells) - points[:, None]).transpose(2, 0, 1)
-        )
+        x, y = points.T[..., None]
+        straight = np.hypot(self._cells.real - x, self._cells.imag - y)
         if self.is_open:
             return np.asarray(straight)
         return np.asarray(self._by_cell[straight.argmin(axis=1)])
@@ -112,21 +114,27 @@ class WallRoutes:
 
         Where there is no way, the route is straight.
         """
-        straight = goal[None]
         if self.is_open:
-            return straight
-        here, there = _numbers(point[None]), _numbers(straight)
-        if np.isfinite(self._lengths(here, there)[0, 0]):
-            return straight
-        first, last = self._to_nodes(here)[0], self._to_nodes(there)[0]
-        length = first[:, None] + self._between + last
-        start, node = np.unravel_index(int(length.argmin()), length.shape)
-        if not np.isfinite(length[start, node]):
-            return straight
-        corners = [int(node)]
-        while corners[-1] != start:
-            corners.append(int(self._before[start, corners[-1]]))
-        return np.concatenate([as_points(self._nodes[corners[::-1]]), straight])
+            return goal[None]
+        return self._legs(np.stack([point, goal]), [(0, 1)])[0, 1]
+
+    def _legs(self, points: Array, pairs: Iterable[Pair]) -> dict[Pair, Array]:
+        """Return the routes of pairs of points (P, 2) [m], by index, as in `legs`."""
+        numbers = _numbers(points)
+        is_straight = np.isfinite(self._lengths(numbers, numbers))
+        to_nodes, routes = self._to_nodes(numbers), {}
+        for a, b in pairs:
+            corners: list[int] = []
+            if not is_straight[a, b]:
+                length = to_nodes[a][:, None] + self._between + to_nodes[b]
+                start, node = np.unravel_index(int(length.argmin()), length.shape)
+                if np.isfinite(length[start, node]):
+                    corners = [int(node)]
+                    while corners[-1] != start:
+                        corners.append(int(self._before[start, corners[-1]]))
+            nodes = as_points(self._nodes[corners[::-1]])
+            routes[a, b] = np.concatenate([nodes, points[[b]]])
+        return routes
 
     def tours(self, point: Array, tours: Array) -> Array:
         """Return the routes of tours (K, 2, 2) from a point, to one goal and another.
@@ -135,15 +143,15 @@ class WallRoutes:
         """
         if self.is_open or not len(tours):
             return tours
-        legs: dict[tuple[bytes, bytes], Array] = {}
-        routes = []
-        for first, second in tours:
-            for a, b in ((point, first), (first, second)):
-                if (a.tobytes(), b.tobytes()) not in legs:
-                    legs[a.tobytes(), b.tobytes()] = self.legs(a, b)
-            to_first = legs[point.tobytes(), first.tobytes()]
-            to_second = legs[first.tobytes(), second.tobytes()]
-            routes.append(np.concatenate([to_first, to_second]))
+        stops = np.concatenate([point[None], tours.reshape(-1, 2)])
+        points, places = np.unique(stops, axis=0, return_inverse=True)
+        here, *goals = places.ravel().tolist()
+        ways = list(zip(goals[::2], goals[1::2], strict=True))
+        legs = self._legs(points, {*ways, *((here, first) for first, _ in ways)})
+        routes = [
+            np.concatenate([legs[here, first], legs[first, second]])
+            for first, second in ways
+        ]
         longest = max(map(len, routes))
         padding = [np.tile(each[-1:], (longest - len(each), 1)) for each in routes]
         return np.array([*map(np.concatenate, zip(routes, padding, strict=True))])
