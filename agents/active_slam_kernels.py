@@ -307,7 +307,7 @@ def cells_in_view(
         for t in range(poses.shape[1]):
             x, y, heading = poses[b, t, 0], poses[b, t, 1], poses[b, t, 2]
             pose = x, y, math.cos(heading), math.sin(heading)
-            look_around(pose, cells, View(*view), seen[b], points)
+            mark_cells(pose, cells, View(*view), seen[b], points)
 
 
 @njit_internal
@@ -316,8 +316,27 @@ def look_around(
 ) -> int:
     """Mark the cells in view as seen, and write those still unseen as points.
 
-    Returns how many are unseen. The first loops have no branches, unless walls hide
-    cells, so that they run on whole vector registers.
+    Returns how many are unseen.
+    """
+    mark_cells(pose, cells, view, seen, points)
+    unseen = 0
+    for c in range(len(seen)):
+        if not seen[c]:
+            points[AHEAD, unseen] = points[AHEAD, c]
+            points[ASIDE, unseen] = points[ASIDE, c]
+            points[DISTANCE, unseen] = points[DISTANCE, c]
+            unseen += 1
+    return unseen
+
+
+@njit_internal
+def mark_cells(
+    pose: Pose, cells: Array, view: View, seen: BoolArray, points: Array
+) -> None:
+    """Mark the cells in view as seen, and write all cells as points.
+
+    The loops have no branches, unless walls hide cells, so that they run on whole
+    vector registers.
     """
     x, y, _, _ = pose
     for c in range(len(seen)):
@@ -330,14 +349,6 @@ def look_around(
             if not seen[c] and is_in_view(points[AHEAD, c], points[DISTANCE, c], view):
                 dx, dy = cells[0, c] - x, cells[1, c] - y
                 seen[c] = not is_hidden(x, y, dx, dy, view.walls)
-    unseen = 0
-    for c in range(len(seen)):
-        if not seen[c]:
-            points[AHEAD, unseen] = points[AHEAD, c]
-            points[ASIDE, unseen] = points[ASIDE, c]
-            points[DISTANCE, unseen] = points[DISTANCE, c]
-            unseen += 1
-    return unseen
 
 
 @njit_internal

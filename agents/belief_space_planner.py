@@ -281,9 +281,8 @@ def _driven(knowledge: AgentKnowledge, tours: Array, steps: int) -> Array:
         distance = np.hypot(dx, dy)
         arrived = distance < 0.5 * longest
         error = wrap_angle(np.arctan2(dy, dx) - heading)
-        turn = np.minimum(
-            np.maximum(np.where(arrived, turning, error), -turning), turning
-        )
+        turn = np.minimum(np.maximum(error, -turning), turning)
+        turn[arrived] = turning
         ahead = (np.abs(error) < _ALIGNED) & ~arrived
         drive = np.where(ahead, np.minimum(distance, longest), 0.0)
         plans[:, t, 0], plans[:, t, 1] = drive, turn
