@@ -31,6 +31,7 @@ from ..arrays import Array, BoolArray, IndexArray
 from ..envs.robot import wrap_angle
 from ..estimator.filters.imagine import imagine
 from ..estimator.kernels.imagine import Imagined
+from ..sim_configs import Robot
 from .belief_features import largest_variances
 from .wall_routes import AgentKnowledge, as_points
 
@@ -89,16 +90,13 @@ class BeliefSpacePlanner:
         """Choose (v, ω) [m/s, rad/s]; see `Baseline.act`."""
         settings = self._settings
         self._look(knowledge)
-        robot, dt = knowledge.scenario.robot, knowledge.scenario.dt
-        plans = _arcs(robot.max_speed * dt, robot.max_turn_rate * dt, settings)
-        tours = np.empty((0, 2, 2))
-        arcs = len(plans)
+        plans = _arcs(knowledge.scenario.robot, knowledge.scenario.dt, settings)
+        arcs, tours = len(plans), np.empty((0, 2, 2))
         if settings.goals:
             tours = _tours(knowledge, self._chance, settings.goals)
         rest = _rest(knowledge, self._tour)
         tours = np.concatenate([tours, rest])
-        driven = _driven(knowledge, tours, settings.horizon)
-        plans = np.concatenate([plans, driven])
+        plans = np.concatenate([plans, _driven(knowledge, tours, settings.horizon)])
         values = plan_values(knowledge, plans, self._chance, settings)
         values[-1] += settings.persistence * len(rest)
         best = int(np.argmax(values))
@@ -210,11 +208,9 @@ def _is_free(knowledge: AgentKnowledge, poses: Array) -> BoolArray:
 
 
 @cache
-def _arcs(longest: float, turning: float, settings: PlannerSettings) -> Array:
-    """Return plans that turn, drive straight on, and turn on the spot, (K, T, 2).
-
-    A step drives at most `longest` [m] and turns at most by `turning` [rad].
-    """
+def _arcs(robot: Robot, dt: float, settings: PlannerSettings) -> Array:
+    """Return plans that turn, drive straight on, and turn on the spot, (K, T, 2)."""
+    longest, turning = robot.max_speed * dt, robot.max_turn_rate * dt
     plans = []
     for drive, steps in ((1.0, 1), (1.0, 4), (0.0, 3), (0.0, settings.horizon)):
         for straight in settings.straight if steps < settings.horizon else (0,):

@@ -13,7 +13,6 @@ e               end of a wall [m]
 """
 
 import math
-from collections.abc import Iterable
 from functools import cached_property
 from typing import NamedTuple
 
@@ -27,8 +26,6 @@ from ..sim_configs import Scenario
 from .active_slam_kernels import SECTORS, cells_in_view
 from .belief_features import Bounds, world_bounds
 from .estimator_choice import BeliefOfMap, FollowingEstimator
-
-Pair = tuple[int, int]
 
 CLEARANCE = 1.0  # of goals on a floor without inner walls [m]
 _GAP = 0.5  # kept between the robot and walls on a route [m]
@@ -116,9 +113,11 @@ class WallRoutes:
         """
         if self.is_open:
             return goal[None]
-        return self._legs(np.stack([point, goal]), [(0, 1)])[0, 1]
+        return self._legs(np.stack([point, goal]), {(0, 1)})[0, 1]
 
-    def _legs(self, points: Array, pairs: Iterable[Pair]) -> dict[Pair, Array]:
+    def _legs(
+        self, points: Array, pairs: set[tuple[int, int]]
+    ) -> dict[tuple[int, int], Array]:
         """Return the routes of pairs of points (P, 2) [m], by index, as in `legs`."""
         numbers = _numbers(points)
         is_straight = np.isfinite(self._lengths(numbers, numbers))
@@ -152,9 +151,8 @@ class WallRoutes:
             np.concatenate([legs[here, first], legs[first, second]])
             for first, second in ways
         ]
-        longest = max(map(len, routes))
-        padding = [np.tile(each[-1:], (longest - len(each), 1)) for each in routes]
-        return np.array([*map(np.concatenate, zip(routes, padding, strict=True))])
+        steps = np.arange(max(map(len, routes)))
+        return np.array([each[np.minimum(steps, len(each) - 1)] for each in routes])
 
     def kept_clear(self, goals: Array) -> Array:
         """Return goals (G, 2) moved to where the robot can stand, off the walls [m]."""

@@ -92,6 +92,7 @@ def world_cases() -> dict[str, Case]:
     than_sync = ("SyncVectorEnv, 64 worlds", 20.0)
     return {
         than_sync[0]: steps_of(sync(64)),
+        "vector world, 1": steps_of(native(1), at_most=41.0),
         "vector world, 64": steps_of(native(64), at_most=1.5, faster_than=than_sync),
         "vector world, 1024": steps_of(native(1024), at_most=0.8),
         "vector world, 1024, 100 landmarks": steps_of(

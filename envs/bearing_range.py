@@ -155,14 +155,11 @@ def _disturb(  # noqa: PLR0917 (numba takes arrays more quickly than tuples of t
         Which numbers of a reading are angles.
     """
     for world in range(len(mask)):
-        _, _, std, growth, _, max_range, field_of_view = settings[
-            min(world, len(settings) - 1)
-        ]
+        std, growth, _, reach, view = settings[min(world, len(settings) - 1), 2:]
         for i in range(mask.shape[1]):
             bearing, distance = places[0, world, i], places[1, world, i]
-            in_view = abs(bearing) <= field_of_view / 2
-            in_reach = nearest[world, i] < distance <= max_range
-            mask[world, i] = in_view and in_reach
+            in_reach = nearest[world, i] < distance <= reach
+            mask[world, i] = in_reach and abs(bearing) <= view / 2
             for part in range(2):
                 reading = 0.0
                 if mask[world, i]:

@@ -120,13 +120,12 @@ class WorldNoise:
         self._faults = scenario.present_faults
         self._landmarks = count = scenario.landmarks.count
         hidden, rows = not sensor.identities, sensor.max_clutter
-        self._widths: dict[int, int] = {}  # of uniform numbers per step
-        if sensor.dropout:
-            self._widths[streams.DROPOUT] = count
-        if hidden and sensor.clutter:
-            self._widths[streams.CLUTTER] = 1 + 2 * rows  # one, and two per false row
-        if hidden:
-            self._widths[streams.ORDER] = count + rows
+        widths = {  # of uniform numbers per step; one and two for each false row
+            streams.DROPOUT: count * (sensor.dropout > 0),
+            streams.CLUTTER: (1 + 2 * rows) * (hidden and sensor.clutter > 0),
+            streams.ORDER: (count + rows) * hidden,
+        }
+        self._widths = {stream: width for stream, width in widths.items() if width}
         self._nearest = math.nextafter(sensor.min_range, -1.0)
         self._settings = SensorSettings.of(sensor)
         self._motion_std = np.array(scenario.motion.std)
@@ -205,8 +204,7 @@ class WorldNoise:
         return NoiseRows(partial(self._sensor_by_step, key))
 
     def _motion_by_step(self, key: WordArray, steps: IntArray) -> list[list[float]]:
-        rows: list[list[float]] = self.motion(key, steps).tolist()
-        return rows
+        return cast("list[list[float]]", self.motion(key, steps).tolist())
 
     def _sensor_by_step(self, key: WordArray, steps: IntArray) -> Iterable[SensorNoise]:
         error, nearest, clutter, order = self.sensor(key, steps)
@@ -280,8 +278,7 @@ def _scale(
     This is the range above which r + (σr + k r) ε + bias > 0, at least `smallest`.
     """
     for row in range(len(nearest)):
-        numbers = settings[min(row, len(settings) - 1)]
-        std, growth = numbers[2], numbers[3]
+        first, second, std, growth = settings[min(row, len(settings) - 1), :4]
         for i in range(nearest.shape[1]):
             noise = unit[1, row, i]
             reach = -std * noise - bias
@@ -289,8 +286,8 @@ def _scale(
                 slope = 1.0 + growth * noise
                 reach = reach / slope if slope > 0.0 else np.inf
             nearest[row, i] = max(reach, smallest)
-            unit[0, row, i] *= numbers[0]
-            unit[1, row, i] *= numbers[1]
+            unit[0, row, i] *= first
+            unit[1, row, i] *= second
 
 
 def _poisson_cdf(mean: float, largest: int) -> Array:

@@ -124,8 +124,7 @@ def draw_normals(keys: WordArray, steps: IntArray, stream: int, out: Array) -> N
     """
     parts, rows, width = out.shape
     for row in range(rows):
-        k0, k1 = keys[min(row, len(keys) - 1)]
-        step = steps[row]
+        (k0, k1), step = keys[min(row, len(keys) - 1)], steps[row]
         part, column = 0, 0
         for block in range((parts * width + 3) // 4):
             for word in random_block(k0, k1, block + 1, step, stream):
@@ -142,8 +141,7 @@ def draw_uniforms(keys: WordArray, steps: IntArray, stream: int, out: Array) -> 
     """Fill an array, (K, W), with uniform numbers in [0, 1); see `draw_normals`."""
     rows, width = out.shape
     for row in range(rows):
-        k0, k1 = keys[min(row, len(keys) - 1)]
-        step = steps[row]
+        (k0, k1), step = keys[min(row, len(keys) - 1)], steps[row]
         column = 0
         for block in range((width + 3) // 4):
             for word in random_block(k0, k1, block + 1, step, stream):
