@@ -40,6 +40,21 @@ def test_routes_keep_off_the_walls(grid):
         assert grid.clearance(way).min() >= kept - 1e-4
 
 
+def test_tours_follow_the_routes_to_one_goal_and_another(grid):
+    start, goals = points(1, seed=2)[0], grid.routes.kept_clear(points(12, seed=1))
+    goals[-2] = start  # a goal that is reached already
+    pairs = np.stack([goals[::2], goals[1::2]], axis=1)
+    pairs = np.concatenate([pairs, pairs[:, ::-1], pairs[:, [0, 0]]])
+    tours, lengths = grid.routes.tours(start, pairs), set()
+    for tour, (first, second) in zip(tours, pairs, strict=True):
+        legs = grid.routes.legs(start, first), grid.routes.legs(first, second)
+        way = np.concatenate(legs)
+        np.testing.assert_array_equal(tour[: len(way)], way)
+        assert (tour[len(way) :] == second).all()
+        lengths.add(len(way))
+    assert len(lengths) > 2
+
+
 def test_distances_are_the_lengths_of_routes(grid):
     starts, goals = points(20), grid.routes.kept_clear(points(20, seed=1))
     lengths = grid.routes.distances(starts, goals)
