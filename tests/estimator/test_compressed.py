@@ -23,6 +23,7 @@ from slamgym.estimator.large_maps.compressed.compressed_slam import (
 from slamgym.estimator.large_maps.compressed.deferred_covariance import (
     BLOCK,
     DeferredCovariance,
+    Downdate,
 )
 from slamgym.estimator.large_maps.compressed.phase_update import Handover
 from slamgym.estimator.map_management.map_editor import MapEditor
@@ -376,14 +377,15 @@ def test_the_stored_covariance_is_that_of_a_dense_matrix(seed):
             for blocks in (range(1), range(1, 3)):
                 store.put(blocks, taken, rows[np.argsort(places)], places)
         taken = np.sort(rng.choice(width, rng.integers(1, 9), replace=False))
-        rows = np.empty((len(taken), width))
-        for blocks in (range(2), range(2, 3)):
-            store.read(blocks, taken, rows)
-        np.testing.assert_allclose(rows, dense[taken], atol=1e-10)
         root = rng.standard_normal((width, rng.integers(1, 60)))
         signs = rng.choice([-1.0, 1.0], root.shape[1])
-        store.defer(root.copy(), signs)
+        downdate = Downdate(root.copy(), signs)
         dense -= (root * signs) @ root.T
+        rows = np.empty((len(taken), width))
+        for blocks in (range(2), range(2, 3)):
+            store.read(blocks, taken, rows, downdate)
+        np.testing.assert_allclose(rows, dense[taken], atol=1e-10)
+        store.defer(downdate)
         store.work(int(rng.integers(0, 60)))
         other = np.setdiff1d(rng.choice(width, 20, replace=False), taken)
         rng.shuffle(other)

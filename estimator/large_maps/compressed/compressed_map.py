@@ -180,16 +180,17 @@ class CompressedMap:
         """
         width = self.deferred.width
         share = phase_update.blocks_in_a_step(width, hurried=hurried)
-        if self._handover is not None:
-            self._handover.advance(self.deferred, age * share)
-        if hurried or (age - 1) * share * BLOCK >= width:
+        if hurried or (age - 3) * share * BLOCK >= width:
             self.finish_handover()
-            self.deferred.work(rank)
+            self.deferred.work(rank if hurried else rank * SHARE)
+        elif self._handover is not None and age > 1:
+            self._handover.advance(self.deferred, (age - 2) * share)
 
     def finish_handover(self) -> None:
         """Finish the change of the local map now."""
         if self._handover is not None:
             self._handover.advance(self.deferred, self.deferred.width // BLOCK)
+            self.deferred.defer(self._handover.lost)
             self._handover = None
 
     @property
@@ -325,12 +326,13 @@ LARGEST_WHOLE_MAP = 350
 LARGEST_WHOLE_INVARIANT = 400
 # Smallest number of landmarks at which a local map may be too large.
 SMALLEST_LOCAL_MAP = 30
+SHARE = 0.5
 SHORT_PHASE = 4  # steps after which a phase has paid for its end
 # Limit of the extra landmarks, as a multiple of the landmarks of a scan.
 #
 # The multiple is one for every 400 mapped landmarks, at most 2.5: the end of a phase
 # costs a² n.
-LARGEST_RATIO, LANDMARKS_PER_RATIO = 2.5, 400
+LARGEST_RATIO, LANDMARKS_PER_RATIO = 2.5, 250
 
 
 def extra_landmarks(before: int, read: int, mapped: int, lasted: int) -> int:

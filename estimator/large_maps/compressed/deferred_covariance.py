@@ -25,6 +25,13 @@ LARGEST_BACKLOG = 400
 _EVERY_ROW = np.arange(BLOCK)
 
 
+class Downdate(NamedTuple):
+    """A change not yet applied to the stored covariance: P ← P − W diag(s) Wᵀ."""
+
+    root: Array  # W, shape (width, rank)
+    signs: Array  # s, shape (rank,), each 1 or -1
+
+
 class DeferredCovariance:
     """Lower half of a growing covariance, in blocks of rows, with pending downdates.
 
@@ -87,10 +94,13 @@ class DeferredCovariance:
         while self.width < columns:
             self._blocks.append(np.zeros((BLOCK, self.width + BLOCK)))
 
-    def read(self, blocks: range, columns: IntArray, rows: Array) -> None:
+    def read(
+        self, blocks: range, columns: IntArray, rows: Array, next_: Downdate
+    ) -> None:
         """Fill the part of rows (c, width) of P that some blocks store.
 
-        Pending downdates are subtracted; the columns (c,) are ascending.
+        Pending downdates are subtracted, and the next one, which is not pending yet.
+        The columns (c,) are ascending.
         """
         bounds = _bounds(columns, blocks)
         for k, start, end in zip(blocks, bounds, bounds[1:], strict=False):
@@ -98,7 +108,7 @@ class DeferredCovariance:
             if end > start:
                 rows[start:end, : first + BLOCK] = block[columns[start:end] - first]
             read_columns(block, first, columns[:start], rows)
-        for index, (root, signs) in enumerate(self._pending):
+        for index, (root, signs) in enumerate([*self._pending, next_]):
             applied = self._done if index == 0 else 0  # only the first has been begun
             left = range(max(blocks.start, applied), blocks.stop)
             first, last = left.start * BLOCK, left.stop * BLOCK
@@ -146,10 +156,10 @@ class DeferredCovariance:
         """
         return contents(self)
 
-    def defer(self, root: Array, signs: Array) -> None:
-        """Subtract W diag(s) Wᵀ later, W of shape (width, rank)."""
-        if len(signs):
-            self._pending.append(Downdate(root, signs))
+    def defer(self, downdate: Downdate) -> None:
+        """Subtract W diag(s) Wᵀ later."""
+        if len(downdate.signs):
+            self._pending.append(downdate)
 
     def work(self, rank: int) -> None:
         """Apply pending downdates, for the cost of one full downdate of this rank.
@@ -289,13 +299,6 @@ def _bounds(columns: IntArray, blocks: range) -> list[int]:
     starts = BLOCK * np.arange(blocks.start, blocks.stop + 1)
     bounds: list[int] = columns.searchsorted(starts).tolist()
     return bounds
-
-
-class Downdate(NamedTuple):
-    """A change not yet applied to the stored covariance: P ← P − W diag(s) Wᵀ."""
-
-    root: Array  # W, shape (width, rank)
-    signs: Array  # s, shape (rank,), each 1 or -1
 
 
 # What a saved state holds about downdates.

@@ -33,8 +33,8 @@ from ..multifrontal import pairs, symmetric
 from .deferred_covariance import (
     BLOCK,
     DeferredCovariance,
+    Downdate,
     fill_extended,
-    subtract,
     unpivot,
 )
 
@@ -223,6 +223,9 @@ def exchanged_rows(
     return rows, dict.fromkeys([old[k] for k in staying] + entering)
 
 
+UNKNOWN = Downdate(np.empty((0, 0)), np.empty(0))
+
+
 @dataclass
 class Handover:
     """Exchange of rows between the stored covariance and two local maps.
@@ -231,50 +234,62 @@ class Handover:
     which this happens.
     """
 
-    coefficients: Array  # Φ above Uᵀ of the old phase, shape (a + r, e)
+    old: Phase  # the end of the old phase
     strip: Array  # S of the old phase, shape (s, width)
-    # P_aa at the end of the old phase, without the columns of the pose.
-    covariance: Array
     rows: Exchanged
-    lost: Array  # W of the deferred downdate, shape (width, r), to be filled
     next_strip: Array  # S of the new phase, shape (s', width), to be filled
     invariant: bool
     group: int  # number of blocks that are exchanged at a time
     done: int = 0  # number of blocks that have been exchanged
+    #: What the old phase subtracts from the covariance of all landmarks outside it.
+    lost: Downdate = UNKNOWN
+    _coefficients: Array = field(init=False, repr=False)  # Φ above Uᵀ, (a + r, e)
     _values: Array = field(init=False, repr=False)
     _order: IntArray = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        self._values = np.zeros((len(self.covariance), len(self.lost)))
-        self._order = np.argsort(self.rows.own)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory that the exchange holds [bytes]."""
-        arrays = (self.coefficients, self.strip, self.covariance, self._values)
-        return sum(array.nbytes for array in arrays)
-
     def advance(self, stored: DeferredCovariance, blocks: int) -> None:
-        """Exchange groups of blocks until ``blocks`` are done, or all."""
-        count = len(self.lost) // BLOCK
+        """Exchange groups of blocks until ``blocks`` are done, or all.
+
+        The first call factors Ψ; with 0 blocks, it does no more.
+        """
+        count = stored.width // BLOCK
+        if self.lost is UNKNOWN:
+            self._prepare(stored.width)
         while self.done < min(blocks, count):
             last = min(self.done + self.group, count)
             self._exchange(stored, range(self.done, last))
             self.done = last
 
+    @property
+    def nbytes(self) -> int:
+        """Memory that the exchange holds [bytes]."""
+        arrays = [self.strip, self.old.covariance, self.old.gain, self.old.loss]
+        if self.lost is not UNKNOWN:
+            arrays += [self._coefficients, self._values, self.lost.root]
+        return sum(array.nbytes for array in arrays)
+
+    def _prepare(self, width: int) -> None:
+        root, signs = np.empty((0, self.old.gain.shape[1])), np.empty(0)
+        if len(self.old.loss):
+            root, signs = roots(self.old.loss, self.invariant)
+        self._coefficients = np.concatenate([self.old.gain, root])
+        self._values = np.zeros((len(self.old.mean), width))
+        self._order = np.argsort(self.rows.own)
+        self.lost = Downdate(np.zeros((width, len(signs))), signs)
+
     def _exchange(self, stored: DeferredCovariance, blocks: range) -> None:
         here, a = slice(blocks.start * BLOCK, blocks.stop * BLOCK), len(self._values)
-        if self.coefficients.size:
-            part = combine(self.coefficients, self.strip[:, here], self.invariant)
+        if self._coefficients.size:
+            part = combine(self._coefficients, self.strip[:, here], self.invariant)
             self._values[:, here] = part[:a]
-            self.lost[here] = part[a:].T
+            self.lost.root[here] = part[a:].T
         own = self._order[_within(self.rows.own[self._order], here)]
-        self._values[:, self.rows.own[own]] = self.covariance[:, own]
-        self.lost[self.rows.leaving[_within(self.rows.leaving, here)]] = 0.0
+        self._values[:, self.rows.own[own]] = self.old.covariance[:, 3 + own]
+        self.lost.root[self.rows.leaving[_within(self.rows.leaving, here)]] = 0.0
         stored.put(blocks, self.rows.leaving, self._values, self.rows.places)
         count = len(self.rows.kept)
         self.next_strip[:count, here] = self._values[self.rows.kept, here]
-        stored.read(blocks, self.rows.entering, self.next_strip[count:])
+        stored.read(blocks, self.rows.entering, self.next_strip[count:], self.lost)
 
 
 def begin_handover(
@@ -304,29 +319,15 @@ def begin_handover(
     covariance : ndarray, shape (a', a' - 3)
         Of pose and new local landmarks, without the columns of the pose.
     """
-    root, signs = np.empty((0, now.gain.shape[1])), np.empty(0)
-    if len(now.loss):
-        root, signs = roots(now.loss, invariant)
-    coefficients, a = np.concatenate([now.gain, root]), len(now.mean)
     entering = np.ascontiguousarray(strip[:, rows.entering])
-    near = combine(coefficients, entering, invariant)
     block = stored.marginal(rows.entering)
-    subtract(block, near[a:].T, signs)
+    lost = np.ascontiguousarray(combine(now.loss, entering, invariant).T)
+    block -= combine(lost, entering, invariant)  # Sᵀ Ψ S
     stored.forget(rows.leaving)
-    lost = np.zeros((stored.width, len(signs)))
-    stored.defer(lost, signs)
-    size = len(rows.kept) + len(rows.entering)
-    handover = Handover(
-        coefficients,
-        strip,
-        now.covariance[:, 3:],
-        rows,
-        lost,
-        np.empty((size, stored.width)),
-        invariant,
-        blocks_in_a_step(stored.width, hurried=hurried),
-    )
-    across = near[rows.kept]
+    next_strip = np.empty((len(rows.kept) + len(rows.entering), stored.width))
+    group = blocks_in_a_step(stored.width, hurried=hurried)
+    handover = Handover(now, strip, rows, next_strip, invariant, group)
+    across = combine(now.gain[rows.kept], entering, invariant)
     inside = now.covariance[np.ix_(rows.kept, rows.kept[3:])]
     return handover, np.block([[inside, across], [across[3:].T, symmetric(block)]])
 
