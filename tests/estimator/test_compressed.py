@@ -1,5 +1,6 @@
 """The compressed filter is the full filter: whatever it puts off, nothing is lost."""
 
+import copy
 import pickle
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ from drives import MEASUREMENT_STD
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from inner_parts import map_of, spied
+from interrupts import is_interrupted, lines_of
 from town_drives import TOWN_MOTION_STD, map_all, run, wander
 
 from slamgym.estimator import EkfSlam, InvariantEkfSlam, check_estimator
@@ -275,21 +277,49 @@ def test_no_step_does_more_of_the_map_than_a_full_update(jumping, monkeypatch):
 
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
 def test_a_change_of_the_local_map_is_spread_over_steps(base, monkeypatch):
-    """After a long phase, no step exchanges more than a quarter of the blocks."""
-    done = []
+    """After a long phase, no step exchanges more than a quarter of the blocks.
+
+    The step of the change exchanges none, nor does the next one, which factors Ψ.
+    """
+    done, factored, ages = [], [], []
 
     def count_blocks(self, stored, blocks):
         done[-1] += len(blocks)
 
+    def count_factors(self, width):
+        factored[-1] += 1
+
     slam = map_all(CompressedEkfSlam(*NOISE, base=base, local_size=40), 600)
     spied(monkeypatch, Handover, "_exchange", count_blocks)
+    spied(monkeypatch, Handover, "_factor", count_factors)
     for odometry, readings, ids in wander(600, 80):
         slam.predict(odometry)
         done.append(0)
+        factored.append(0)
         slam.update(readings, ids)
+        ages.append(slam._age)
     blocks = 1200 // BLOCK + 1
     assert max(done[10:]) <= blocks // 4
     assert sum(done[10:]) >= 2 * blocks
+    last = list(zip(ages, done, factored, strict=True))[10:]
+    assert {age for age, count, _ in last if count} == {3, 4, 5, 6, 7}
+    assert {age for age, _, count in last if count} == {2}
+
+
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_a_question_may_be_interrupted_while_it_finishes_a_change(base):
+    slam = map_all(CompressedEkfSlam(*NOISE, base=base), 150)
+    for odometry, readings, ids in wander(150, 80):
+        slam.predict(odometry)
+        slam.update(readings, ids)
+        if slam._age == 3:  # a part of the rows is exchanged
+            break
+    expected = copy.deepcopy(slam).belief()
+    finish = map_of(copy.deepcopy(slam)).finish_handover
+    for line in range(lines_of(finish)):
+        other = copy.deepcopy(slam)
+        assert is_interrupted(map_of(other).finish_handover, line)
+        assert_same_bits(other.belief(), expected)
 
 
 def test_what_it_stores_is_about_half_a_covariance():

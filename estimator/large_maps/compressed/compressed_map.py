@@ -172,7 +172,8 @@ class CompressedMap:
         Parameters
         ----------
         rank : int
-            The work is at most that of a full downdate of this rank.
+            That of a full update: the work is at most its downdate, and only a share
+            of it unless hurried.
         age : int
             Steps since the local map changed, including this one.
         hurried : bool
@@ -326,11 +327,14 @@ LARGEST_WHOLE_MAP = 350
 LARGEST_WHOLE_INVARIANT = 400
 # Smallest number of landmarks at which a local map may be too large.
 SMALLEST_LOCAL_MAP = 30
-SHARE = 0.5
 SHORT_PHASE = 4  # steps after which a phase has paid for its end
+# Share of a full downdate that one step applies to the stored covariance.
+#
+# A smaller share takes more steps: in the invariant frame, more than half of them.
+SHARE = 0.75
 # Limit of the extra landmarks, as a multiple of the landmarks of a scan.
 #
-# The multiple is one for every 400 mapped landmarks, at most 2.5: the end of a phase
+# The multiple is one for every 250 mapped landmarks, at most 2.5: the end of a phase
 # costs a² n.
 LARGEST_RATIO, LANDMARKS_PER_RATIO = 2.5, 250
 
@@ -352,7 +356,7 @@ def extra_landmarks(before: int, read: int, mapped: int, lasted: int) -> int:
     Examples
     --------
     >>> [extra_landmarks(9, 10, mapped, lasted=20) for mapped in (300, 1000, 5000)]
-    [7, 25, 25]
+    [12, 25, 25]
     >>> extra_landmarks(9, 10, 1000, lasted=1)  # scans far apart from each other
     4
     """

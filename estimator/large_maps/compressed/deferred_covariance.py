@@ -95,11 +95,11 @@ class DeferredCovariance:
             self._blocks.append(np.zeros((BLOCK, self.width + BLOCK)))
 
     def read(
-        self, blocks: range, columns: IntArray, rows: Array, next_: Downdate
+        self, blocks: range, columns: IntArray, rows: Array, coming: Downdate
     ) -> None:
         """Fill the part of rows (c, width) of P that some blocks store.
 
-        Pending downdates are subtracted, and the next one, which is not pending yet.
+        Pending downdates are subtracted, and one that is not pending yet.
         The columns (c,) are ascending.
         """
         bounds = _bounds(columns, blocks)
@@ -108,7 +108,7 @@ class DeferredCovariance:
             if end > start:
                 rows[start:end, : first + BLOCK] = block[columns[start:end] - first]
             read_columns(block, first, columns[:start], rows)
-        for index, (root, signs) in enumerate([*self._pending, next_]):
+        for index, (root, signs) in enumerate([*self._pending, coming]):
             applied = self._done if index == 0 else 0  # only the first has been begun
             left = range(max(blocks.start, applied), blocks.stop)
             first, last = left.start * BLOCK, left.stop * BLOCK
@@ -157,11 +157,12 @@ class DeferredCovariance:
         return contents(self)
 
     def defer(self, downdate: Downdate) -> None:
-        """Subtract W diag(s) Wᵀ later."""
-        if len(downdate.signs):
+        """Subtract W diag(s) Wᵀ later; once only if an interrupt repeats the call."""
+        is_new = all(downdate is not each for each in self._pending)
+        if is_new and len(downdate.signs):
             self._pending.append(downdate)
 
-    def work(self, rank: int) -> None:
+    def work(self, rank: float) -> None:
         """Apply pending downdates, for the cost of one full downdate of this rank.
 
         Blocks are changed as a whole; unused cost is kept for the next call.

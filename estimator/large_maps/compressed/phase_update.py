@@ -169,9 +169,10 @@ def _by_eigenvalues(part: Array) -> tuple[Array, Array]:
 # The rows of the landmarks that leave go back to the stored covariance, those of the
 # landmarks that enter are read, and Φ S becomes the strip of the new local map.  The
 # new phase needs none of this before it ends: it begins with the covariance of its own
-# landmarks alone.  The exchange therefore proceeds block by block.
+# landmarks alone.  Ψ is therefore factored in the step after the change, and the
+# exchange proceeds block by block in the steps that follow.
 
-SPREAD = 4  # steps that a change of the local map takes in a large map
+SPREAD = 4  # steps that an exchange takes in a large map
 
 
 def blocks_in_a_step(width: int, *, hurried: bool) -> int:
@@ -223,15 +224,12 @@ def exchanged_rows(
     return rows, dict.fromkeys([old[k] for k in staying] + entering)
 
 
-UNKNOWN = Downdate(np.empty((0, 0)), np.empty(0))
-
-
 @dataclass
 class Handover:
     """Exchange of rows between the stored covariance and two local maps.
 
     One group of blocks follows the other.  The results do not depend on the time at
-    which this happens.
+    which this happens.  The stored covariance must not change in between.
     """
 
     old: Phase  # the end of the old phase
@@ -241,8 +239,8 @@ class Handover:
     invariant: bool
     group: int  # number of blocks that are exchanged at a time
     done: int = 0  # number of blocks that have been exchanged
-    #: What the old phase subtracts from the covariance of all landmarks outside it.
-    lost: Downdate = UNKNOWN
+    is_factored: bool = False  # whether what follows is known
+    lost: Downdate = field(init=False, repr=False)  # to be deferred at the end
     _coefficients: Array = field(init=False, repr=False)  # Φ above Uᵀ, (a + r, e)
     _values: Array = field(init=False, repr=False)
     _order: IntArray = field(init=False, repr=False)
@@ -253,8 +251,8 @@ class Handover:
         The first call factors Ψ; with 0 blocks, it does no more.
         """
         count = stored.width // BLOCK
-        if self.lost is UNKNOWN:
-            self._prepare(stored.width)
+        if not self.is_factored:
+            self._factor(stored.width)
         while self.done < min(blocks, count):
             last = min(self.done + self.group, count)
             self._exchange(stored, range(self.done, last))
@@ -264,11 +262,11 @@ class Handover:
     def nbytes(self) -> int:
         """Memory that the exchange holds [bytes]."""
         arrays = [self.strip, self.old.covariance, self.old.gain, self.old.loss]
-        if self.lost is not UNKNOWN:
+        if self.is_factored:
             arrays += [self._coefficients, self._values, self.lost.root]
         return sum(array.nbytes for array in arrays)
 
-    def _prepare(self, width: int) -> None:
+    def _factor(self, width: int) -> None:
         root, signs = np.empty((0, self.old.gain.shape[1])), np.empty(0)
         if len(self.old.loss):
             root, signs = roots(self.old.loss, self.invariant)
@@ -276,6 +274,7 @@ class Handover:
         self._values = np.zeros((len(self.old.mean), width))
         self._order = np.argsort(self.rows.own)
         self.lost = Downdate(np.zeros((width, len(signs))), signs)
+        self.is_factored = True
 
     def _exchange(self, stored: DeferredCovariance, blocks: range) -> None:
         here, a = slice(blocks.start * BLOCK, blocks.stop * BLOCK), len(self._values)
