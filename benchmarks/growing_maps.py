@@ -47,7 +47,8 @@ Array = NDArray[np.float64]
 MOTION_STD, MEASUREMENT_STD = np.array([0.02, 0.01, 0.01]), np.array([0.01, 0.05])
 NOISE = (MOTION_STD, MEASUREMENT_STD)
 SEEN = 10
-REPEATED = 1000  # landmarks
+REPEATED = 1000  # landmarks up to which a drive is repeated
+LARGEST_FULL = 3000  # landmarks up to which there are full filters
 FASTEST = "ekf, half storage and dsyrk"
 CONSOLE = Console(width=110)
 
@@ -108,7 +109,7 @@ def dsyrk_floor(count: int) -> Step:
 
 def compare(count: int, steps: int, *, jumping: bool = False) -> dict[str, Costs]:
     """Measure every filter in a map with this number of landmarks."""
-    drives = 3 if count <= REPEATED else 1
+    drives = 1 if REPEATED < count <= LARGEST_FULL else 3
     return least(
         [
             compare_once(count, steps, jumping=jumping, backwards=k % 2 == 1)
@@ -129,7 +130,7 @@ def compare_once(
         "compressed": (step_of(slam), steps),
         "compressed invariant": (step_of(invariant), steps),
     }
-    if count <= 3000:
+    if count <= LARGEST_FULL:
         cases["floor"] = (dsyrk_floor(count), few)
         full = mapped(EkfSlam(*NOISE), count)
         cases["ekf"] = (step_of(full), few)

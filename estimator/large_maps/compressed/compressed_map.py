@@ -351,7 +351,7 @@ def extra_landmarks(before: int, read: int, mapped: int, lasted: int) -> int:
     mapped : int
         Landmarks in the map.
     lasted : int
-        Steps of the phase that ends.
+        Steps of the phase that ends; 0 for the first one.
 
     Examples
     --------
@@ -359,11 +359,13 @@ def extra_landmarks(before: int, read: int, mapped: int, lasted: int) -> int:
     [12, 25, 25]
     >>> extra_landmarks(9, 10, 1000, lasted=1)  # scans far apart from each other
     4
+    >>> extra_landmarks(0, 10, 1000, lasted=0)
+    25
     """
-    if lasted < SHORT_PHASE:
+    if 0 < lasted < SHORT_PHASE:
         return before // 2
-    ratio = min(LARGEST_RATIO, mapped / LANDMARKS_PER_RATIO)
-    return min(2 * before + 8, int(max(read, 4) * ratio))
+    most = int(max(read, 4) * min(LARGEST_RATIO, mapped / LANDMARKS_PER_RATIO))
+    return min(2 * before + 8, most) if lasted else most
 
 
 def choose_local(

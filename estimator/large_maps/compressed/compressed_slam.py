@@ -314,7 +314,8 @@ class CompressedEkfSlam:
                 f"scan, got {self._local_size}"
             )
         rests, extra = max(self._rests - 1, 0), self._extra
-        if self._age >= SHORT_PHASE and self._map.deferred.is_up_to_date:
+        is_short = 0 < self._age < SHORT_PHASE
+        if not is_short and self._map.deferred.is_up_to_date:
             rests = 2  # one short phase does not matter, several leave too much work
         size, mapped = self._local_size, len(self._map.slots)
         if size is None:
