@@ -331,7 +331,7 @@ SHORT_PHASE = 4  # steps after which a phase has paid for its end
 # Share of a full downdate that one step applies to the stored covariance.
 #
 # A smaller share takes more steps: in the invariant frame, more than half of them.
-SHARE = 0.75
+SHARE = 2 / 3
 # Limit of the extra landmarks, as a multiple of the landmarks of a scan.
 #
 # The multiple is one for every 250 mapped landmarks, at most 2.5: the end of a phase
