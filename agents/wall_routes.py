@@ -155,11 +155,16 @@ class WallRoutes:
         return np.array([each[np.minimum(steps, len(each) - 1)] for each in routes])
 
     def kept_clear(self, goals: Array) -> Array:
-        """Return goals (G, 2) moved to where the robot can stand, off the walls [m]."""
+        """Return goals (G, 2) moved to where the robot can stand, off the walls [m].
+
+        Goals of a robot that walls leave no such cell stay where they are.
+        """
         left, bottom, right, top = self._bounds
         low, high = np.array([left, bottom]), np.array([right, top])
         if self.is_open:
             return np.clip(goals, low + CLEARANCE, high - CLEARANCE)
+        if not self._free.size:
+            return goals
         points = _numbers(goals)
         nearest = self._free[np.abs(points[:, None] - self._free).argmin(axis=1)]
         return as_points(np.where(self._is_free(points), points, nearest))

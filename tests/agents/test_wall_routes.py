@@ -7,7 +7,7 @@ import pytest
 from scipy.sparse.csgraph import dijkstra
 
 from slamgym.agents import ActiveSlamEnv
-from slamgym.agents.active_slam_baselines import make_baseline
+from slamgym.agents.active_slam_baselines import BASELINES, make_baseline
 from slamgym.agents.active_slam_scores import VALIDATION, baseline_policy, run_episode
 from slamgym.agents.wall_routes import CoverageGrid
 from slamgym.sim_configs import load_scenario
@@ -116,3 +116,15 @@ def test_baselines_find_their_way_through_doors(name, rooms, steps):
     episode = run_episode(env, baseline_policy(baseline), seed)
     assert len(np.unique((episode.path > 0) @ [1, 2])) >= rooms
     assert not episode.crashed
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_every_baseline_acts_where_walls_leave_no_room(name):
+    r = 0.7
+    box = [[-r, -r, r, -r], [r, -r, r, r], [r, r, -r, r], [-r, r, -r, -r]]
+    easy = load_scenario("active_easy")
+    scenario = easy.with_changes(walls=[*easy.walls, *box])
+    env = ActiveSlamEnv(scenario)
+    env.reset(seed=1)
+    action = make_baseline(name, scenario, np.random.default_rng(0)).act(env.knowledge)
+    assert env.action_space.contains(np.asarray(action, env.action_space.dtype))
