@@ -298,7 +298,7 @@ class ManagedSlam:
         """Do what follows an update of the filter; return the whole report."""
         self._recent.note_scan(plan, scans, first, report)
         self._editor.expire()
-        view = self._editor.map_view()
+        view = self._editor.map_view(self._policy.reach(readings))
         self.candidates = plan.candidates_after(view)
         used = {i for i in plan.row_ids if i is not None}
         seen = used.intersection(view.ids)
@@ -389,14 +389,15 @@ class ManagedSlam:
 
     def snapshot(self) -> tuple[Any, ...]:
         """Return the present state, decisions included, for :meth:`resume`."""
-        kept = self.candidates, self.steps, self._report
+        kept = self._editor.within, self.candidates, self.steps, self._report
         parts = self._pruner.records.state(), self._recent.state()
         return snapshot(self._filter), *parts, *kept
 
     def resume(self, before: tuple[Any, ...]) -> None:
         """Return to a :meth:`snapshot` of a filter with the same settings."""
-        within, records, recent, self.candidates, self.steps, self._report = before
-        resume(self._filter, within)
+        inside, records, recent, self._editor.within, *own = before
+        self.candidates, self.steps, self._report = own
+        resume(self._filter, inside)
         self._pruner.records.restore(records)
         self._recent.restore(recent)
         self._editor.expire()

@@ -63,7 +63,7 @@ class MapPruner:
 
     def expected(self, scan: Array) -> set[int]:
         """Return the landmarks that a scan (m, 2) should show; changes nothing."""
-        view, policy = self._editor.map_view(), self._policy
+        view, policy = self._editor.map_view(self._policy.reach(scan)), self._policy
         if policy.remove_after is None or policy.view is None or not view.ids:
             return set()
         mask = policy.view.expects(view.mean[:3].copy(), view.landmarks, scan)

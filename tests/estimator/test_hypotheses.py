@@ -488,3 +488,12 @@ def test_readings_that_a_hypothesis_does_not_explain_cost_their_poisson_probabil
         free.update(scan)
         told.update(scan)
     assert expected > 0.5
+
+
+def test_a_copy_sees_as_far_as_its_original():
+    """A filter for large maps shows a part of its map: as far as the last view."""
+    noise = (0.1, 0.1, 0.05), (0.02, 0.1)
+    slam, copy = (ManagedSlam(EkfSlam, *noise, management=True) for _ in "ab")
+    slam.update([(0.5, 4.0), (-0.7, 6.0)])
+    copy.resume(slam.snapshot())
+    assert copy._editor.within == slam._editor.within == 6.0
