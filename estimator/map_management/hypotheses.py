@@ -461,9 +461,9 @@ class HypothesisSlam:
         self, hypotheses: list[Hypothesis], others: Sequence[ManagedSlam] = ()
     ) -> None:
         """Continue with these hypotheses, and reuse all other filters."""
-        slams = *self._slams, *others
+        slams, kept = [*self._slams, *others], [h.slam for h in hypotheses]
         self.hypotheses = hypotheses
-        self._pool.free(slam for slam in slams if slam not in self._slams)
+        self._pool.free(slam for slam in slams if slam not in kept)
 
     def __repr__(self) -> str:
         count = len(self.hypotheses)

@@ -389,14 +389,13 @@ class ManagedSlam:
 
     def snapshot(self) -> tuple[Any, ...]:
         """Return the present state, decisions included, for :meth:`resume`."""
-        kept = self._editor.within, self.candidates, self.steps, self._report
+        kept = self.candidates, self.steps, self._report
         parts = self._pruner.records.state(), self._recent.state()
         return snapshot(self._filter), *parts, *kept
 
     def resume(self, before: tuple[Any, ...]) -> None:
         """Return to a :meth:`snapshot` of a filter with the same settings."""
-        inside, records, recent, self._editor.within, *own = before
-        self.candidates, self.steps, self._report = own
+        inside, records, recent, self.candidates, self.steps, self._report = before
         resume(self._filter, inside)
         self._pruner.records.restore(records)
         self._recent.restore(recent)

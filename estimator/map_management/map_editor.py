@@ -50,8 +50,7 @@ class MapEditor:
     def __init__(self, slam: SlamEstimator, *, merging: bool = True) -> None:
         self._slam: Any = slam
         self._view: MapView | None = None
-        #: How far the last view reached [m].
-        self.within = 0.0
+        self._within = 0.0
         wanted = ("remove", "merge") if merging else ("remove",)
         has_all = all(hasattr(slam, name) for name in wanted)
         self._has_methods = has_all and not hides_its_belief(slam)
@@ -72,22 +71,22 @@ class MapEditor:
         Landmarks farther away than ``within`` [m] may be left out; by default, this is
         the distance of the last time.
         """
-        reach = self.within if within is None else within
-        if self._view is None or reach > self.within:
+        reach = self._within if within is None else within
+        if self._view is None or reach > self._within:
             if self._has_methods and hasattr(self._slam, "local_view"):
                 self._view = self._slam.local_view(reach)
             else:
                 self._view = view_map(self._slam)
-        self.within = reach
+        self._within = reach
         return self._view
 
     def bookmark(self) -> Undo:
         """Return what takes back later views, also where the filter notes them."""
-        within = self.within
+        within = self._within
         undo_slam = bookmark(self._slam) if hasattr(self._slam, "local_view") else None
 
         def undo() -> None:
-            self._view, self.within = None, within
+            self._view, self._within = None, within
             if undo_slam is not None:
                 undo_slam()
 

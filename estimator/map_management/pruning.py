@@ -327,7 +327,8 @@ class LandmarkRecords(Restorable):
 
     def forget_pairs(self, ids: Sequence[int]) -> None:
         """Drop which landmarks are known to differ from removed ones."""
-        self.apart = {pair for pair in self.apart if set(ids).isdisjoint(pair)}
+        gone = set(ids)
+        self.apart = {pair for pair in self.apart if gone.isdisjoint(pair)}
 
     def by_information(self, ids: Sequence[int]) -> list[int]:
         """Sort landmarks by information, the least first, of equals the newest."""

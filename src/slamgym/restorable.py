@@ -29,6 +29,7 @@ class Restorable:
     def restore(self, state: State) -> None:
         """Return to a state of this object, which stays usable for further calls."""
         attributes, values = vars(self), iter(state)
+        # The names end first: zip then has taken no value too many.
         for name, value in zip(self.changing, values, strict=False):
             if not put_back(attributes[name], value):
                 attributes[name] = copied(value)
