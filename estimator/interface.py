@@ -658,6 +658,13 @@ class UpdateReport:
         parts = {name: getattr(self, name) for name in _PARTS}
         return UpdateReport(**parts | changes)
 
+    def completed(self, **parts: Any) -> UpdateReport:
+        """Return the report with parts that its filter did not know.
+
+        It may be this report itself, so nobody else may hold it.
+        """
+        return self.replace(**parts)
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, UpdateReport):
             return NotImplemented

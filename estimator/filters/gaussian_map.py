@@ -631,6 +631,11 @@ class ScanReport(UpdateReport):
         self.detach()
         return self.__dict__
 
+    def completed(self, **parts: Any) -> ScanReport:
+        """Take parts that the filter did not know, without reading the others."""
+        self.__dict__.update(parts)
+        return self
+
     @cached_property
     def nis(self) -> float:
         """νᵀ S⁻¹ ν, χ² distributed when the filter is consistent."""
@@ -654,39 +659,46 @@ class ScanReport(UpdateReport):
     @cached_property
     def associated_ids(self) -> tuple[int, ...]:
         """Mapped landmarks whose readings corrected the belief."""
-        return self._readings_with(gain.OUTCOME, gain.USED)
+        return self._with_outcome(gain.USED)
 
     @cached_property
     def added_ids(self) -> tuple[int, ...]:
         """Landmarks that entered the map."""
-        return self._readings_with(gain.OUTCOME, gain.ADDED)
+        return self._with_outcome(gain.ADDED)
 
     @cached_property
     def rejected_ids(self) -> tuple[int, ...]:
         """Mapped landmarks whose readings the chi-square gate rejected."""
-        return self._readings_with(gain.OUTCOME, gain.GATED)
+        return self._with_outcome(gain.GATED)
 
     @cached_property
     def skipped_ids(self) -> tuple[int, ...]:
         """Landmarks whose readings are too close to use."""
-        return self._readings_with(gain.OUTCOME, gain.SKIPPED)
+        return self._with_outcome(gain.SKIPPED)
 
     @cached_property
     def near_ids(self) -> tuple[int, ...]:
         """Mapped landmarks within 10 σ of the robot."""
-        return self._readings_with(gain.NEAR, 1)
+        return tuple([i for i, is_near in self._entries(gain.NEAR) if is_near])
 
     @cached_property
     def innovation(self) -> Array:
         """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
         return self._record.rows[:, gain.INNOVATION].reshape(-1, 2)
 
-    def _readings_with(self, row: int, value: int) -> tuple[int, ...]:
-        """Return the landmarks of the readings that have a value in the ledger."""
+    def _with_outcome(self, value: int) -> tuple[int, ...]:
+        """Return the landmarks of the readings with an outcome."""
+        return tuple([i for i, found in self._outcomes if found == value])
+
+    @cached_property
+    def _outcomes(self) -> list[tuple[int, int]]:
+        return self._entries(gain.OUTCOME)
+
+    def _entries(self, row: int) -> list[tuple[int, int]]:
+        """Return the landmark of each reading, and its entry in a row of the ledger."""
         if self.is_detached:
             ids, values = self._record.scan_ids, self._record.ledger[row]
         else:  # without a copy of the rows, which are large
             parts, count = self._parts, self._parts.numbers[SCANNED]
             ids, values = parts.scan_ids[:count], parts.ledger[row, :count]
-        readings = zip(ids.tolist(), values.tolist(), strict=True)
-        return tuple([i for i, found in readings if found == value])
+        return [*zip(ids.tolist(), values.tolist(), strict=True)]

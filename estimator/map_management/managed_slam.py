@@ -306,7 +306,7 @@ class ManagedSlam:
         removed, merged = self._pruner.prune(readings, plan, seen, missed)
         self._recent.note_edits(removed, merged)
         made = self.decisions[-1]
-        self._report = report.replace(
+        self._report = report.completed(
             removed_ids=tuple(removed),
             merged_ids=tuple(merged),
             confirmed_ids=tuple(i for i in made.added if i in plan.confirmed),
