@@ -50,7 +50,7 @@ class MapEditor:
     def __init__(self, slam: SlamEstimator, *, merging: bool = True) -> None:
         self._slam: Any = slam
         self._view: MapView | None = None
-        self._within = 0.0
+        self._within, self._is_local = 0.0, hasattr(slam, "local_view")
         wanted = ("remove", "merge") if merging else ("remove",)
         has_all = all(hasattr(slam, name) for name in wanted)
         self._has_methods = has_all and not hides_its_belief(slam)
@@ -73,7 +73,7 @@ class MapEditor:
         """
         reach = self._within if within is None else within
         if self._view is None or reach > self._within:
-            if self._has_methods and hasattr(self._slam, "local_view"):
+            if self._has_methods and self._is_local:
                 self._view = self._slam.local_view(reach)
             else:
                 self._view = view_map(self._slam)
@@ -83,7 +83,7 @@ class MapEditor:
     def bookmark(self) -> Undo:
         """Return what takes back later views, also where the filter notes them."""
         within = self._within
-        undo_slam = bookmark(self._slam) if hasattr(self._slam, "local_view") else None
+        undo_slam = bookmark(self._slam) if self._is_local else None
 
         def undo() -> None:
             self._view, self._within = None, within

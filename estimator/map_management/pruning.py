@@ -15,7 +15,7 @@ from ..association.scan_association import ScanAssociation
 from ..filters.conditioning import separation
 from ..interface import MapView
 from ..support import saved_states
-from ..support.undo import Undo, contents
+from ..support.undo import Undo, attributes
 from .loop_closing import Pairs, doubtful_after, lost, same_landmarks, without_lost
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy
@@ -53,7 +53,7 @@ class MapPruner:
 
     def bookmark(self) -> Undo:
         """Return what takes back later changes of what is remembered."""
-        return contents(self, self.records)
+        return attributes(self, self.records)
 
     def view_for(self, readings: Array) -> MapView:
         """Return a view of the landmarks that readings (m, 2) may belong to."""
@@ -120,17 +120,17 @@ class MapPruner:
         """Record the landmarks that a scan has shown, and that they differ."""
         view, within = self._editor.map_view(), self._policy.merge_within
         self.records.follow(view.mapped)
-        rows = [row for row, i in enumerate(row_ids) if i in seen]
-        ids = [i for i in row_ids if i is not None and i in seen]
-        if not ids:
+        if not seen:
             return
+        shown = [i if i in seen else None for i in row_ids]
         heading = float(view.mean[2])
-        self.records.note_sightings(ids, readings[rows], heading, self._noise)
+        self.records.note_sightings(shown, readings, heading, self._noise)
         if within is not None:
+            ids = [i for i in shown if i is not None]
             places = view.landmarks[self._places(view, ids)]
             close = _distances(places, places) < 2 * within
-            for i, j in np.argwhere(np.triu(close, 1)).tolist():
-                self.records.apart.add(_ordered(ids[i], ids[j]))
+            pairs = np.argwhere(np.triu(close, 1)).tolist()
+            self.records.note_apart(_ordered(ids[i], ids[j]) for i, j in pairs)
 
     def _remove_missing(self, missed: set[int]) -> list[int]:
         """Count a miss for each landmark of ``missed``; remove those missed too often.
@@ -140,7 +140,7 @@ class MapPruner:
         most, records = self._policy.remove_after, self.records
         if most is None:
             return []
-        records.misses[records.slots(missed)] += 1
+        records.count_misses(missed)
         overdue = np.flatnonzero(records.misses >= most)
         return self.remove([records.ids[k] for k in overdue.tolist()])
 
@@ -254,8 +254,11 @@ class LandmarkRecords(Restorable):
     [7, 9]
     """
 
-    changing = ("sightings", "misses", "information", "apart")
-    replaced = ("ids", "_slots", "aliases", "doubtful")
+    changing = ()
+    replaced = (
+        *("ids", "_slots", "sightings", "misses", "information"),
+        *("apart", "aliases", "doubtful"),
+    )
 
     def __init__(self) -> None:
         self.ids: tuple[int, ...] = ()
@@ -287,7 +290,7 @@ class LandmarkRecords(Restorable):
 
     def note_sightings(
         self,
-        ids: Sequence[int],
+        ids: Sequence[int | None],
         readings: Array,
         heading: float,
         noise: tuple[float, float, float, float],
@@ -296,20 +299,34 @@ class LandmarkRecords(Restorable):
 
         Parameters
         ----------
-        ids : sequence of int
-            The landmarks, without repetition.
+        ids : sequence of int or None, length m
+            The landmark of each reading, if any, without repetition.
         readings : ndarray, shape (m, 2)
-            Readings of these landmarks, rows (β, r) [rad, m].
+            The scan, rows (β, r) [rad, m].
         heading : float
             Heading of the robot [rad].
         noise : tuple of float
             The first four fields of :class:`Noise`.  A plain tuple reaches a kernel
             faster.
         """
-        slots = self.slots(ids)
-        self.sightings[slots] += 1
-        self.misses[slots] = 0
-        _add_information(self.information, slots, readings, heading, noise)
+        slots = self._slots
+        rows = np.array([-1 if i is None else slots[i] for i in ids], dtype=np.int64)
+        _add_sightings(self._renewed(), rows, readings, heading, noise)
+
+    def _renewed(self) -> tuple[IntArray, IntArray, Array]:
+        """Replace the arrays by copies, which may be changed; return these."""
+        self.sightings, self.misses = self.sightings.copy(), self.misses.copy()
+        self.information = self.information.copy()
+        return self.sightings, self.misses, self.information
+
+    def count_misses(self, ids: Iterable[int]) -> None:
+        """Count one miss of each landmark."""
+        self._renewed()[1][self.slots(ids)] += 1
+
+    def note_apart(self, pairs: Iterable[tuple[int, int]]) -> None:
+        """Remember pairs of landmarks that differ."""
+        if not self.apart.issuperset(new := [*pairs]):
+            self.apart = self.apart.union(new)
 
     def slots(self, ids: Iterable[int]) -> IntArray:
         """Return the places of landmarks in the order of the map."""
@@ -318,9 +335,10 @@ class LandmarkRecords(Restorable):
     def join(self, kept: int, gone: int) -> None:
         """Add the records of one landmark to those of another."""
         i, j = self._slots[kept], self._slots[gone]
-        self.sightings[i] += self.sightings[j]
-        self.information[i] += self.information[j]
-        self.misses[i] = min(self.misses[i], self.misses[j])
+        sightings, misses, information = self._renewed()
+        sightings[i] += sightings[j]
+        information[i] += information[j]
+        misses[i] = min(misses[i], misses[j])
         earlier = {i: kept for i, j in self.aliases.items() if j == gone}
         self.aliases = {**self.aliases, gone: kept, **earlier}
         self.apart = {_renamed(pair, gone, kept) for pair in self.apart}
@@ -364,16 +382,24 @@ RECORDS: saved_states.Table = {
 
 
 @jit
-def _add_information(
-    information: Array,
+def _add_sightings(
+    counts: tuple[IntArray, IntArray, Array],
     slots: IntArray,
     readings: Array,
     heading: float,
     noise: tuple[float, float, float, float],
 ) -> None:
-    """Λ ← Λ + H_lᵀ Q⁻¹ H_l for each reading, as xx, xy, yy in the rows ``slots``."""
+    """Count a sighting by each reading with a slot ≥ 0; Λ ← Λ + H_lᵀ Q⁻¹ H_l.
+
+    The counts are sightings, misses and, as xx, xy, yy, the information.
+    """
+    sightings, misses, information = counts
     bearing_std, range_std, per_metre, metres = noise
     for k in range(len(slots)):
+        if slots[k] < 0:
+            continue
+        sightings[slots[k]] += 1
+        misses[slots[k]] = 0
         bearing, distance = readings[k, 0] + heading, readings[k, 1]
         along = (range_std + per_metre * distance) ** -2.0
         across = (max(distance, 1e-12) * bearing_std + metres) ** -2.0

@@ -327,8 +327,10 @@ class RecentScan(NamedTuple):
 
     def feed(self, slam: SlamEstimator) -> UpdateReport:
         """Update a filter with the rows that it uses."""
-        rows = [row for row, i in enumerate(self.row_ids) if i is not None]
         ids = [i for i in self.row_ids if i is not None]
+        if len(ids) == len(self.row_ids):
+            return slam.update(self.readings, ids)
+        rows = [row for row, i in enumerate(self.row_ids) if i is not None]
         return slam.update(self.readings[rows], ids)
 
     def without(self, landmark_id: int) -> RecentScan:
