@@ -21,6 +21,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
+from ...jit import jit
 from ..association.constellations import Constellations, TwoPlaces, match_constellations
 from ..interface import MapView
 
@@ -50,15 +51,14 @@ def lost(view: MapView, rules: Constellations | None) -> BoolArray:
     Unless the rules say always, none is as long as no constellation can be recognised,
     with few landmarks around the robot or in the map.
     """
-    if rules is None or not view.ids:
-        return np.zeros(len(view.ids), dtype=np.bool_)
-    std, least = _relative_std(view), rules.least
-    is_lost = np.asarray(std > rules.lost_std)
-    local = np.count_nonzero(std <= LOCAL_STD * rules.lost_std)
-    elsewhere = len(view.mapped) - np.count_nonzero(~is_lost)
+    is_lost = np.zeros(len(view.ids), dtype=np.bool_)
+    if rules is None or not (rules.always or len(view.mapped) >= 2 * rules.least):
+        return is_lost
+    limit, least = float(rules.lost_std), rules.least
+    local, known = _find_lost(view.mean, view.covariance, limit, is_lost)
     is_part = view.whole is not None  # landmarks near the robot may be left out
-    can_match = (local >= least or is_part) and elsewhere >= 2 * least
-    return is_lost & (can_match or rules.always)
+    can_match = (local >= least or is_part) and len(view.mapped) - known >= 2 * least
+    return is_lost if can_match or rules.always else np.zeros_like(is_lost)
 
 
 def without_lost(view: MapView, rules: Constellations | None, within: float) -> MapView:
@@ -169,18 +169,30 @@ def _recognised(
     ]
 
 
-def _relative_std(view: MapView) -> Array:
-    """Return the largest σ of each landmark relative to the robot, shape (n,) [m]."""
-    mean, P, end = view.mean, view.covariance, 3 + 2 * len(view.ids)
-    x, y, variances = slice(3, end, 2), slice(4, end, 2), P.diagonal()
-    along, across = mean[1] - mean[y], mean[x] - mean[0]  # J (l − p)
-    turn_x, turn_y = P[x, 2] - P[0, 2], P[y, 2] - P[1, 2]
-    xx = variances[x] + P[0, 0] - 2 * P[x, 0] - 2 * turn_x * along
-    yy = variances[y] + P[1, 1] - 2 * P[y, 1] - 2 * turn_y * across
-    xy = P.diagonal(1)[x] + P[0, 1] - P[x, 1] - P[y, 0]
-    xy = xy - turn_x * across - turn_y * along + P[2, 2] * along * across
-    xx, yy = xx + P[2, 2] * along * along, yy + P[2, 2] * across * across
-    return _largest_std(xx, xy, yy)
+@jit
+def _find_lost(
+    mean: Array, P: Array, limit: float, is_lost: BoolArray
+) -> tuple[int, int]:
+    """Mark landmarks whose largest σ relative to the robot exceeds a limit [m].
+
+    Return how many are local, and how many are not lost.
+    """
+    local, known = 0, 0
+    for j in range(len(is_lost)):
+        x, y = 3 + 2 * j, 4 + 2 * j
+        along, across = mean[1] - mean[y], mean[x] - mean[0]  # J (l − p)
+        turn_x, turn_y = P[x, 2] - P[0, 2], P[y, 2] - P[1, 2]
+        xx = P[x, x] + P[0, 0] - 2 * P[x, 0] - 2 * turn_x * along
+        yy = P[y, y] + P[1, 1] - 2 * P[y, 1] - 2 * turn_y * across
+        xy = P[x, y] + P[0, 1] - P[x, 1] - P[y, 0]
+        xy = xy - turn_x * across - turn_y * along + P[2, 2] * along * across
+        xx, yy = xx + P[2, 2] * along * along, yy + P[2, 2] * across * across
+        largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
+        std = np.sqrt(max(largest, 0.0))
+        is_lost[j] = std > limit
+        local += std <= LOCAL_STD * limit
+        known += not std > limit
+    return local, known
 
 
 def _offsets(view: MapView, some: IntArray, others: IntArray) -> tuple[Array, Array]:
@@ -198,13 +210,8 @@ def _offsets(view: MapView, some: IntArray, others: IntArray) -> tuple[Array, Ar
     squared = np.full((m, n), np.inf)
     product = yy * x * x - 2 * xy * x * y + xx * y * y
     np.divide(product, determinant, out=squared, where=determinant > 0)
-    return squared, _largest_std(xx, xy, yy)
-
-
-def _largest_std(xx: Array, xy: Array, yy: Array) -> Array:
-    """Return the largest standard deviation of covariances (xx, xy, yy)."""
     largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
-    return np.sqrt(np.maximum(largest, 0.0))
+    return squared, np.sqrt(np.maximum(largest, 0.0))
 
 
 def _invariant(view: MapView, slots: IntArray) -> Array:
