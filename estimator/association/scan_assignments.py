@@ -14,18 +14,16 @@ import numpy as np
 from scipy.special import chdtri
 
 from ...arrays import Array, IntArray
-from ...jit import jit
+from ...jit import jit, njit_internal
 from ..interface import MapView
 from ..kernels.assignment_search import (
     UNPAIRED,
-    Problem,
-    fill_distances,
+    best_assignments,
     fill_expected,
     largest_change,
     reading_covariance,
-    search_assignments,
 )
-from ..models.bearing_range import reading_slopes_jit, wrap_angle, wrap_angle_jit
+from ..models.bearing_range import reading_slopes_jit, wrap_angle_jit
 from ..support import argument_checks
 
 #: Assignments of a scan e^8 times less likely than the best one are not considered.
@@ -60,7 +58,7 @@ def assign_scan(
     view: MapView,
     readings: Array,
     noise: Noise,
-    density: float | Array,
+    density: Array,
     *,
     ceiling: float = np.inf,
     most: int | None = None,
@@ -77,7 +75,7 @@ def assign_scan(
         Rows (β, r) [rad, m].
     noise : Noise
         Of the sensor.
-    density : float or ndarray, shape (m,)
+    density : ndarray, shape (m,)
         Readings per scan that belong to no landmark of the map, where each reading is
         [1 / (rad m)].
     ceiling : float
@@ -85,77 +83,101 @@ def assign_scan(
     most : int, optional
         How many assignments at most, if fewer than the policy considers.
     """
-    fit = innovation_distances(view, readings, noise, policy.new_gate)
-    explained = np.flatnonzero(np.isfinite(fit.squared).any(axis=0))
     if policy.association == "nearest":
+        fit = innovation_distances(view, readings, noise, policy.new_gate)
+        explained = np.flatnonzero(np.isfinite(fit.squared).any(axis=0))
         gates = {"match": policy.match_gate, "new": policy.new_gate}
         slots = nearest_neighbours(fit, **gates, ambiguity=policy.ambiguity)
         return Assignments([Assignment(0.0, slots)], explained)
-    expected, joint = predicted_readings(view.mean, view.covariance, explained)
     pairs_first, count = policy.association == "compatibility", len(readings)
-    problem = Problem(
-        innovations=innovations_of(readings, expected),
-        joint=joint,
-        variances=_likely_variances(readings, expected, joint, noise),
-        feasible=fit.squared[:, explained] <= policy.pair_gate,
-        missing=np.zeros(count) if pairs_first else missing_costs(density, count),
-        gate=policy.pair_gate,
-        limits=_limits(policy, count),
-        pairs_first=pairs_first,
-    )
+    missing = np.zeros(count) if pairs_first else missing_costs(density)
     if most is None:
         most = policy.branches if policy.association == "hypotheses" else 1
-    found = best_assignments(
-        problem,
-        most=most,
-        spread=BRANCH_SPREAD,
-        ceiling=ceiling,
-        nodes=policy.search_nodes,
+    costs, slots, explained = assign_jointly(
+        (view.mean, view.covariance, len(view.ids)),
+        readings,
+        tuple(noise),
+        (missing, _limits(policy, count), pairs_first),
+        (float(policy.new_gate), float(policy.pair_gate), float(ceiling)),
+        (most, policy.search_nodes),
     )
-    ranked, chosen = [], list[IntArray]()
-    for cost, marks, distances in zip(*found[:3], strict=True):
-        slots = _slots(policy, marks, distances, explained)
-        if not _is_superfluous(problem, marks, slots, chosen):
-            chosen.append(marks)
-            ranked.append(Assignment(float(cost), slots))
-    return Assignments(ranked, explained)
-
-
-def _is_superfluous(
-    problem: Problem, marks: IntArray, slots: IntArray, better: list[IntArray]
-) -> bool:
-    """Return whether these only leave out readings that hardly change the belief."""
-    ambiguous, of_scan = slots == AMBIGUOUS, tuple(problem)
-    return any(
-        ambiguous[marks != other].all() and largest_change(of_scan, other, marks) < SAME
-        for other in better
-    )
-
-
-def _likely_variances(
-    readings: Array, expected: Array, joint: Array, noise: Noise
-) -> Array:
-    """Return (σβ², σr²) of each pair, shape (m, J, 2); above 0, for their logarithm."""
-    variances = np.empty((len(readings), len(expected), 2))
-    spread = np.diagonal(joint)[1::2]
-    _fill_variances(readings[:, 1], expected[:, 1], spread, tuple(noise), variances)
-    return variances
+    if not len(explained):
+        costs[0] = missing.sum()
+    return Assignments([*map(Assignment, costs.tolist(), slots)], explained)
 
 
 @jit
-def _fill_variances(
-    ranges: Array,
-    expected: Array,
-    spread: Array,
+def assign_jointly(
+    belief: tuple[Array, Array, int],
+    readings: Array,
     of_sensor: tuple[float, ...],
-    variances: Array,
-) -> None:
-    noise = Noise(*of_sensor)
-    for i in range(len(ranges)):
-        for j in range(len(expected)):
-            found = likely_variances_jit(noise, ranges[i], expected[j], spread[j])
-            variances[i, j, 0] = max(found[0], TINY)
-            variances[i, j, 1] = max(found[1], TINY)
+    of_problem: tuple[Array, Array, bool],
+    gates: tuple[float, float, float],
+    search: tuple[int, int],
+) -> tuple[Array, IntArray, IntArray]:
+    """Return costs (M,), slots (M, m) and the explained landmarks (k,).
+
+    Parameters
+    ----------
+    belief : tuple
+        Mean, covariance and number of landmarks of the map.
+    readings : ndarray, shape (m, 2)
+    of_sensor : tuple
+        The fields of a :class:`Noise`.
+    of_problem : tuple
+        ``missing``, ``limits`` and ``pairs_first`` of the :class:`Problem`.
+    gates : tuple
+        Those of new landmarks and of pairs, and the ceiling of the cost.
+    search : tuple
+        How many assignments at most, and the limit of nodes.
+    """
+    (mean, P, landmarks), (missing, limits, pairs_first) = belief, of_problem
+    (new_gate, pair_gate, ceiling), (most, nodes) = gates, search
+    noise, rows = Noise(*of_sensor), len(readings)
+    squared = np.full((rows, landmarks), np.inf)
+    of_pairs = squared, squared.copy()
+    _compare(mean, P, readings, of_sensor, new_gate, of_pairs)
+    explained = np.flatnonzero(np.array([np.isfinite(d).any() for d in squared.T]))
+    near = len(explained)
+    expected, joint = np.empty((near, 2)), np.empty((2 * near, 2 * near))
+    fill_expected(mean, P, explained, expected, joint)
+    innovations, variances = np.empty((rows, near, 2)), np.empty((rows, near, 2))
+    feasible = np.empty((rows, near), np.bool_)
+    for i in range(rows):
+        for j in range(near):
+            bearing, distance = readings[i, 0] - expected[j, 0], expected[j, 1]
+            innovations[i, j, 0] = wrap_angle_jit(bearing)
+            innovations[i, j, 1] = readings[i, 1] - distance
+            spread = joint[2 * j + 1, 2 * j + 1]
+            q = likely_variances_jit(noise, readings[i, 1], distance, spread)
+            variances[i, j, 0], variances[i, j, 1] = max(q[0], TINY), max(q[1], TINY)
+            feasible[i, j] = squared[i, explained[j]] <= pair_gate
+    of_scan = innovations, joint, variances, feasible, missing
+    problem = *of_scan, pair_gate, limits, pairs_first
+    found = best_assignments(problem, most, BRANCH_SPREAD, ceiling, nodes)
+    costs, marks, distances, _ = found
+    slots, kept = np.empty_like(marks), 0
+    for s in range(len(costs)):
+        for i in range(rows):
+            slots[s, i] = AMBIGUOUS if distances[s, i] <= new_gate else NEW
+            if marks[s, i] != UNPAIRED:
+                slots[s, i] = explained[marks[s, i]]
+        if not _is_superfluous(problem, marks[:kept], marks[s], slots[s]):
+            costs[kept], marks[kept], slots[kept] = costs[s], marks[s], slots[s]
+            kept += 1
+    return costs[:kept], slots[:kept], explained
+
+
+@njit_internal
+def _is_superfluous(
+    of_scan: tuple[Any, ...], better: IntArray, marks: IntArray, slots: IntArray
+) -> bool:
+    """Return whether these only leave out readings that hardly change the belief."""
+    for other in better:
+        is_part = (slots[marks != other] == AMBIGUOUS).all()
+        if is_part and largest_change(of_scan, other, marks) < SAME:
+            return True
+    return False
 
 
 def _limits(policy: AssociationPolicy, rows: int) -> Array:
@@ -167,25 +189,15 @@ def _limits(policy: AssociationPolicy, rows: int) -> Array:
     return limits
 
 
-def missing_costs(density: float | Array, rows: int) -> Array:
+def missing_costs(density: Array) -> Array:
     """Return λ = −2 ln ρ − 2 ln 2π of each reading, its cost without a landmark.
 
     Examples
     --------
-    >>> missing_costs(0.02, 2).round(2)
-    array([4.15, 4.15])
+    >>> missing_costs(np.array([0.02])).round(2)
+    array([4.15])
     """
-    return np.full(rows, -2 * np.log(density) - 2 * np.log(2 * np.pi))
-
-
-def _slots(
-    policy: AssociationPolicy, marks: IntArray, distances: Array, explained: IntArray
-) -> IntArray:
-    """Translate marks into slots; unpaired readings near a landmark are ambiguous."""
-    slots = np.where(distances <= policy.new_gate, AMBIGUOUS, NEW)
-    paired = marks != UNPAIRED
-    slots[paired] = explained[marks[paired]]
-    return np.asarray(slots, dtype=np.int64)
+    return np.asarray(-2 * np.log(density) - 2 * np.log(2 * np.pi))
 
 
 ASSOCIATIONS = ("auto", "nearest", "joint", "compatibility", "hypotheses")
@@ -497,105 +509,3 @@ def nearest_neighbours(
 # The k readings still open add at least the following, since C ⪯ k blockdiag(Cⱼⱼ)::
 #
 #     Σᵢ min(λᵢ, minⱼ νᵀ (k Cⱼⱼ + Q)⁻¹ ν + ln det Q)
-
-
-class Solutions(NamedTuple):
-    """The best assignments, the cheapest first."""
-
-    #: Shape (M,).
-    costs: Array
-    #: Landmark 0 … J − 1 of each reading or `UNPAIRED`, shape (M, m).
-    marks: IntArray
-    #: Least νᵀ S⁻¹ ν of each unpaired reading to a landmark without a reading, given
-    #: the pairs, shape (M, m).
-    distances: Array
-    #: False where the search stopped at its limit of nodes.
-    is_complete: bool
-
-
-def predicted_readings(
-    mean: Array, covariance: Array, slots: IntArray
-) -> tuple[Array, Array]:
-    """Return h(x), shape (J, 2), and H P Hᵀ, shape (2J, 2J), of some landmarks.
-
-    Parameters
-    ----------
-    mean, covariance : ndarray
-        (x, y, θ, l1x, …) and P; there may be more behind the landmarks.
-    slots : ndarray of int64, shape (J,)
-        Places of the landmarks in the map.
-    """
-    count = len(slots)
-    expected, joint = np.empty((count, 2)), np.empty((2 * count, 2 * count))
-    fill_expected(mean, covariance, slots, expected, joint)
-    return expected, joint
-
-
-def innovations_of(readings: Array, expected: Array) -> Array:
-    """Return z − h(x) of all pairs, shape (m, J, 2), bearings in [-π, π)."""
-    innovations = readings[:, None] - expected[None]
-    innovations[..., 0] = wrap_angle(innovations[..., 0])
-    return innovations
-
-
-def best_assignments(
-    problem: Problem,
-    *,
-    most: int = 1,
-    spread: float = np.inf,
-    ceiling: float = np.inf,
-    nodes: int = 2000,
-) -> Solutions:
-    """Return the cheapest assignments of a scan.
-
-    Parameters
-    ----------
-    problem : Problem
-    most : int
-        M, how many at most.
-    spread : float
-        Largest difference of their costs to the least.
-    ceiling : float
-        Cost beyond which only the first one found is of interest.
-    nodes : int
-        Limit of the search.  At the limit, the best assignments found so far are
-        returned.  The first of them always gives each reading in turn the pair that is
-        most likely given the pairs before it.
-
-    Notes
-    -----
-    With ``pairs_first`` and χ² limits this is the joint compatibility test of [1]_.
-
-    References
-    ----------
-    .. [1] J. Neira, J. Tardós, Data association in stochastic mapping using the joint
-       compatibility test, IEEE Transactions on Robotics and Automation 17, 2001.
-
-    Examples
-    --------
-    >>> expected = np.array([(0.0, 5.0), (0.3, 5.0)])
-    >>> problem = Problem(
-    ...     innovations=innovations_of(expected + 0.2, expected),
-    ...     joint=np.tile(0.04 * np.eye(2), (2, 2)),
-    ...     variances=np.full((2, 2, 2), 0.01),
-    ...     feasible=np.ones((2, 2), dtype=bool),
-    ...     missing=np.full(2, 9.0),
-    ...     gate=25.0,
-    ...     limits=np.full(3, np.inf),
-    ...     pairs_first=False,
-    ... )
-    >>> best_assignments(problem).marks.tolist()
-    [[0, 1]]
-    """
-    rows, visited, of_scan = len(problem.innovations), 0, tuple(problem)
-    costs = np.full(most, np.inf)
-    marks = np.full((most, rows), UNPAIRED)
-    distances = np.full((most, rows), np.inf)
-    if problem.feasible.size:
-        visited = search_assignments(of_scan, costs, marks, spread, ceiling, nodes)
-    else:
-        costs[0] = problem.missing.sum()
-    count = int((np.isfinite(costs) & (costs <= costs[0] + spread)).sum())
-    if problem.feasible.size:
-        fill_distances(of_scan, marks[:count], distances[:count])
-    return Solutions(costs[:count], marks[:count], distances[:count], visited < nodes)

@@ -8,7 +8,7 @@ accepted the scan.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -65,17 +65,23 @@ class ScanAssociation:
         Before the scan.
     readings : ndarray, shape (m, 2)
         The scan, rows (β, r) [rad, m].
+    detections : Detections, optional
+        After the scan; by default, it leaves them as they are.
     """
 
     def __init__(
-        self, policy: AssociationPolicy, candidates: Candidates, readings: Array
+        self,
+        policy: AssociationPolicy,
+        candidates: Candidates,
+        readings: Array,
+        detections: Detections | None = None,
     ) -> None:
         self._policy = policy
         self._tentative = candidates.tentative.next_scan(policy.confirm[1])
         self._waiting = dict(candidates.waiting)
         self._next_id, self.scan = candidates.next_id, candidates.scan
         self._density, self._readings = candidates.density, readings
-        self._detections = candidates.detections
+        self._detections = detections or candidates.detections
         #: For each row the landmark that the filter associates it with, if any.
         self.row_ids: list[int | None] = [None] * len(readings)
         #: Labels of landmarks that were tentative before this scan.
@@ -91,32 +97,24 @@ class ScanAssociation:
         """Return the candidates after the scan, given the belief after it."""
         first = [label < 0 or label >> LABEL_BITS == self.scan for label in self.labels]
         is_new = [i is None and f for i, f in zip(self.row_ids, first, strict=True)]
-        density = self._density.after(
-            self._readings, np.array(is_new, dtype=np.bool_), len(self.confirmed)
-        )
+        new = np.array(is_new, dtype=np.bool_)
+        density = self._density.after(self._readings, new, len(self.confirmed))
         evidence = self._detections.evidence.with_heading(view)
         detections = self._detections._replace(evidence=evidence)
         known = self._tentative, self._waiting, self._next_id, self.scan + 1
         return Candidates(*known, density, detections)
 
-    def assign(
-        self, rows: IntArray, slots: IntArray, view: MapView, noise: Noise
-    ) -> None:
-        """Take the slots of the map that some rows are assigned to.
+    def assign(self, slots: IntArray, view: MapView, noise: Noise) -> None:
+        """Take the slots of the map that the rows are assigned to.
 
-        Rows that no landmark explains may belong to a tentative one; the other rows of
-        the scan have no usable bearing and are ambiguous.
+        Rows that no landmark explains may belong to a tentative one.
         """
-        for row, slot in zip(rows.tolist(), slots.tolist(), strict=True):
-            if slot >= 0:
-                self.row_ids[row] = view.ids[slot]
-        self.ambiguous_rows += sorted(set(range(len(self.labels))) - set(rows.tolist()))
-        self.ambiguous_rows += rows[slots == AMBIGUOUS].tolist()
-        new = rows[slots == NEW]
-        if len(new) or len(self._tentative.seen):
-            self._match_tentative(new, noise)
-        self.ambiguous_rows.sort()
-        self.tentative_rows.sort()
+        marks = slots.tolist()
+        self.row_ids = [view.ids[slot] if slot >= 0 else None for slot in marks]
+        self.ambiguous_rows = [k for k, slot in enumerate(marks) if slot == AMBIGUOUS]
+        new = [row for row, slot in enumerate(marks) if slot == NEW]
+        if new or len(self._tentative.seen):
+            self._match_tentative(np.array(new, dtype=np.int64), noise)
 
     def translate(
         self, ids: Sequence[int], mapped: Sequence[int], aliases: Mapping[int, int]
@@ -329,29 +327,34 @@ class Detections(NamedTuple):
         longest : float
             Longest range read so far [m].
         """
-        ids, is_seen = view.ids, np.zeros(len(view.ids), dtype=np.bool_)
-        is_seen[slots[slots >= 0]] = True
+        ids, shown, first_new = view.ids, self.shown, self.evidence.first_new
+        proven = [shown.get(i, 0) >= PROVEN and i < first_new for i in ids]
         missed = np.array([self.missed.get(i, 1.0) for i in ids])
-        shown = np.array([self.shown.get(i, 0) for i in ids], dtype=np.int64)
-        is_telling = (shown >= PROVEN) & (np.array(ids) < self.evidence.first_new)
-        is_telling[explained] &= is_seen[explained]
-        counts, known = (self.seen.copy(), self.expected.copy()), (is_seen, is_telling)
-        P = view.covariance
-        cost, fewer = _count(view.mean, P, known, longest, counts, missed)
-        shown = np.minimum(shown + is_seen, PROVEN)
+        counts = self.seen.copy(), self.expected.copy()
+        cost, fewer = _count(
+            (view.mean, view.covariance),
+            (slots, explained),
+            np.array(proven, dtype=np.bool_),
+            longest,
+            counts,
+            missed,
+        )
         left = {**self.missed, **dict(zip(ids, missed.tolist(), strict=True))}
+        seen = [ids[slot] for slot in slots.tolist() if slot >= 0]
+        more = {i: shown.get(i, 0) + 1 for i in seen if shown.get(i, 0) < PROVEN}
         return cost, Detections(
             *counts,
             {i: chance for i, chance in left.items() if chance < 1},
-            {**self.shown, **dict(zip(ids, shown.tolist(), strict=True))},
+            {**shown, **more},
             self.evidence.after(fewer, view.mapped),
         )
 
     def chance_to_miss(self, view: MapView, longest: float) -> Array:
         """Return the probability that a scan does not show a landmark, shape (n,)."""
-        chance, none = np.ones(len(view.ids)), np.zeros(len(view.ids), dtype=np.bool_)
+        count, none = len(view.ids), np.zeros(0, dtype=np.int64)
+        chance, known = np.ones(count), np.zeros(count, dtype=np.bool_)
         counts = self.seen.copy(), self.expected.copy()
-        _count(view.mean, view.covariance, (none, none), longest, counts, chance)
+        _count(view[:2], (none, none), known, longest, counts, chance)
         return chance
 
 
@@ -480,20 +483,23 @@ Place = tuple[float, float, float, float]
 
 @jit
 def _count(
-    mean: Array,
-    P: Array,
-    known: tuple[BoolArray, BoolArray],
+    belief: tuple[Array, Array],
+    scan: tuple[IntArray, IntArray],
+    is_telling: BoolArray,
     longest: float,
     counts: tuple[Array, Array],
     missed: Array,
 ) -> tuple[float, float]:
     """Count a scan; return its cost, and the evidence that the run is lost.
 
-    For every landmark, ``known`` holds whether the scan shows it, and whether that is
-    evidence.
+    Of the map, the scan holds the slots of the landmarks that it shows, and of those
+    that are no evidence if it does not.  For every landmark, ``is_telling`` holds
+    whether it is evidence at all.
     """
-    is_seen, is_telling = known
-    seen, expected = counts
+    (mean, P), (slots, explained), (seen, expected) = belief, scan, counts
+    is_seen = np.zeros(len(missed), np.bool_)
+    is_seen[slots[slots >= 0]] = True
+    is_telling[explained] &= is_seen[explained]
     sectors, rings = seen.shape
     ring = (seen.sum(axis=0) + 1) / (expected.sum(axis=0) + 2)
     sector = (seen.sum(axis=1) + 1) / (expected.sum(axis=1) + 2)
@@ -575,16 +581,18 @@ def associate(
     is of interest.  Readings closer than the sensor's least range have no usable
     bearing: they are ambiguous.
     """
-    rows = np.flatnonzero(readings[:, 1] >= sensor.min_range)
-    used, noise = readings[rows], sensor.noise
+    usable, noise = readings[:, 1] >= sensor.min_range, sensor.noise
+    used = readings if usable.all() else readings[usable]
     density = _unexplained_density(policy, candidates, used, noise)
     found = assign_scan(policy, view, used, noise, density, ceiling=ceiling)
 
     def complete(slots: IntArray, detections: Detections) -> ScanAssociation:
-        before = replace(candidates, detections=detections)
-        association = ScanAssociation(policy, before, readings)
+        association = ScanAssociation(policy, candidates, readings, detections)
         association.explained = {view.ids[slot] for slot in found.explained.tolist()}
-        association.assign(rows, slots, view, noise)
+        if len(slots) < len(readings):
+            slots, given = np.full(len(readings), AMBIGUOUS), slots
+            slots[usable] = given
+        association.assign(slots, view, noise)
         return association
 
     options = []

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array, BoolArray, IntArray
+from ...jit import jit, njit_internal
 from ..interface import MapView
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import rotation
@@ -211,11 +212,9 @@ class UnexplainedDensity(NamedTuple):
         with n readings per scan, r the longest range, and half a reading added to every
         sector and ring.
         """
-        sectors, rings = self.cells.sum(axis=1) + 0.5, self.cells.sum(axis=0) + 0.5
-        sector, ring = _cells(readings, self.longest)
-        usual, usual_ring = sectors.sum() / SECTORS, rings.sum() / RINGS
-        shape = sectors[sector] / usual * rings[ring] / usual_ring
-        return np.asarray(self.per_scan / (2 * np.pi * self.longest) * shape)
+        density = np.full(len(readings), self.per_scan / (2 * np.pi * self.longest))
+        _shape_density(self.cells, readings, self.longest, density)
+        return density
 
     @property
     def per_scan(self) -> float:
@@ -231,27 +230,50 @@ class UnexplainedDensity(NamedTuple):
         self, readings: Array, is_new: BoolArray, landmarks: int = 0
     ) -> "UnexplainedDensity":
         """Count one more scan (m, 2), its rows of no landmark, and those confirmed."""
-        finite = np.isfinite(readings).all(axis=1)
-        longest = max(self.longest, float(readings[finite, 1].max(initial=0.0)))
-        new, cells = int(np.count_nonzero(is_new)), self.cells
-        if new:
-            cells = cells.copy()
-            np.add.at(cells, _cells(readings[is_new & finite], longest), 1.0)
+        new = int(np.count_nonzero(is_new))
+        cells = self.cells.copy() if new else self.cells
         return UnexplainedDensity(
             MEMORY * self.readings + new,
             MEMORY * self.scans + 1,
-            longest,
+            _count_readings(cells, readings, is_new, self.longest),
             MEMORY * self.landmarks + landmarks,
             cells,
         )
 
 
-def _cells(readings: Array, longest: float) -> tuple[IntArray, IntArray]:
-    """Return the sector and the ring of readings (m, 2)."""
-    turned = np.mod(readings[:, 0] + np.pi, 2 * np.pi)
-    sector = np.floor(turned * (SECTORS / (2 * np.pi)))
-    ring = np.minimum(np.maximum(readings[:, 1] * (RINGS / longest), 0), RINGS - 1)
-    return sector.astype(np.int64) % SECTORS, ring.astype(np.int64)
+@njit_internal
+def _cell(bearing: float, distance: float, longest: float) -> tuple[int, int]:
+    """Return the sector and the ring of a reading."""
+    turned = (bearing + np.pi) % (2 * np.pi)
+    ring = min(max(distance * (RINGS / longest), 0.0), RINGS - 1.0)
+    return int(turned * (SECTORS / (2 * np.pi))) % SECTORS, int(ring)
+
+
+@jit
+def _shape_density(
+    cells: Array, readings: Array, longest: float, density: Array
+) -> None:
+    """Multiply a density by the shares of the sector and the ring of each reading."""
+    sectors, rings = cells.sum(axis=1) + 0.5, cells.sum(axis=0) + 0.5
+    usual, usual_ring = sectors.sum() / SECTORS, rings.sum() / RINGS
+    for k in range(len(readings)):
+        sector, ring = _cell(readings[k, 0], readings[k, 1], longest)
+        density[k] *= sectors[sector] / usual * rings[ring] / usual_ring
+
+
+@jit
+def _count_readings(
+    cells: Array, readings: Array, is_new: BoolArray, longest: float
+) -> float:
+    """Count new readings in their cells; return the longest range read so far [m]."""
+    for bearing, distance in readings:
+        if np.isfinite(bearing) and np.isfinite(distance):
+            longest = max(longest, distance)
+    for k in range(len(readings)):
+        bearing, distance = readings[k, 0], readings[k, 1]
+        if is_new[k] and np.isfinite(bearing) and np.isfinite(distance):
+            cells[_cell(bearing, distance, longest)] += 1.0
+    return longest
 
 
 def _masks(name: str, value: Any, shape: tuple[int, ...]) -> Masks:

@@ -106,6 +106,59 @@ def _insert(
 
 
 @jit
+def best_assignments(
+    of_scan: tuple[Any, ...], most: int, spread: float, ceiling: float, nodes: int
+) -> tuple[Array, IntArray, Array, bool]:
+    """Return the cheapest assignments of a scan.
+
+    Parameters
+    ----------
+    of_scan : tuple
+        The fields of a :class:`Problem`.  A plain tuple reaches a kernel faster.
+    most : int
+        M, how many at most.
+    spread : float
+        Largest difference of their costs to the least.
+    ceiling : float
+        Cost beyond which only the first one found is of interest.
+    nodes : int
+        Limit of the search.  At the limit, the best assignments found so far are
+        returned.  The first of them always gives each reading in turn the pair that is
+        most likely given the pairs before it.
+
+    Returns
+    -------
+    costs : ndarray, shape (M,)
+        The cheapest first; infinite where a scan has no pair to consider.
+    marks : ndarray of int64, shape (M, m)
+        Landmark 0 … J − 1 of each reading or `UNPAIRED`.
+    distances : ndarray, shape (M, m)
+        As :func:`fill_distances` finds them.
+    is_complete : bool
+        False where the search stopped at its limit of nodes.
+
+    Notes
+    -----
+    With ``pairs_first`` and χ² limits this is the joint compatibility test of [1]_.
+
+    References
+    ----------
+    .. [1] J. Neira, J. Tardós, Data association in stochastic mapping using the joint
+       compatibility test, IEEE Transactions on Robotics and Automation 17, 2001.
+    """
+    rows, landmarks = Problem(*of_scan).feasible.shape
+    costs, marks = np.full(most, np.inf), np.full((most, rows), UNPAIRED)
+    distances = np.full((most, rows), np.inf)
+    if rows == 0 or landmarks == 0:
+        return costs[:1], marks[:1], distances[:1], True
+    visited = search_assignments(of_scan, costs, marks, spread, ceiling, nodes)
+    count = (np.isfinite(costs) & (costs <= costs[0] + spread)).sum()
+    costs, marks, distances = costs[:count], marks[:count], distances[:count]
+    fill_distances(of_scan, marks, distances)
+    return costs, marks, distances, visited < nodes
+
+
+@njit_internal
 def search_assignments(
     of_scan: tuple[Any, ...],
     costs: Array,
@@ -119,7 +172,7 @@ def search_assignments(
     Parameters
     ----------
     of_scan : tuple
-        The fields of a :class:`Problem`.  A plain tuple reaches a kernel faster.
+        As in :func:`best_assignments`.
     costs, marks : ndarray, shape (M,) and (M, m)
         Infinite and `UNPAIRED`; on return the assignments found, the cheapest first.
     spread, ceiling : float
@@ -421,7 +474,7 @@ def condition_on_all(
     return here
 
 
-@jit
+@njit_internal
 def fill_distances(of_scan: tuple[Any, ...], marks: IntArray, distances: Array) -> None:
     """Find the least νᵀ S⁻¹ ν of each unpaired reading to a landmark without one.
 
@@ -431,7 +484,7 @@ def fill_distances(of_scan: tuple[Any, ...], marks: IntArray, distances: Array) 
     Parameters
     ----------
     of_scan : tuple
-        As in :func:`search_assignments`.
+        As in :func:`best_assignments`.
     marks, distances : ndarray, shape (M, m)
         Assignments; the distances are infinite before.
     """
@@ -474,7 +527,7 @@ def largest_change(of_scan: tuple[Any, ...], marks: IntArray, fewer: IntArray) -
     Parameters
     ----------
     of_scan : tuple
-        As in :func:`search_assignments`.
+        As in :func:`best_assignments`.
     marks, fewer : ndarray, shape (m,)
         Two assignments.
 

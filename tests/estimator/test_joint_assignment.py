@@ -4,19 +4,18 @@ from itertools import product
 
 import numpy as np
 import pytest
+from plain_association import assign_plainly, innovations_of, predicted_readings, solve
 from scipy.stats import chi2
 
-from slamgym.estimator.association.scan_assignments import (
-    best_assignments,
-    innovations_of,
-    predicted_readings,
-)
+from slamgym.estimator.association.scan_assignments import AMBIGUOUS, Noise, assign_scan
+from slamgym.estimator.interface import MapView
 from slamgym.estimator.kernels.assignment_search import (
     SURE,
     UNPAIRED,
     Problem,
     largest_change,
 )
+from slamgym.estimator.map_management.policy import LandmarkPolicy
 from slamgym.estimator.models.bearing_range import predict_measurement
 
 MISSING = 2.0
@@ -93,7 +92,7 @@ def test_the_best_assignments_are_those_of_an_exhaustive_search(seed):
     rng = np.random.default_rng(seed)
     for _ in range(40):
         problem = random_problem(rng)
-        found = best_assignments(problem, most=5, nodes=10**6)
+        found = solve(problem, most=5, nodes=10**6)
         expected = all_assignments(problem)[:5]
         assert found.is_complete
         np.testing.assert_allclose(found.costs, [c for c, _ in expected], rtol=1e-9)
@@ -122,7 +121,7 @@ def test_compatibility_takes_most_pairs_and_then_the_nearest():
         expected = next(
             a for a in all_assignments(problem) if is_compatible(problem, a[2])
         )
-        found = best_assignments(problem, nodes=10**6)
+        found = solve(problem, nodes=10**6)
         assert tuple(found.marks[0]) == tuple(expected[2])
 
 
@@ -137,7 +136,7 @@ def test_the_order_of_the_scan_changes_nothing():
             feasible=problem.feasible[order],
             missing=problem.missing[order],
         )
-        one, other = best_assignments(problem), best_assignments(turned)
+        one, other = solve(problem), solve(turned)
         np.testing.assert_array_equal(one.marks[0][order], other.marks[0])
         assert one.costs[0] == other.costs[0]
 
@@ -156,8 +155,8 @@ def test_the_limit_of_nodes_returns_the_best_so_far_and_says_so():
         np.full(rows + 1, np.inf),
         False,
     )
-    few = best_assignments(problem, nodes=50)
-    many = best_assignments(problem, nodes=20_000)
+    few = solve(problem, nodes=50)
+    many = solve(problem, nodes=20_000)
     assert not few.is_complete
     assert few.costs[0] >= many.costs[0]
     assert len(set(few.marks[0][few.marks[0] != UNPAIRED].tolist())) == int(
@@ -165,11 +164,40 @@ def test_the_limit_of_nodes_returns_the_best_so_far_and_says_so():
     )
 
 
+@pytest.mark.parametrize("method", ["joint", "compatibility", "hypotheses"])
+def test_a_scan_is_assigned_as_step_by_step_in_numpy(method):
+    rng, policy = np.random.default_rng(5), LandmarkPolicy(association=method)
+    noise, several, ambiguous = Noise(0.05, 0.2, 0.02, 0.1), 0, 0
+    for _ in range(150):
+        count, rows = rng.integers(0, 9), rng.integers(0, 11)
+        mean = rng.normal(scale=3.0, size=3 + 2 * count)
+        root = rng.normal(scale=rng.choice([0.05, 0.2]), size=(len(mean), len(mean)))
+        view = MapView(mean, root @ root.T, tuple(range(count)))
+        readings = rng.uniform((-3, 0.5), (3, 5), (rows, 2))
+        density = rng.uniform(0.001, 0.1, rows)
+        limits = np.full(rows + 1, np.inf)
+        if method == "compatibility":
+            tail = np.exp(-policy.pair_gate / 2)
+            limits[1:] = chi2.isf(tail, 2 * np.arange(1, rows + 1))
+        most = policy.branches if method == "hypotheses" else 1
+        found = assign_scan(policy, view, readings, noise, density)
+        costs, slots, explained = assign_plainly(
+            policy, view, readings, noise, density, limits=limits, most=most
+        )
+        np.testing.assert_array_equal(found.explained, explained)
+        np.testing.assert_array_equal([each.cost for each in found.ranked], costs)
+        np.testing.assert_array_equal([each.slots for each in found.ranked], slots)
+        several += len(costs) > 1
+        ambiguous += sum((each == AMBIGUOUS).sum() for each in slots)
+    assert several > 30 or method != "hypotheses"
+    assert ambiguous > 10
+
+
 def test_unpaired_readings_are_compared_with_free_landmarks_given_the_pairs():
     rng = np.random.default_rng(3)
     for _ in range(50):
         problem = random_problem(rng)
-        found = best_assignments(problem)
+        found = solve(problem)
         marks = found.marks[0]
         paired = np.flatnonzero(marks != UNPAIRED)
         for row in np.flatnonzero(marks == UNPAIRED):
