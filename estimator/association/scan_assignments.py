@@ -93,54 +93,58 @@ def assign_scan(
     missing = np.zeros(count) if pairs_first else missing_costs(density)
     if most is None:
         most = policy.branches if policy.association == "hypotheses" else 1
-    costs, slots, explained = assign_jointly(
-        (view.mean, view.covariance, len(view.ids)),
-        readings,
+    landmarks = len(view.ids)
+    costs, slots = np.empty(most), np.empty((most, count), dtype=np.int64)
+    explained = np.empty(landmarks, dtype=np.int64)
+    found, near = assign_jointly(
+        (view.mean, view.covariance),
+        (readings, missing, _limits(policy, count)),
         tuple(noise),
-        (missing, _limits(policy, count), pairs_first),
         (float(policy.new_gate), float(policy.pair_gate), float(ceiling)),
-        (most, policy.search_nodes),
+        (pairs_first, policy.search_nodes),
+        (costs, slots, explained),
     )
-    if not len(explained):
+    if not near:
         costs[0] = missing.sum()
-    return Assignments([*map(Assignment, costs.tolist(), slots)], explained)
+    ranked = [*map(Assignment, costs[:found].tolist(), slots)]
+    return Assignments(ranked, explained[:near])
 
 
 @jit
 def assign_jointly(
-    belief: tuple[Array, Array, int],
-    readings: Array,
+    belief: tuple[Array, Array],
+    scan: tuple[Array, Array, Array],
     of_sensor: tuple[float, ...],
-    of_problem: tuple[Array, Array, bool],
     gates: tuple[float, float, float],
-    search: tuple[int, int],
-) -> tuple[Array, IntArray, IntArray]:
-    """Return costs (M,), slots (M, m) and the explained landmarks (k,).
+    search: tuple[bool, int],
+    result: tuple[Array, IntArray, IntArray],
+) -> tuple[int, int]:
+    """Assign a scan; return the numbers of assignments and of explained landmarks.
 
     Parameters
     ----------
     belief : tuple
-        Mean, covariance and number of landmarks of the map.
-    readings : ndarray, shape (m, 2)
+        Mean and covariance of the map.
+    scan : tuple
+        The readings (m, 2), and ``missing`` and ``limits`` of the :class:`Problem`.
     of_sensor : tuple
         The fields of a :class:`Noise`.
-    of_problem : tuple
-        ``missing``, ``limits`` and ``pairs_first`` of the :class:`Problem`.
     gates : tuple
         Those of new landmarks and of pairs, and the ceiling of the cost.
     search : tuple
-        How many assignments at most, and the limit of nodes.
+        ``pairs_first`` of the :class:`Problem`, and the limit of nodes.
+    result : tuple
+        Overwritten: costs (M,), slots (M, m), explained landmarks (n,).
     """
-    (mean, P, landmarks), (missing, limits, pairs_first) = belief, of_problem
-    (new_gate, pair_gate, ceiling), (most, nodes) = gates, search
+    (mean, P), (readings, missing, limits) = belief, scan
+    (new_gate, pair_gate, ceiling), (pairs_first, nodes) = gates, search
+    costs, slots, explained = result
     noise, rows = Noise(*of_sensor), len(readings)
-    squared = np.full((rows, landmarks), np.inf)
-    of_pairs = squared, squared.copy()
-    _compare(mean, P, readings, of_sensor, new_gate, of_pairs)
-    explained = np.flatnonzero(np.array([np.isfinite(d).any() for d in squared.T]))
-    near = len(explained)
+    squared = np.full((rows, len(explained)), np.inf)
+    _compare(mean, P, readings, of_sensor, new_gate, (squared, squared.copy()))
+    near = _list_explained(squared, explained)
     expected, joint = np.empty((near, 2)), np.empty((2 * near, 2 * near))
-    fill_expected(mean, P, explained, expected, joint)
+    fill_expected(mean, P, explained[:near], expected, joint)
     innovations, variances = np.empty((rows, near, 2)), np.empty((rows, near, 2))
     feasible = np.empty((rows, near), np.bool_)
     for i in range(rows):
@@ -154,18 +158,28 @@ def assign_jointly(
             feasible[i, j] = squared[i, explained[j]] <= pair_gate
     of_scan = innovations, joint, variances, feasible, missing
     problem = *of_scan, pair_gate, limits, pairs_first
-    found = best_assignments(problem, most, BRANCH_SPREAD, ceiling, nodes)
-    costs, marks, distances, _ = found
-    slots, kept = np.empty_like(marks), 0
-    for s in range(len(costs)):
+    found = best_assignments(problem, len(costs), BRANCH_SPREAD, ceiling, nodes)
+    marks, kept = found[1], 0
+    for s in range(len(marks)):
         for i in range(rows):
-            slots[s, i] = AMBIGUOUS if distances[s, i] <= new_gate else NEW
+            slots[kept, i] = AMBIGUOUS if found[2][s, i] <= new_gate else NEW
             if marks[s, i] != UNPAIRED:
-                slots[s, i] = explained[marks[s, i]]
-        if not _is_superfluous(problem, marks[:kept], marks[s], slots[s]):
-            costs[kept], marks[kept], slots[kept] = costs[s], marks[s], slots[s]
+                slots[kept, i] = explained[marks[s, i]]
+        if not _is_superfluous(problem, marks[:kept], marks[s], slots[kept]):
+            costs[kept], marks[kept] = found[0][s], marks[s]
             kept += 1
-    return costs[:kept], slots[:kept], explained
+    return kept, near
+
+
+@njit_internal
+def _list_explained(squared: Array, explained: IntArray) -> int:
+    """List the landmarks that some reading may belong to; return how many."""
+    near = 0
+    for j in range(len(explained)):
+        if np.isfinite(squared[:, j]).any():
+            explained[near] = j
+            near += 1
+    return near
 
 
 @njit_internal

@@ -95,8 +95,11 @@ class ScanAssociation:
 
     def candidates_after(self, view: MapView) -> Candidates:
         """Return the candidates after the scan, given the belief after it."""
-        first = [label < 0 or label >> LABEL_BITS == self.scan for label in self.labels]
-        is_new = [i is None and f for i, f in zip(self.row_ids, first, strict=True)]
+        rows = zip(self.row_ids, self.labels, strict=True)
+        is_new = [
+            i is None and (label < 0 or label >> LABEL_BITS == self.scan)
+            for i, label in rows
+        ]
         new = np.array(is_new, dtype=np.bool_)
         density = self._density.after(self._readings, new, len(self.confirmed))
         evidence = self._detections.evidence.with_heading(view)
@@ -257,7 +260,7 @@ class LostEvidence(NamedTuple):
         if present == 0:
             first_new = max(first_new, 1 + max(mapped, default=-1))
         largest = max(self.largest, present)
-        return self._replace(present=present, largest=largest, first_new=first_new)
+        return LostEvidence(present, largest, first_new, *self[3:])
 
     def with_heading(self, view: MapView) -> LostEvidence:
         """Count a scan after which the belief is ``view``.
@@ -276,7 +279,7 @@ class LostEvidence(NamedTuple):
         is_unknown = len(view.mapped) > 0 and variance - surest > UNKNOWN
         unknown = self.unknown + 1 if is_unknown else 0
         largest = max(self.largest, MOST_OF_SCAN / 2 * unknown)
-        return self._replace(surest=surest, unknown=unknown, largest=largest)
+        return LostEvidence(self.present, largest, self.first_new, surest, unknown)
 
 
 class Detections(NamedTuple):
@@ -328,7 +331,7 @@ class Detections(NamedTuple):
             Longest range read so far [m].
         """
         ids, shown, first_new = view.ids, self.shown, self.evidence.first_new
-        proven = [shown.get(i, 0) >= PROVEN and i < first_new for i in ids]
+        proven = [i < first_new and shown.get(i, 0) >= PROVEN for i in ids]
         missed = np.array([self.missed.get(i, 1.0) for i in ids])
         counts = self.seen.copy(), self.expected.copy()
         cost, fewer = _count(
@@ -345,7 +348,7 @@ class Detections(NamedTuple):
         return cost, Detections(
             *counts,
             {i: chance for i, chance in left.items() if chance < 1},
-            {**shown, **more},
+            {**shown, **more} if more else shown,
             self.evidence.after(fewer, view.mapped),
         )
 

@@ -92,8 +92,6 @@ class TentativeLandmarks(NamedTuple):
         self, displacement: tuple[float, float, float], variance: Array
     ) -> "TentativeLandmarks":
         """Follow the robot by (dx, dy, α) in its frame, with noise (σx², σy², σα²)."""
-        if not len(self.seen):
-            return self
         *shift, turn = displacement
         back = rotation(-turn)
         places = (self.places - shift) @ back.T

@@ -61,14 +61,9 @@ def lost(view: MapView, rules: Constellations | None) -> BoolArray:
     return is_lost if can_match or rules.always else np.zeros_like(is_lost)
 
 
-def without_lost(view: MapView, rules: Constellations | None, within: float) -> MapView:
-    """Return a view of the landmarks within a distance [m] that are not lost.
-
-    The view itself, if no landmark is lost.
-    """
+def without_lost(view: MapView, rules: Constellations, within: float) -> MapView:
+    """Return a view of the landmarks within a distance [m] that are not lost."""
     is_lost = lost(view, rules)
-    if rules is None or not is_lost.any():
-        return view
     away = np.hypot(*(view.landmarks - view.mean[:2]).T)
     is_near = away <= within + NEAR_STDS * rules.lost_std
     return _part(view, np.flatnonzero(~is_lost & is_near))

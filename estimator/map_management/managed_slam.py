@@ -175,10 +175,11 @@ class ManagedSlam:
         """Move by odometry (d, α) [m, rad], dt multiplies its noise variance."""
         reading = argument_checks.pair("odometry", odometry)
         displacement = self._motion_noise.motion.moved(reading)
-        variance = self._motion_noise.over(displacement, dt)
-        tentative = self.candidates.tentative
-        moved, candidates = tentative.moved(displacement, variance), self.candidates
-        if moved is not tentative:
+        weight = self._motion_noise.weight(displacement, dt)
+        candidates, tentative = self.candidates, self.candidates.tentative
+        if len(tentative.seen):
+            variance = weight * self._motion_noise.variance
+            moved = tentative.moved(displacement, variance)
             candidates = replace(candidates, tentative=moved)
 
         def follow(_: object) -> None:
@@ -251,7 +252,7 @@ class ManagedSlam:
     def as_given(self, readings: Array, ids: Sequence[int]) -> ScanAssociation:
         """Associate readings (m, 2) by their identities, which must differ."""
         plan = ScanAssociation(self._policy, self.candidates, readings)
-        view = self._editor.map_view(self._policy.reach(readings))
+        view = self._pruner.view_around(readings)
         plan.translate(ids, view.mapped, self._pruner.records.aliases)
         return plan
 
@@ -298,7 +299,7 @@ class ManagedSlam:
         """Do what follows an update of the filter; return the whole report."""
         self._recent.note_scan(plan, scans, first, report)
         self._editor.expire()
-        view = self._editor.map_view(self._policy.reach(readings))
+        view = self._pruner.view_around(readings)
         self.candidates = plan.candidates_after(view)
         used = {i for i in plan.row_ids if i is not None}
         seen = used.intersection(view.ids)

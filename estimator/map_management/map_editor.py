@@ -50,7 +50,9 @@ class MapEditor:
     def __init__(self, slam: SlamEstimator, *, merging: bool = True) -> None:
         self._slam: Any = slam
         self._view: MapView | None = None
-        self._within, self._is_local = 0.0, hasattr(slam, "local_view")
+        self._within = 0.0
+        #: Whether the filter can show the map around the robot alone.
+        self.is_local = hasattr(slam, "local_view")
         wanted = ("remove", "merge") if merging else ("remove",)
         has_all = all(hasattr(slam, name) for name in wanted)
         self._has_methods = has_all and not hides_its_belief(slam)
@@ -72,23 +74,25 @@ class MapEditor:
         the distance of the last time.
         """
         reach = self._within if within is None else within
-        if self._view is None or reach > self._within:
-            if self._has_methods and self._is_local:
-                self._view = self._slam.local_view(reach)
+        view = self._view
+        if view is None or reach > self._within:
+            if self._has_methods and self.is_local:
+                view = self._slam.local_view(reach)
             else:
-                self._view = view_map(self._slam)
+                view = view_map(self._slam)
+            self._view = view
         self._within = reach
-        return self._view
+        return view
 
     def bookmark(self) -> Undo:
         """Return what takes back later views, also where the filter notes them."""
-        within = self._within
-        undo_slam = bookmark(self._slam) if self._is_local else None
+        if not self.is_local:
+            return self.expire
+        within, undo_slam = self._within, bookmark(self._slam)
 
         def undo() -> None:
             self._view, self._within = None, within
-            if undo_slam is not None:
-                undo_slam()
+            undo_slam()
 
         return undo
 

@@ -55,15 +55,21 @@ class MapPruner:
         """Return what takes back later changes of what is remembered."""
         return attributes(self, self.records)
 
+    def view_around(self, readings: Array) -> MapView:
+        """Return a view of the landmarks that may matter for a scan (m, 2)."""
+        is_local = self._editor.is_local
+        return self._editor.map_view(self._policy.reach(readings) if is_local else 0.0)
+
     def view_for(self, readings: Array) -> MapView:
         """Return a view of the landmarks that readings (m, 2) may belong to."""
-        reach = self._policy.reach(readings)
-        view = self._editor.map_view(reach)
-        return without_lost(view, self._policy.constellations, reach)
+        view, rules = self.view_around(readings), self._policy.constellations
+        if rules is None or not lost(view, rules).any():
+            return view
+        return without_lost(view, rules, self._policy.reach(readings))
 
     def expected(self, scan: Array) -> set[int]:
         """Return the landmarks that a scan (m, 2) should show; changes nothing."""
-        view, policy = self._editor.map_view(self._policy.reach(scan)), self._policy
+        view, policy = self.view_around(scan), self._policy
         if policy.remove_after is None or policy.view is None or not view.ids:
             return set()
         mask = policy.view.expects(view.mean[:3].copy(), view.landmarks, scan)
@@ -196,8 +202,7 @@ class MapPruner:
         rules, records = self._policy.constellations, self.records
         if rules is None or not (added or records.doubtful):
             return []
-        within = self._policy.reach(readings)
-        view = self._editor.map_view(within)
+        within, view = self._policy.reach(readings), self.view_around(readings)
         records.doubtful = doubtful_after(view, rules, added, records.doubtful)
         pairs = same_landmarks(view, rules, added, records.doubtful, within)
         return pairs if pairs and self._joined(pairs) else []

@@ -29,7 +29,7 @@ from ..interface import (
 )
 from ..support import saved_states
 from ..support.saved_states import with_prefix, without_prefix
-from ..support.undo import Undo
+from ..support.undo import Undo, attributes
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy
 
@@ -52,8 +52,8 @@ class RecentScans(Restorable):
     of those that need the truth at every step.
     """
 
-    changing = ("scans", "decisions")
-    replaced = ("motions",)
+    changing = ("decisions",)
+    replaced = ("scans", "motions")
 
     def __init__(
         self, slam: SlamEstimator, editor: MapEditor, policy: LandmarkPolicy
@@ -72,12 +72,12 @@ class RecentScans(Restorable):
 
     def bookmark(self) -> Undo:
         """Return what takes back later changes of what is remembered."""
-        scans, motions, decisions = list(self.scans), self.motions, self.decisions
+        undo_attributes, decisions = attributes(self), self.decisions
         count, newest = len(decisions), decisions[-self._window - 1 :]
 
         def undo() -> None:
             decisions[count - len(newest) :] = newest
-            self.scans, self.motions, self.decisions = list(scans), motions, decisions
+            undo_attributes()
 
         return undo
 
@@ -90,9 +90,12 @@ class RecentScans(Restorable):
         self, removed: Sequence[int], merged: Sequence[tuple[int, int]]
     ) -> None:
         """Remember which landmarks were removed and merged after the last scan."""
+        if not (removed or merged):
+            return
+        self.scans = [*self.scans]
         noted: tuple[list[Any], ...] = self.decisions, self.scans
         for scans in noted:
-            if scans and (removed or merged):
+            if scans:
                 last = scans[-1]
                 scans[-1] = last._replace(
                     removed=(*last.removed, *removed), merged=(*last.merged, *merged)
@@ -135,7 +138,7 @@ class RecentScans(Restorable):
     ) -> None:
         """Remember a scan that the filter has taken in."""
         if self._window:
-            self.scans, self.motions = list(scans), ()
+            self.scans, self.motions = scans, ()
         self.decisions.append(_decided(plan, report))
         if first is not None:
             self._revise_decisions(scans[first:-1])
@@ -193,12 +196,12 @@ class RecentScans(Restorable):
 
 def _decided(plan: ScanAssociation, report: UpdateReport) -> ScanDecisions:
     """Return the outcome of each row of a scan."""
-    new = {*report.added_ids, *plan.confirmed}.difference(report.skipped_ids)
-    unused = {*report.rejected_ids, *report.skipped_ids} - new
-    row_ids = tuple(None if i in unused else i for i in plan.row_ids)
-    return ScanDecisions(
-        row_ids, tuple(i for i in row_ids if i in new and i is not None)
-    )
+    row_ids, skipped = tuple(plan.row_ids), report.skipped_ids
+    new = {*report.added_ids, *plan.confirmed}.difference(skipped)
+    unused = {*report.rejected_ids, *skipped} - new
+    if unused:
+        row_ids = tuple(None if i in unused else i for i in row_ids)
+    return ScanDecisions(row_ids, tuple([i for i in row_ids if i in new]))
 
 
 def _relabel(scans: list[RecentScan], confirmed: Mapping[int, int]) -> int | None:
