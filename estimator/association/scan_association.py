@@ -95,12 +95,12 @@ class ScanAssociation:
 
     def candidates_after(self, view: MapView) -> Candidates:
         """Return the candidates after the scan, given the belief after it."""
-        rows = zip(self.row_ids, self.labels, strict=True)
-        is_new = [
-            i is None and (label < 0 or label >> LABEL_BITS == self.scan)
-            for i, label in rows
+        rows = enumerate(zip(self.row_ids, self.labels, strict=True))
+        new = [
+            row
+            for row, (i, label) in rows
+            if i is None and (label < 0 or label >> LABEL_BITS == self.scan)
         ]
-        new = np.array(is_new, dtype=np.bool_)
         density = self._density.after(self._readings, new, len(self.confirmed))
         evidence = self._detections.evidence.with_heading(view)
         detections = self._detections._replace(evidence=evidence)

@@ -20,6 +20,7 @@ the share of the readings that match no mapped landmark and proved to be of a ne
     miss      o ← o (1 − P_D)
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -182,7 +183,7 @@ class UnexplainedDensity(NamedTuple):
     --------
     >>> density = UnexplainedDensity()
     >>> for _ in range(500):
-    ...     density = density.after(np.array([[0, 7.9], [1, 8]]), np.array([True] * 2))
+    ...     density = density.after(np.array([[0, 7.9], [1, 8]]), [0, 1])
     >>> round(density.per_scan, 2)
     2.0
     >>> far, near = density.at(np.array([[0, 7.5], [0, 2.5]]))
@@ -225,15 +226,16 @@ class UnexplainedDensity(NamedTuple):
         return min(self.landmarks / self.readings, 1.0)
 
     def after(
-        self, readings: Array, is_new: BoolArray, landmarks: int = 0
+        self, readings: Array, new: Sequence[int], landmarks: int = 0
     ) -> "UnexplainedDensity":
         """Count one more scan (m, 2), its rows of no landmark, and those confirmed."""
-        new = int(np.count_nonzero(is_new))
-        cells = self.cells.copy() if new else self.cells
+        rows, cells = np.array(new, dtype=np.int64), self.cells
+        if new:
+            cells = cells.copy()
         return UnexplainedDensity(
-            MEMORY * self.readings + new,
+            MEMORY * self.readings + len(new),
             MEMORY * self.scans + 1,
-            _count_readings(cells, readings, is_new, self.longest),
+            _count_readings(cells, readings, rows, self.longest),
             MEMORY * self.landmarks + landmarks,
             cells,
         )
@@ -261,15 +263,14 @@ def _shape_density(
 
 @jit
 def _count_readings(
-    cells: Array, readings: Array, is_new: BoolArray, longest: float
+    cells: Array, readings: Array, new: IntArray, longest: float
 ) -> float:
-    """Count new readings in their cells; return the longest range read so far [m]."""
+    """Count some readings in their cells; return the longest range read so far [m]."""
     for bearing, distance in readings:
         if np.isfinite(bearing) and np.isfinite(distance):
             longest = max(longest, distance)
-    for k in range(len(readings)):
-        bearing, distance = readings[k, 0], readings[k, 1]
-        if is_new[k] and np.isfinite(bearing) and np.isfinite(distance):
+    for bearing, distance in readings[new]:
+        if np.isfinite(bearing) and np.isfinite(distance):
             cells[_cell(bearing, distance, longest)] += 1.0
     return longest
 

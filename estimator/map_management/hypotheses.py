@@ -26,14 +26,7 @@ from ..models.bearing_range import wrap_angle
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
-from ..support.undo import (
-    Undo,
-    attributes,
-    contents,
-    to_the_end,
-    undo_all,
-    undone_on_error,
-)
+from ..support.undo import Undo, attributes, to_the_end, undo_all, undone_on_error
 from .managed_slam import ManagedSlam
 from .map_editor import is_near
 from .policy import LandmarkPolicy, as_policy
@@ -481,7 +474,7 @@ class FilterPool:
 
     def __init__(self, make: Callable[[], ManagedSlam]) -> None:
         self._make = make
-        self._spare: list[ManagedSlam] = []
+        self._spare: tuple[ManagedSlam, ...] = ()
 
     def __len__(self) -> int:
         """Return how many filters nobody uses."""
@@ -489,7 +482,10 @@ class FilterPool:
 
     def fresh(self) -> ManagedSlam:
         """Return a filter that nobody uses, in any state."""
-        return self._spare.pop() if self._spare else self._make()
+        if not self._spare:
+            return self._make()
+        slam, self._spare = self._spare[-1], self._spare[:-1]
+        return slam
 
     def copy(self, slam: ManagedSlam) -> ManagedSlam:
         """Return another filter that continues from the same state."""
@@ -499,11 +495,11 @@ class FilterPool:
 
     def bookmark(self) -> Undo:
         """Return what takes back which filters nobody uses."""
-        return contents(self)
+        return attributes(self)
 
     def free(self, slams: Iterable[ManagedSlam]) -> None:
         """Take filters back."""
         for slam in slams:
             if slam not in self._spare:
                 slam.reset(np.zeros(3), np.zeros(3))  # frees its scans
-                self._spare.append(slam)
+                self._spare = (*self._spare, slam)

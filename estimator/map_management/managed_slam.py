@@ -174,12 +174,12 @@ class ManagedSlam:
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], dt multiplies its noise variance."""
         reading = argument_checks.pair("odometry", odometry)
-        displacement = self._motion_noise.motion.moved(reading)
-        weight = self._motion_noise.weight(displacement, dt)
-        candidates, tentative = self.candidates, self.candidates.tentative
-        if len(tentative.seen):
-            variance = weight * self._motion_noise.variance
-            moved = tentative.moved(displacement, variance)
+        argument_checks.duration(dt)
+        candidates, noise = self.candidates, self._motion_noise
+        if len(candidates.tentative.seen):
+            displacement = noise.motion.moved(reading)
+            variance = noise.over(displacement, dt)
+            moved = candidates.tentative.moved(displacement, variance)
             candidates = replace(candidates, tentative=moved)
 
         def follow(_: object) -> None:
@@ -376,9 +376,9 @@ class ManagedSlam:
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
-        parts = self._pruner, self._recent, self._editor
-        undos = (part.bookmark() for part in parts)
-        return undo_all(*undos, bookmark(self._filter), attributes(self))
+        parts = self._recent.bookmark(), self._editor.bookmark()
+        own = attributes(self, self._pruner, self._pruner.records)
+        return undo_all(*parts, bookmark(self._filter), own)
 
     def bookmark_views(self) -> Undo:
         """Return what takes back that associations have looked at the map."""

@@ -15,7 +15,6 @@ from ..association.scan_association import ScanAssociation
 from ..filters.conditioning import separation
 from ..interface import MapView
 from ..support import saved_states
-from ..support.undo import Undo, attributes
 from .loop_closing import Pairs, doubtful_after, lost, same_landmarks, without_lost
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy
@@ -50,10 +49,6 @@ class MapPruner:
     def forget(self) -> None:
         """Start a new run."""
         self.records = LandmarkRecords()
-
-    def bookmark(self) -> Undo:
-        """Return what takes back later changes of what is remembered."""
-        return attributes(self, self.records)
 
     def view_around(self, readings: Array) -> MapView:
         """Return a view of the landmarks that may matter for a scan (m, 2)."""

@@ -287,7 +287,7 @@ def test_the_density_is_large_where_new_readings_appear():
         ahead = (rng.uniform(-0.7, 0.7), rng.uniform(7.0, 8.0))  # new landmarks
         known = (2.0, 2.0)
         readings = np.array([near, ahead, known])
-        density = density.after(readings, np.array([True, True, False]))
+        density = density.after(readings, [0, 1])
     bearing, distance = (rng.uniform(low, 1.0, 20_000) for low in (-1.0, 0.0))
     readings = np.column_stack([np.pi * bearing, density.longest * distance])
     total = density.at(readings).mean() * 2 * np.pi * density.longest
@@ -300,10 +300,7 @@ def test_the_density_is_large_where_new_readings_appear():
 def test_bearings_of_many_turns_count_in_their_sector():
     far = np.array([[1e200, 2.0], [-1e200, 2.0]])
     within = np.column_stack([wrap_angle(far[:, 0]), far[:, 1]])
-    counts = [
-        UnexplainedDensity().after(z, np.ones(2, dtype=bool)).cells
-        for z in (far, within)
-    ]
+    counts = [UnexplainedDensity().after(z, [0, 1]).cells for z in (far, within)]
     np.testing.assert_array_equal(*counts)
 
 
