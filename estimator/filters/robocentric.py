@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
-from ..interface import Belief, MapView, UpdateReport
+from ..interface import Belief, MapView
 from ..kernels.scan_update import DONE
 from ..models.rigid_motion import as_covariance
 from ..models.sensors import only_placing
@@ -25,11 +25,15 @@ from .gaussian_map import LANDMARKS, complete, parts_jit, update_map
 # zero in place of the first two landmarks; then the landmarks.
 ORIGIN, HEADING, FIRST_LANDMARK = 3, 5, 7
 RESERVED = (-(2**63), 1 - 2**63)  # ids of these two places
+TAKEN = -5  # status of an update with one of these ids
 
 
 @jit
 def update_and_move(block: Array, readings: Array, ids: IntArray) -> int:
-    """Update a map with a scan as `update_map`, then move the frame."""
+    """Update a map with a scan as `update_map`, then move the frame to the robot."""
+    for landmark_id in ids:
+        if landmark_id <= RESERVED[1]:
+            return TAKEN
     status = update_map(block, readings, ids)
     if status == DONE and len(ids) > 0:
         parts = parts_jit(block)
@@ -80,15 +84,10 @@ class RobocentricEkfSlam(EkfSlam):
         state = {"mean": mean, "covariance": covariance, "reference": reference}
         self.map.restore(state | {"landmark_ids": np.array(RESERVED)})
 
-    def update(
-        self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
-    ) -> UpdateReport:
-        """Correct map and motion with one scan, then move the frame to the robot."""
-        readings = argument_checks.scan(measurements, self.sensor.columns)
-        given = argument_checks.identity_array(landmark_ids, len(readings), self)
-        if min(given.tolist(), default=0) <= max(RESERVED):
-            raise ValueError(f"landmark_ids must be above {max(RESERVED)}")
-        return super().update(readings, given)
+    def _refuse(self, status: int, readings: Array, ids: IntArray) -> NoReturn:
+        if status == TAKEN:
+            raise ValueError(f"landmark_ids must be above {RESERVED[1]}")
+        super()._refuse(status, readings, ids)
 
     def _observe(
         self, given: PoseReading, mean: Array, covariance: Array

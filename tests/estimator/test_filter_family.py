@@ -470,3 +470,16 @@ def test_an_update_makes_no_copy_of_the_covariance(name, policy):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 8 * 403**2 / 2
+
+
+@pytest.mark.parametrize("name", [-(2**63), 1 - 2**63])
+def test_a_robocentric_map_refuses_the_identities_of_its_own_places(name):
+    slam = make_estimator(
+        "robocentric", motion_std=(0.1, 0.1, 0.05), measurement_std=(0.02, 0.1)
+    )
+    slam.update([(0.0, 3.0), (1.0, 2.0)], [1, 2 - 2**63])
+    before = slam.state_dict()
+    with pytest.raises(ValueError, match=f"landmark_ids must be above {1 - 2**63}"):
+        slam.update([(0.1, 3.0), (0.2, 2.0)], [1, name])
+    for key, value in slam.state_dict().items():
+        np.testing.assert_array_equal(value, before[key])
