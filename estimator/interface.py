@@ -409,10 +409,10 @@ def advance(
     undo_then : callable
         Returns what takes back ``then``, which is called after the step.
     """
-    if not hasattr(estimator, "steps"):
+    steps = getattr(estimator, "steps", None)
+    if steps is None:
         with undone_on_error(undo_all(bookmark(estimator), undo_then(), undo)):
             return then(step())
-    steps = estimator.steps
     taken_back: Undo | None = None
 
     def settle() -> None:

@@ -342,12 +342,15 @@ class Detections(NamedTuple):
             counts,
             missed,
         )
-        left = {**self.missed, **dict(zip(ids, missed.tolist(), strict=True))}
+        left, chances = self.missed, missed.tolist()
+        if left or min(chances, default=1.0) < 1:
+            left = {**left, **dict(zip(ids, chances, strict=True))}
+            left = {i: chance for i, chance in left.items() if chance < 1}
         seen = [ids[slot] for slot in slots.tolist() if slot >= 0]
         more = {i: shown.get(i, 0) + 1 for i in seen if shown.get(i, 0) < PROVEN}
         return cost, Detections(
             *counts,
-            {i: chance for i, chance in left.items() if chance < 1},
+            left,
             {**shown, **more} if more else shown,
             self.evidence.after(fewer, view.mapped),
         )

@@ -123,15 +123,14 @@ class MapPruner:
         self.records.follow(view.mapped)
         if not seen:
             return
-        shown = [i if i in seen else None for i in row_ids]
-        heading = float(view.mean[2])
-        self.records.note_sightings(shown, readings, heading, self._noise)
+        ids = [i if i in seen else None for i in row_ids]
+        self.records.note_sightings(ids, readings, view.mean[2], self._noise)
         if within is not None:
-            ids = [i for i in shown if i is not None]
-            places = view.landmarks[self._places(view, ids)]
+            shown = [i for i in ids if i is not None]
+            places = view.landmarks[self._places(view, shown)]
             close = _distances(places, places) < 2 * within
             pairs = np.argwhere(np.triu(close, 1)).tolist()
-            self.records.note_apart(_ordered(ids[i], ids[j]) for i, j in pairs)
+            self.records.note_apart(_ordered(shown[i], shown[j]) for i, j in pairs)
 
     def _remove_missing(self, missed: set[int]) -> list[int]:
         """Count a miss for each landmark of ``missed``; remove those missed too often.
