@@ -86,27 +86,22 @@ def assign_scan(
     if policy.association == "nearest":
         fit = innovation_distances(view, readings, noise, policy.new_gate)
         explained = np.flatnonzero(np.isfinite(fit.squared).any(axis=0))
-        gates = {"match": policy.match_gate, "new": policy.new_gate}
-        slots = nearest_neighbours(fit, **gates, ambiguity=policy.ambiguity)
+        within = {"match": policy.match_gate, "new": policy.new_gate}
+        slots = nearest_neighbours(fit, **within, ambiguity=policy.ambiguity)
         return Assignments([Assignment(0.0, slots)], explained)
     pairs_first, count = policy.association == "compatibility", len(readings)
     missing = np.zeros(count) if pairs_first else missing_costs(density)
     if most is None:
         most = policy.branches if policy.association == "hypotheses" else 1
-    landmarks = len(view.ids)
-    costs, slots = np.empty(most), np.empty((most, count), dtype=np.int64)
-    explained = np.empty(landmarks, dtype=np.int64)
-    found, near = assign_jointly(
-        (view.mean, view.covariance),
-        (readings, missing, _limits(policy, count)),
-        tuple(noise),
-        (float(policy.new_gate), float(policy.pair_gate), float(ceiling)),
-        (pairs_first, policy.search_nodes),
-        (costs, slots, explained),
-    )
+    scan = readings, missing, _limits(policy, count)
+    gates = float(policy.new_gate), float(policy.pair_gate), float(ceiling)
+    search = pairs_first, policy.search_nodes
+    slots = np.empty((most, count), dtype=np.int64)
+    found = costs, _, explained = np.empty(most), slots, np.arange(len(view.ids))
+    best, near = assign_jointly(view[:2], scan, tuple(noise), gates, search, found)
     if not near:
         costs[0] = missing.sum()
-    ranked = [*map(Assignment, costs[:found].tolist(), slots)]
+    ranked = [*map(Assignment, costs[:best].tolist(), slots)]
     return Assignments(ranked, explained[:near])
 
 
@@ -142,7 +137,9 @@ def assign_jointly(
     noise, rows = Noise(*of_sensor), len(readings)
     squared = np.full((rows, len(explained)), np.inf)
     _compare(mean, P, readings, of_sensor, new_gate, (squared, squared.copy()))
-    near = _list_explained(squared, explained)
+    some = np.flatnonzero(np.array([np.isfinite(d).any() for d in squared.T]))
+    near = len(some)
+    explained[:near] = some
     expected, joint = np.empty((near, 2)), np.empty((2 * near, 2 * near))
     fill_expected(mean, P, explained[:near], expected, joint)
     innovations, variances = np.empty((rows, near, 2)), np.empty((rows, near, 2))
@@ -169,17 +166,6 @@ def assign_jointly(
             costs[kept], marks[kept] = found[0][s], marks[s]
             kept += 1
     return kept, near
-
-
-@njit_internal
-def _list_explained(squared: Array, explained: IntArray) -> int:
-    """List the landmarks that some reading may belong to; return how many."""
-    near = 0
-    for j in range(len(explained)):
-        if np.isfinite(squared[:, j]).any():
-            explained[near] = j
-            near += 1
-    return near
 
 
 @njit_internal

@@ -65,23 +65,18 @@ class ScanAssociation:
         Before the scan.
     readings : ndarray, shape (m, 2)
         The scan, rows (β, r) [rad, m].
-    detections : Detections, optional
-        After the scan; by default, it leaves them as they are.
     """
 
     def __init__(
-        self,
-        policy: AssociationPolicy,
-        candidates: Candidates,
-        readings: Array,
-        detections: Detections | None = None,
+        self, policy: AssociationPolicy, candidates: Candidates, readings: Array
     ) -> None:
         self._policy = policy
         self._tentative = candidates.tentative.next_scan(policy.confirm[1])
         self._waiting = dict(candidates.waiting)
         self._next_id, self.scan = candidates.next_id, candidates.scan
         self._density, self._readings = candidates.density, readings
-        self._detections = detections or candidates.detections
+        #: After the scan.
+        self.detections = candidates.detections
         #: For each row the landmark that the filter associates it with, if any.
         self.row_ids: list[int | None] = [None] * len(readings)
         #: Labels of landmarks that were tentative before this scan.
@@ -96,16 +91,13 @@ class ScanAssociation:
     def candidates_after(self, view: MapView) -> Candidates:
         """Return the candidates after the scan, given the belief after it."""
         rows = enumerate(zip(self.row_ids, self.labels, strict=True))
-        new = [
-            row
-            for row, (i, label) in rows
-            if i is None and (label < 0 or label >> LABEL_BITS == self.scan)
-        ]
+        known = self.scan << LABEL_BITS  # labels below are of tentative landmarks
+        new = [k for k, (i, label) in rows if i is None and not 0 <= label < known]
         density = self._density.after(self._readings, new, len(self.confirmed))
-        evidence = self._detections.evidence.with_heading(view)
-        detections = self._detections._replace(evidence=evidence)
-        known = self._tentative, self._waiting, self._next_id, self.scan + 1
-        return Candidates(*known, density, detections)
+        evidence = self.detections.evidence.with_heading(view)
+        detections = self.detections._replace(evidence=evidence)
+        changed = self._tentative, self._waiting, self._next_id, self.scan + 1
+        return Candidates(*changed, density, detections)
 
     def assign(self, slots: IntArray, view: MapView, noise: Noise) -> None:
         """Take the slots of the map that the rows are assigned to.
@@ -155,7 +147,7 @@ class ScanAssociation:
                 self.labels[row] = int(tentative.labels[slot])
                 reading = readings[row]
                 tentative = tentative.with_sighting(slot, reading, noise, density[n])
-        chance = self._detections.chance_to_miss(view, self._density.longest)
+        chance = self.detections.chance_to_miss(view, self._density.longest)
         tentative = tentative.with_misses(chance)
         needed = self._policy.confirm[0]
         enough = (tentative.sightings >= needed) & (tentative.odds > ENTRY_ODDS)
@@ -332,16 +324,10 @@ class Detections(NamedTuple):
         """
         ids, shown, first_new = view.ids, self.shown, self.evidence.first_new
         proven = [i < first_new and shown.get(i, 0) >= PROVEN for i in ids]
+        is_telling, scan = np.array(proven, dtype=np.bool_), (slots, explained)
         missed = np.array([self.missed.get(i, 1.0) for i in ids])
         counts = self.seen.copy(), self.expected.copy()
-        cost, fewer = _count(
-            (view.mean, view.covariance),
-            (slots, explained),
-            np.array(proven, dtype=np.bool_),
-            longest,
-            counts,
-            missed,
-        )
+        cost, fewer = _count(view[:2], scan, is_telling, longest, counts, missed)
         left, chances = self.missed, missed.tolist()
         if left or min(chances, default=1.0) < 1:
             left = {**left, **dict(zip(ids, chances, strict=True))}
@@ -593,7 +579,8 @@ def associate(
     found = assign_scan(policy, view, used, noise, density, ceiling=ceiling)
 
     def complete(slots: IntArray, detections: Detections) -> ScanAssociation:
-        association = ScanAssociation(policy, candidates, readings, detections)
+        association = ScanAssociation(policy, candidates, readings)
+        association.detections = detections
         association.explained = {view.ids[slot] for slot in found.explained.tolist()}
         if len(slots) < len(readings):
             slots, given = np.full(len(readings), AMBIGUOUS), slots

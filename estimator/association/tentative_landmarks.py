@@ -229,9 +229,8 @@ class UnexplainedDensity(NamedTuple):
         self, readings: Array, new: Sequence[int], landmarks: int = 0
     ) -> "UnexplainedDensity":
         """Count one more scan (m, 2), its rows of no landmark, and those confirmed."""
-        rows, cells = np.array(new, dtype=np.int64), self.cells
-        if new:
-            cells = cells.copy()
+        rows = np.array(new, dtype=np.int64)
+        cells = self.cells.copy() if new else self.cells
         return UnexplainedDensity(
             MEMORY * self.readings + len(new),
             MEMORY * self.scans + 1,

@@ -26,7 +26,6 @@ from ..support import saved_states as saved
 from ..support.argument_checks import aligned_copy, aligned_zeros, landmarks_that_fit
 from ..support.undo import Undo
 
-set_attribute = object.__setattr__  # of frozen dataclasses
 FIRST_LANDMARKS = FIRST_READINGS = 8  # that a new map has room for
 
 # Status of an update besides those of `update_belief`.
@@ -613,7 +612,7 @@ class ScanReport(UpdateReport):
     _parts: Parts
 
     def __init__(self, parts: Parts) -> None:
-        set_attribute(self, "_parts", parts)
+        self.__dict__["_parts"] = parts  # past a frozen dataclass
 
     def detach(self) -> None:
         """Copy the results: the next update is about to overwrite them."""
@@ -687,12 +686,9 @@ class ScanReport(UpdateReport):
         return self._record.rows[:, gain.INNOVATION].reshape(-1, 2)
 
     def _with_outcome(self, value: int) -> tuple[int, ...]:
-        """Return the landmarks of the readings with an outcome."""
         return tuple([i for i, found in self._outcomes if found == value])
 
-    @cached_property
-    def _outcomes(self) -> list[tuple[int, int]]:
-        return self._entries(gain.OUTCOME)
+    _outcomes = cached_property(lambda self: self._entries(gain.OUTCOME))
 
     def _entries(self, row: int) -> list[tuple[int, int]]:
         """Return the landmark of each reading, and its entry in a row of the ledger."""

@@ -1,7 +1,7 @@
 """Search for the cheapest joint assignments of a scan, compiled.
 
 :mod:`slamgym.estimator.association.scan_assignments` has the equations.
-`search_assignments` decides at depth d of the search tree the reading ``order[d]``.
+`best_assignments` decides at depth d of the search tree the reading ``order[d]``.
 The expected readings given the pairs so far stand at ``level[d]`` of ``shifts`` and
 ``joints``. `search_clique` finds the largest set of landmark pairs that agree.
 """
@@ -109,7 +109,7 @@ def _insert(
 def best_assignments(
     of_scan: tuple[Any, ...], most: int, spread: float, ceiling: float, nodes: int
 ) -> tuple[Array, IntArray, Array, bool]:
-    """Return the cheapest assignments of a scan.
+    """Return the cheapest assignments of a scan by depth-first branch and bound.
 
     Parameters
     ----------
@@ -129,11 +129,11 @@ def best_assignments(
     Returns
     -------
     costs : ndarray, shape (M,)
-        The cheapest first; infinite where a scan has no pair to consider.
+        The cheapest first.
     marks : ndarray of int64, shape (M, m)
         Landmark 0 … J − 1 of each reading or `UNPAIRED`.
     distances : ndarray, shape (M, m)
-        As :func:`fill_distances` finds them.
+        As :func:`least_distances` finds them.
     is_complete : bool
         False where the search stopped at its limit of nodes.
 
@@ -146,46 +146,6 @@ def best_assignments(
     .. [1] J. Neira, J. Tardós, Data association in stochastic mapping using the joint
        compatibility test, IEEE Transactions on Robotics and Automation 17, 2001.
     """
-    rows, landmarks = Problem(*of_scan).feasible.shape
-    costs, marks = np.full(most, np.inf), np.full((most, rows), UNPAIRED)
-    distances = np.full((most, rows), np.inf)
-    if rows == 0 or landmarks == 0:
-        return costs[:1], marks[:1], distances[:1], True
-    visited = search_assignments(of_scan, costs, marks, spread, ceiling, nodes)
-    count = (np.isfinite(costs) & (costs <= costs[0] + spread)).sum()
-    costs, marks, distances = costs[:count], marks[:count], distances[:count]
-    fill_distances(of_scan, marks, distances)
-    return costs, marks, distances, visited < nodes
-
-
-@njit_internal
-def search_assignments(
-    of_scan: tuple[Any, ...],
-    costs: Array,
-    marks: IntArray,
-    spread: float,
-    ceiling: float,
-    nodes: int,
-) -> int:
-    """Fill the cheapest assignments by depth-first branch and bound.
-
-    Parameters
-    ----------
-    of_scan : tuple
-        As in :func:`best_assignments`.
-    costs, marks : ndarray, shape (M,) and (M, m)
-        Infinite and `UNPAIRED`; on return the assignments found, the cheapest first.
-    spread, ceiling : float
-        Assignments that cost more than the cheapest plus ``spread``, or more than
-        ``ceiling``, are ignored, except the first one found.
-    nodes : int
-        Limit of nodes to visit once an assignment has been found.
-
-    Returns
-    -------
-    int
-        Number of nodes visited.
-    """
     problem = Problem(*of_scan)
     missing, gate, limits, pairs_first = (
         problem.missing,
@@ -194,6 +154,7 @@ def search_assignments(
         problem.pairs_first,
     )
     rows, landmarks = problem.feasible.shape
+    costs, marks = np.full(most, np.inf), np.full((most, rows), UNPAIRED)
     order = _decision_order(problem.feasible, problem.innovations)
     names, counts = _needed(problem.feasible, order)
     innovations = problem.innovations[:, names]
@@ -299,7 +260,8 @@ def search_assignments(
                 continue
         depth += 1
         is_new = True
-    return visited
+    marks = marks[: (np.isfinite(costs) & (costs <= costs[0] + spread)).sum()]
+    return costs[: len(marks)], marks, least_distances(problem, marks), visited < nodes
 
 
 # --------------------------------------------------------------------------------------
@@ -475,22 +437,26 @@ def condition_on_all(
 
 
 @njit_internal
-def fill_distances(of_scan: tuple[Any, ...], marks: IntArray, distances: Array) -> None:
-    """Find the least νᵀ S⁻¹ ν of each unpaired reading to a landmark without one.
+def least_distances(problem: Problem, marks: IntArray) -> Array:
+    """Return the least νᵀ S⁻¹ ν of each unpaired reading to a landmark without one.
 
     A scan shows a landmark once, so a reading near a paired landmark shows another one.
     Only landmarks whose place in the scan is certain count: det S ≤ `SURE` det Q.
 
     Parameters
     ----------
-    of_scan : tuple
-        As in :func:`best_assignments`.
-    marks, distances : ndarray, shape (M, m)
-        Assignments; the distances are infinite before.
+    problem : Problem
+    marks : ndarray, shape (M, m)
+        Assignments.
+
+    Returns
+    -------
+    ndarray, shape (M, m)
+        Infinite where there is none.
     """
-    problem = Problem(*of_scan)
     innovations, variances = problem.innovations, problem.variances
     rows, landmarks = problem.feasible.shape
+    distances = np.full(marks.shape, np.inf)
     shifts = np.empty((2, landmarks, 2))
     joints = np.empty((2, 2 * landmarks, 2 * landmarks))
     taken = np.zeros(landmarks, np.bool_)
@@ -511,6 +477,7 @@ def fill_distances(of_scan: tuple[Any, ...], marks: IntArray, distances: Array) 
                     q = variances[i, j]
                     if determinant <= SURE * q[0] * q[1]:
                         distances[s, i] = min(distances[s, i], x)
+    return distances
 
 
 @jit

@@ -474,7 +474,7 @@ class FilterPool:
 
     def __init__(self, make: Callable[[], ManagedSlam]) -> None:
         self._make = make
-        self._spare: tuple[ManagedSlam, ...] = ()
+        self._spare: list[ManagedSlam] = []
 
     def __len__(self) -> int:
         """Return how many filters nobody uses."""
@@ -482,9 +482,7 @@ class FilterPool:
 
     def fresh(self) -> ManagedSlam:
         """Return a filter that nobody uses, in any state."""
-        if not self._spare:
-            return self._make()
-        slam, self._spare = self._spare[-1], self._spare[:-1]
+        *self._spare, slam = self._spare or [self._make()]
         return slam
 
     def copy(self, slam: ManagedSlam) -> ManagedSlam:
@@ -502,4 +500,4 @@ class FilterPool:
         for slam in slams:
             if slam not in self._spare:
                 slam.reset(np.zeros(3), np.zeros(3))  # frees its scans
-                self._spare = (*self._spare, slam)
+                self._spare = [*self._spare, slam]

@@ -54,10 +54,10 @@ def lost(view: MapView, rules: Constellations | None) -> BoolArray:
     is_lost = np.zeros(len(view.ids), dtype=np.bool_)
     if rules is None or not (rules.always or len(view.mapped) >= 2 * rules.least):
         return is_lost
-    limit, least = float(rules.lost_std), rules.least
-    local, known = _find_lost(view.mean, view.covariance, limit, is_lost)
+    local, known = _find_lost(*view[:2], float(rules.lost_std), is_lost)
     is_part = view.whole is not None  # landmarks near the robot may be left out
-    can_match = (local >= least or is_part) and len(view.mapped) - known >= 2 * least
+    is_known = local >= rules.least or is_part
+    can_match = is_known and len(view.mapped) - known >= 2 * rules.least
     return is_lost if can_match or rules.always else np.zeros_like(is_lost)
 
 

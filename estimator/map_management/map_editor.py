@@ -74,15 +74,13 @@ class MapEditor:
         the distance of the last time.
         """
         reach = self._within if within is None else within
-        view = self._view
-        if view is None or reach > self._within:
+        if self._view is None or reach > self._within:
             if self._has_methods and self.is_local:
-                view = self._slam.local_view(reach)
+                self._view = self._slam.local_view(reach)
             else:
-                view = view_map(self._slam)
-            self._view = view
+                self._view = view_map(self._slam)
         self._within = reach
-        return view
+        return self._view
 
     def bookmark(self) -> Undo:
         """Return what takes back later views, also where the filter notes them."""

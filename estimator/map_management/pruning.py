@@ -130,7 +130,8 @@ class MapPruner:
             places = view.landmarks[self._places(view, shown)]
             close = _distances(places, places) < 2 * within
             pairs = np.argwhere(np.triu(close, 1)).tolist()
-            self.records.note_apart(_ordered(shown[i], shown[j]) for i, j in pairs)
+            apart = {_ordered(shown[i], shown[j]) for i, j in pairs}
+            self.records.apart = self.records.apart | apart
 
     def _remove_missing(self, missed: set[int]) -> list[int]:
         """Count a miss for each landmark of ``missed``; remove those missed too often.
@@ -140,7 +141,7 @@ class MapPruner:
         most, records = self._policy.remove_after, self.records
         if most is None:
             return []
-        records.count_misses(missed)
+        records.renewed()[1][records.slots(missed)] += 1
         overdue = np.flatnonzero(records.misses >= most)
         return self.remove([records.ids[k] for k in overdue.tolist()])
 
@@ -310,22 +311,13 @@ class LandmarkRecords(Restorable):
         """
         slots = self._slots
         rows = np.array([-1 if i is None else slots[i] for i in ids], dtype=np.int64)
-        _add_sightings(self._renewed(), rows, readings, heading, noise)
+        _add_sightings(self.renewed(), rows, readings, heading, noise)
 
-    def _renewed(self) -> tuple[IntArray, IntArray, Array]:
+    def renewed(self) -> tuple[IntArray, IntArray, Array]:
         """Replace the arrays by copies, which may be changed; return these."""
         self.sightings, self.misses = self.sightings.copy(), self.misses.copy()
         self.information = self.information.copy()
         return self.sightings, self.misses, self.information
-
-    def count_misses(self, ids: Iterable[int]) -> None:
-        """Count one miss of each landmark."""
-        self._renewed()[1][self.slots(ids)] += 1
-
-    def note_apart(self, pairs: Iterable[tuple[int, int]]) -> None:
-        """Remember pairs of landmarks that differ."""
-        if not self.apart.issuperset(new := [*pairs]):
-            self.apart = self.apart.union(new)
 
     def slots(self, ids: Iterable[int]) -> IntArray:
         """Return the places of landmarks in the order of the map."""
@@ -334,7 +326,7 @@ class LandmarkRecords(Restorable):
     def join(self, kept: int, gone: int) -> None:
         """Add the records of one landmark to those of another."""
         i, j = self._slots[kept], self._slots[gone]
-        sightings, misses, information = self._renewed()
+        sightings, misses, information = self.renewed()
         sightings[i] += sightings[j]
         information[i] += information[j]
         misses[i] = min(misses[i], misses[j])
