@@ -249,7 +249,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         self, info: dict[str, Any], ended: BoolArray
     ) -> tuple[Observation, dict[str, Any]]:
         rows = self.task.observations()
-        infos = self._explorers.infos(self._landmarks[None], ended)
+        infos = self._explorers.infos(self._landmarks, ended)
         more = {key: values.item() for key, values in infos.items()}
         return {key: row[0] for key, row in rows.items()}, {**info, **more}
 

@@ -9,17 +9,17 @@ p = (x, y, θ)  true robot pose in the world frame [m, m, rad]
 l = (lx, ly)   landmark [m, m], as the complex number lx + i ly
 z = (β, r)     reading: bearing from the robot's heading, and range [rad, m]
 
-Here readings are stored as (all bearings, all ranges), so that both are contiguous.
-Every function accepts leading axes for worlds that are simulated together.
+Every function takes several worlds that are simulated together, along the first axis.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..arrays import Array, BoolArray, ComplexArray, IntArray
-from ..jit import jit
+from ..jit import fma, jit, njit_internal
 from ..sim_configs import Scenario
 from ..suggestions import imported
 from .noise_streams import SensorNoise, SensorSettings
@@ -31,7 +31,7 @@ _LAST = np.array(np.inf)  # sorts after every other row
 class AnonymousScan(NamedTuple):
     """Readings without identities, in random order, empty rows last."""
 
-    readings: Array  # (β, r), zeros in empty rows, shape (2, …, M) [rad, m]
+    readings: Array  # (β, r), zeros in empty rows, shape (…, M, 2) [rad, m]
     mask: BoolArray  # rows with a reading, shape (…, M)
     # The true landmark of each row, -1 for clutter and empty rows, shape (…, M).
     landmark_ids: IntArray
@@ -53,11 +53,14 @@ class BearingRangeSensor:
     def __init__(self, scenario: Scenario) -> None:
         sensor = scenario.sensor
         self._settings = SensorSettings.of(sensor)
-        self._reads_places, self._wraps = _reading_of_places(sensor.kind)
+        self._reads_places, wraps = _reading_of_places(sensor.kind)
         self._reads_ranges = sensor.kind == "range"
         self._reads_one = sensor.kind in ("bearing", "range")
         faults = scenario.present_faults
-        self._bias = faults.bearing_bias, faults.range_bias
+        bias = faults.bearing_bias, faults.range_bias
+        smallest = math.nextafter(sensor.min_range, -1.0)
+        self._constants = np.array([smallest, *bias, *wraps])
+        self._room = np.empty((0, 0), np.complex128), np.empty((2, 0, 0))
         hides = sensor.occlusion and scenario.walls
         self._sight = LineOfSight(scenario.walls) if hides else None
 
@@ -65,11 +68,11 @@ class BearingRangeSensor:
         self,
         landmarks: ComplexArray,
         position: ComplexArray,
-        inverse_heading: ComplexArray,
+        heading: ComplexArray,
         noise: SensorNoise,
         settings: SensorSettings | None = None,
     ) -> tuple[Array, BoolArray]:
-        """Measure the landmarks from one pose per world.
+        """Measure the landmarks from one pose in each of K worlds.
 
         ::
 
@@ -77,12 +80,10 @@ class BearingRangeSensor:
 
         Parameters
         ----------
-        landmarks : complex ndarray, shape (…, N)
+        landmarks : complex ndarray, shape (K, N)
             l [m].
-        position : complex ndarray, shape () or (…, 1)
-            x + iy [m].
-        inverse_heading : complex ndarray, shape () or (…, 1)
-            cos θ - i sin θ.
+        position, heading : complex ndarray, shape (K,)
+            x + iy [m] and cos θ + i sin θ.
         noise : SensorNoise
             Noise of this step.
         settings : SensorSettings, optional
@@ -90,88 +91,121 @@ class BearingRangeSensor:
 
         Returns
         -------
-        readings : ndarray, shape (2, …, N)
+        measurements : ndarray, shape (K, N, 2)
             (β in [-π, π), r) [rad, m], or the numbers of another kind of sensor, zeros
             where unseen.
-        mask : bool ndarray, shape (…, N)
+        mask : bool ndarray, shape (K, N)
             Landmarks that the sensor reads.
         """
-        error, nearest, _, _ = noise
-        relative = (landmarks - position) * inverse_heading
-        readings = np.empty(error.shape)  # without noise at first
-        mask = np.empty(nearest.shape, dtype=np.bool_)
-        y, x = relative.imag, relative.real
-        if y.ndim > 1:  # contiguous copies are twice as fast for many
-            y, x = y.copy(), x.copy()
-        np.arctan2(y, x, readings[0])
-        np.abs(relative, readings[1])
-        places = readings
+        shape = landmarks.shape
+        if self._room[0].shape != shape:
+            self._room = np.empty(shape, np.complex128), np.empty((2, *shape))
+        relative, places = self._room
+        _relate(landmarks, position, heading, relative, places)
+        y, x, readings = places[0], places[1], places
         if self._reads_places is not None:
-            places, readings = readings, np.empty(error.shape)
-            readings[0], readings[1] = self._reads_places(x, y)
-        at = np.s_[..., None, :] if mask.ndim == 1 else np.s_[...]  # one world or more
+            readings = np.stack(self._reads_places(x, y))
+        np.arctan2(y, x, y)
+        np.abs(relative, x)
+        measurements, mask = np.empty((*shape, 2)), np.empty(shape, np.bool_)
+        numbers = self._settings.numbers if settings is None else settings.numbers
         _disturb(
-            *(places[at], readings[at], error[at], nearest[at], mask[at]),
-            *((settings or self._settings).numbers, self._bias, self._wraps),
+            *(places, readings, noise[0], noise[1], numbers, self._constants),
+            *(measurements, mask),
         )
         if self._sight is not None:
-            mask &= ~self._sight.blocked(landmarks, position)
-            readings = np.where(mask, readings, 0.0)
+            mask &= ~self._sight.blocked(landmarks, position[:, None])
+            measurements = np.where(mask[..., None], measurements, 0.0)
         if self._reads_one:
             if self._reads_ranges:
-                readings[0] = readings[1]
-            readings[1] = 0.0
-        return readings, mask
+                measurements[..., 0] = measurements[..., 1]
+            measurements[..., 1] = 0.0
+        return measurements, mask
+
+
+@jit
+def _relate(
+    landmarks: ComplexArray,
+    position: ComplexArray,
+    heading: ComplexArray,
+    relative: ComplexArray,
+    places: Array,
+) -> None:
+    """Write δ of the landmarks of K worlds, also as its y and its x, (2, K, N) [m]."""
+    for world in range(len(landmarks)):
+        p, cos, sin = position[world], heading[world].real, heading[world].imag
+        for i in range(landmarks.shape[1]):
+            away = landmarks[world, i] - p
+            x = fma(away.real, cos, away.imag * sin)
+            y = fma(away.real, -sin, away.imag * cos)
+            relative[world, i] = complex(x, y)
+            places[0, world, i], places[1, world, i] = y, x
 
 
 @jit
 def _disturb(  # noqa: PLR0917 (numba takes arrays more quickly than tuples of them)
     places: Array,
     readings: Array,
-    error: Array,
-    nearest: Array,
-    mask: BoolArray,
+    unit: Array,
+    lots: Array,
     settings: Array,
-    bias: tuple[float, float],
-    wraps: tuple[bool, bool],
+    constants: Array,
+    measurements: Array,
+    mask: BoolArray,
 ) -> None:
-    """Turn readings without noise into what the sensors of K worlds read, in place.
+    """Write what the sensors of K worlds read.
 
     Parameters
     ----------
     places : ndarray, shape (2, K, N)
-        True (β, r) [rad, m]; may be `readings`.
-    readings, error : ndarray, shape (2, K, N)
-        Without noise, and what is added; zeros where unseen.
-    nearest : ndarray, shape (K, N)
+        True (β, r) [rad, m].
+    readings : ndarray, shape (2, K, N)
+        Without noise; `places` of a sensor that reads β and r.
+    unit, lots : ndarray
         See `SensorNoise`.
-    mask : bool ndarray, shape (K, N)
-        Receives which landmarks the sensors read.
     settings : ndarray, shape (K or 1, 7)
         See `SensorSettings`.
-    bias : (float, float)
-        Added to the readings.
-    wraps : (bool, bool)
-        Which numbers of a reading are angles.
+    constants : ndarray, shape (5,)
+        The range above which landmarks are read [m], what is added to either number of
+        a reading, and 1 for each of them that is an angle.
+    measurements : ndarray, shape (K, N, 2)
+        Receives the readings, zeros where unseen.
+    mask : bool ndarray, shape (K, N)
+        Receives which landmarks the sensors read.
     """
+    count, smallest = mask.shape[1], constants[0]
+    bias, wraps = constants[1:3], constants[3:]
+    has_bias = bias[0] != 0.0 or bias[1] != 0.0
     for world in range(len(mask)):
-        std, growth, _, reach, view = settings[min(world, len(settings) - 1), 2:]
-        for i in range(mask.shape[1]):
+        row = settings[min(world, len(settings) - 1)]
+        std, growth, dropout, reach, view = row[2:7]
+        for i in range(count):
             bearing, distance = places[0, world, i], places[1, world, i]
-            in_reach = nearest[world, i] < distance <= reach
-            mask[world, i] = in_reach and abs(bearing) <= view / 2
+            nearest = _nearest(unit[world, count + i], std, growth, bias[1])
+            in_reach = max(nearest, smallest) < distance <= reach
+            stays = lots.shape[1] == 0 or lots[world, i] >= dropout
+            mask[world, i] = in_reach and stays and abs(bearing) <= view / 2
             for part in range(2):
                 reading = 0.0
                 if mask[world, i]:
-                    add = error[part, world, i]
+                    error = unit[world, part * count + i] * row[part]
                     if part == 1 and growth > 0.0:
-                        add *= std + growth * distance
-                    reading = readings[part, world, i] + add
-                    if bias[0] != 0.0 or bias[1] != 0.0:
+                        error *= std + growth * distance
+                    reading = readings[part, world, i] + error
+                    if has_bias:
                         reading += bias[part]
-                    if wraps[part]:
+                    if wraps[part] > 0.0:
                         reading = wrapped_bearing(reading)
-                readings[part, world, i] = reading
+                measurements[world, i, part] = reading
+
+
+@njit_internal
+def _nearest(noise: float, std: float, growth: float, bias: float) -> float:
+    """Return the range r above which r + (σr + k r) ε + bias is positive."""
+    nearest, slope = -std * noise - bias, 1.0 + growth * noise
+    if growth > 0.0:
+        nearest = nearest / slope if slope > 0.0 else np.inf
+    return nearest
 
 
 def _reading_of_places(kind: str) -> tuple[Any, tuple[bool, bool]]:
@@ -189,13 +223,13 @@ def _reading_of_places(kind: str) -> tuple[Any, tuple[bool, bool]]:
 
 
 def hide_identities(
-    readings: Array, mask: BoolArray, noise: SensorNoise
+    measurements: Array, mask: BoolArray, noise: SensorNoise
 ) -> AnonymousScan:
     """Mix readings with clutter in random order, empty rows last.
 
     Parameters
     ----------
-    readings : ndarray, shape (2, …, N)
+    measurements : ndarray, shape (…, N, 2)
         (β, r) of each landmark, zeros where unseen [rad, m].
     mask : bool ndarray, shape (…, N)
         Landmarks that the sensor reads.
@@ -211,17 +245,17 @@ def hide_identities(
     assert clutter is not None
     assert order is not None
     count = mask.shape[-1]
-    rows = np.zeros((3, *order.shape))
-    rows[:2, ..., :count] = readings
-    rows[:2, ..., count:] = clutter
-    rows[2] = -1.0
-    np.copyto(rows[2, ..., :count], np.arange(count), where=mask)
-    places = np.argsort(np.where(rows[1] > 0.0, order, _LAST), axis=-1)
+    rows = np.empty((*order.shape, 3))
+    rows[..., :count, :2], rows[..., count:, :2] = measurements, clutter
+    rows[..., 2] = -1.0
+    np.copyto(rows[..., :count, 2], np.arange(count), where=mask)
+    places = np.argsort(np.where(rows[..., 1] > 0.0, order, _LAST), axis=-1)
     if places.ndim == 1:
-        packed = rows[:, places]  # 20 µs faster
+        rows = rows[places]  # 20 µs faster
     else:
-        packed = np.take_along_axis(rows, places[None], axis=-1)
-    return AnonymousScan(packed[:2], packed[1] > 0.0, packed[2].astype(np.int64))
+        rows = np.take_along_axis(rows, places[..., None], axis=-2)
+    ids = rows[..., 2].astype(np.int64)
+    return AnonymousScan(rows[..., :2].copy(), rows[..., 1] > 0.0, ids)
 
 
 _MOUNTED = 1e-6  # a landmark this near to the line of a wall is mounted on it [m]

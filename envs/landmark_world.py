@@ -18,7 +18,7 @@ from ..restorable import Restorable, State
 from ..sim_configs import Scenario, load_scenario
 from .bearing_range import BearingRangeSensor, hide_identities
 from .drives import drive_of
-from .noise_streams import NoiseRows, PoseSensors, WorldNoise
+from .noise_streams import PoseSensors, WorldNoise
 from .rendering.episode_renderer import EpisodeRenderer
 from .rendering.render_state import RENDER_MODES, BeliefLike
 from .robot import OdometrySensor, UnicycleBody
@@ -102,7 +102,7 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         *("_np_random", "_body", "_motion_noise", "_sensor_noise", "_renderer"),
     )
     replaced = (
-        *("_np_random_seed", "_drawn_scenario", "_sensor", "_starts", "_noise", "_key"),
+        *("_np_random_seed", "_drawn_scenario", "_sensor", "_starts", "_key"),
         *("_landmarks", "_start_estimate", "_steps_left"),
     )
     _spec: EnvSpec | None = None
@@ -131,7 +131,6 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         self._hides_identities = not self.scenario.sensor.identities
         self._landmarks: ComplexArray = np.empty(0, dtype=np.complex128)
         self._adopt(self.scenario)
-        self._motion_noise = NoiseRows(_refuse_to_step)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -170,12 +169,12 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
             self._adopt(drawn_scenarios(self.scenario, key)[0])
         redraws = has_ranges or self._starts.redraws_landmarks
         if redraws or len(self._landmarks) == 0:
-            self._landmarks = self._starts.landmarks(key)[0]
+            self._landmarks = self._starts.landmarks(key)
         poses, estimates = self._starts.poses(key)
         self._body.place(poses[0].tolist())
         self._start_estimate: Array = estimates[0]
-        self._motion_noise = self._noise.motion_rows(key)
-        self._sensor_noise = self._noise.sensor_rows(key)
+        self._motion_noise.begin(key, first=1)
+        self._sensor_noise.begin(key, first=0)
         self._steps_left = self.scenario.steps
         if self._renderer is not None:
             self._renderer.begin(self.landmarks)
@@ -200,7 +199,9 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         command = speed * self._dt, turn_rate * self._dt
         if self._drive is not None:
             command = self._drive.feasible(*command)
-        slip, error = self._odometer.split_noise(command, next(self._motion_noise))
+        self._refuse_before_reset()
+        noise = next(self._motion_noise).tolist()
+        slip, error = self._odometer.split_noise(command, noise)
         share = self._body.drive(command, slip)
         odometry = self._odometer.read(command, share, error)
         self._steps_left -= 1
@@ -251,7 +252,9 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         self._drawn_scenario = scenario
         self._sensor = BearingRangeSensor(scenario)
         self._starts = EpisodeStarts(scenario)
-        self._noise = WorldNoise(scenario)
+        noise = WorldNoise(scenario)
+        self._motion_noise = noise.motion_rows()
+        self._sensor_noise = noise.sensor_rows()
 
     @property
     def drawn_scenario(self) -> Scenario:
@@ -288,25 +291,19 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         self, odometry: Array, collision: bool
     ) -> tuple[Observation, dict[str, Any]]:
         body, noise = self._body, next(self._sensor_noise)
-        readings, mask = self._sensor.scan(
-            self._landmarks, body.position, body.inverse_heading, noise
-        )
+        scan = self._sensor.scan(self._landmarks, body.position, body.heading, noise)
+        measurements, mask = scan[0][0], scan[1][0]
         info: dict[str, Any] = {"pose": body.pose, "collision": collision}
         if self._hides_identities:
-            readings, mask, info["landmark_ids"] = hide_identities(
-                readings, mask, noise
+            measurements, mask, info["landmark_ids"] = hide_identities(
+                measurements, mask, noise
             )
         if self._pose_sensors.present:
             step = np.array([self.scenario.steps - self._steps_left])
             at = self._pose_sensors.read(self._key, step, body.pose[None])[0]
             info |= self._pose_sensors.by_name(at)
-        measurements = readings.T
         if self._renderer is not None:
             ids = info.get("landmark_ids")
             clutter = None if ids is None else ids[mask] < 0
             self._renderer.add(body.pose, measurements[mask], collision, clutter)
         return {"landmarks": measurements, "mask": mask, "odometry": odometry}, info
-
-
-def _refuse_to_step(steps: object) -> list[list[float]]:
-    raise ResetNeeded("call reset before step")

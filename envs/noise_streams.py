@@ -7,15 +7,13 @@ effect, and a world has the same noise alone and among others.
 """
 
 import math
-from collections.abc import Callable, Iterable
-from functools import partial
-from itertools import repeat
-from typing import Generic, NamedTuple, TypeVar, cast
+from collections.abc import Callable
+from operator import getitem
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from ..arrays import Array, IntArray, WordArray
-from ..jit import jit
 from ..restorable import Restorable
 from ..sim_configs import Scenario
 from ..sim_configs.scenario import Sensor
@@ -27,19 +25,18 @@ _FIRST_BLOCK = 8  # steps; short, so that a reset is quick
 _GROWTH = 4  # of a block over the last one
 _LONGEST_BLOCK = 128  # steps
 
-# Random effects on the sensor in one step: (error, nearest, clutter, order).
+# Random effects on the sensor in one step of K worlds: (unit, lots, clutter, order).
 #
 # A plain tuple, because a named one costs 1 % of a step. N landmarks, C rows for
-# clutter. Worlds that are simulated together add axes at the dots.
+# clutter.
 #
-# error : shape (2, …, N)
-#     (εβ, εr) [rad, m]; εr in units of σr(r) where that grows with the range.
-# nearest : shape (…, N)
-#     A landmark is read above this true range [m]. It is min_range or more, so that the
-#     noisy range is positive; inf where the reading drops out.
-# clutter : shape (2, …, C), or None with identities
+# unit : shape (K, 2N)
+#     Noise of the bearings, then of the ranges, in standard deviations.
+# lots : shape (K, N), or (K, 0) without dropout
+#     Uniform random numbers; a reading drops out where they are below its probability.
+# clutter : shape (K, C, 2), or None with identities
 #     False readings (β, r), zeros where there is none [rad, m].
-# order : shape (…, N + C), or None with identities
+# order : shape (K, N + C), or None with identities
 #     Uniform random numbers that sort the rows.
 SensorNoise = tuple[Array, Array, Array | None, Array | None]
 
@@ -50,34 +47,49 @@ class NoiseRows(Restorable, Generic[Row]):
     Parameters
     ----------
     draw : callable
-        Takes an array of step numbers and draws the rows of these steps.
-    first : int
-        The first step.
+        Takes the key of an episode and an array of step numbers, and draws the noise of
+        these steps.
+    row : callable
+        Takes this noise and a place in it, and returns the row.
 
     Examples
     --------
-    >>> rows = NoiseRows(lambda steps: steps / 10, first=1)
+    >>> rows = NoiseRows(lambda key, steps: key + steps / 10, getitem)
+    >>> rows.begin(3.0, first=1)
     >>> float(next(rows)), float(next(rows))
-    (0.1, 0.2)
+    (3.1, 3.2)
     """
 
-    changing = ("_to_come",)
-    replaced = ("_draw", "_next", "_block")
+    changing = ()
+    replaced = ("_draw", "_key", "_drawn", "_first", "_step", "_end")
 
     def __init__(
-        self, draw: Callable[[IntArray], Iterable[Row]], first: int = 0
+        self, draw: Callable[[Any, IntArray], Any], row: Callable[[Any, int], Row]
     ) -> None:
-        self._draw = draw
-        self._next = first
-        self._block = _FIRST_BLOCK
-        self._to_come: list[Row] = []  # the next one last
+        self._draw, self._row = draw, row
+
+    def begin(self, key: Any, first: int) -> None:
+        """Continue with the rows of an episode from a step on."""
+        self._key, self._drawn = key, None
+        self._first = self._step = self._end = first
 
     def __next__(self) -> Row:
-        if not self._to_come:
-            end = self._next + self._block
-            self._to_come = list(self._draw(np.arange(self._next, end)))[::-1]
-            self._next, self._block = end, min(_GROWTH * self._block, _LONGEST_BLOCK)
-        return self._to_come.pop()
+        step = self._step
+        if step == self._end:  # of the block
+            size = min(_GROWTH * (step - self._first), _LONGEST_BLOCK) or _FIRST_BLOCK
+            self._first, self._end = step, step + size
+            self._drawn = self._draw(self._key, np.arange(step, step + size))
+        self._step = step + 1
+        return self._row(self._drawn, step - self._first)
+
+
+def row_of(noise: SensorNoise, step: int) -> SensorNoise:
+    """Return the noise of one of many steps of a world."""
+    unit, lots, clutter, order = noise
+    unit, lots = unit[step : step + 1], lots[step : step + 1]
+    if clutter is None or order is None:
+        return unit, lots, None, None
+    return unit, lots, clutter[step], order[step]
 
 
 class SensorSettings(NamedTuple):
@@ -126,7 +138,6 @@ class WorldNoise:
             streams.ORDER: (count + rows) * hidden,
         }
         self._widths = {stream: width for stream, width in widths.items() if width}
-        self._nearest = math.nextafter(sensor.min_range, -1.0)
         self._settings = SensorSettings.of(sensor)
         self._motion_std = np.array(scenario.motion.std)
 
@@ -143,7 +154,7 @@ class WorldNoise:
             Of each world, where worlds differ.
         """
         unit = np.empty((len(steps), 3))
-        streams.draw_normals(keys, steps, streams.MOTION, unit[None])
+        streams.draw_normals(keys, steps, streams.MOTION, unit)
         noise: Array = heavy_tails(unit, self._faults.motion_dof)
         noise *= self._motion_std if std is None else std
         return noise
@@ -153,22 +164,18 @@ class WorldNoise:
     ) -> SensorNoise:
         """Draw the sensor noise; see `motion`."""
         settings = settings or self._settings
-        unit = np.empty((2, len(steps), self._landmarks))
+        unit = np.empty((len(steps), 2 * self._landmarks))
         streams.draw_normals(keys, steps, streams.MEASUREMENT, unit)
         unit = heavy_tails(unit, self._faults.sensor_dof)
         drawn = {
             stream: _uniform(keys, steps, stream, width)
             for stream, width in self._widths.items()
         }
-        nearest = np.empty(unit.shape[1:])
-        bias = self._faults.range_bias
-        _scale(unit, settings.numbers, bias, self._nearest, nearest)
-        if streams.DROPOUT in drawn:
-            nearest[drawn[streams.DROPOUT] < settings.numbers[:, 4:5]] = np.inf
+        lots = drawn.get(streams.DROPOUT, unit[:, :0])
         if streams.ORDER not in drawn:
-            return unit, nearest, None, None
+            return unit, lots, None, None
         clutter = self._clutter(len(steps), drawn.get(streams.CLUTTER), settings)
-        return unit, nearest, clutter, drawn[streams.ORDER]
+        return unit, lots, clutter, drawn[streams.ORDER]
 
     def _clutter(
         self, count: int, drawn: Array | None, settings: SensorSettings
@@ -176,41 +183,27 @@ class WorldNoise:
         """Draw false readings, uniform over the visible bearings and ranges.
 
         One number per step determines their count, two more determine (β, r) of each
-        reserved row. Returns (β, r), shape (2, K, C), zeros in empty rows.
+        reserved row. Returns (β, r), shape (K, C, 2), zeros in empty rows.
         """
         sensor, rows = self._sensor, self._sensor.max_clutter
         if drawn is None:
-            return np.zeros((2, count, rows))
+            return np.zeros((count, rows, 2))
         counts = (settings.counts_below <= drawn[..., :1]).sum(axis=-1, keepdims=True)
         max_range, field_of_view = settings.numbers[:, 5:6], settings.numbers[:, 6:]
         bearings = (drawn[..., 1::2] - 0.5) * field_of_view
         width = max_range - sensor.min_range
         ranges = max_range - drawn[..., 2::2] * width  # above min_range
         present = np.arange(rows) < counts
-        return np.where(present, np.stack([bearings, ranges]), 0.0)
+        readings = np.stack([bearings, ranges], axis=-1)
+        return np.where(present[..., None], readings, 0.0)
 
-    def motion_rows(self, key: WordArray) -> NoiseRows[list[float]]:
-        """Return the motion noise of an episode from step 1 on, as lists of floats.
+    def motion_rows(self) -> NoiseRows[Array]:
+        """Return the motion noise of one world, step by step."""
+        return NoiseRows(self.motion, getitem)
 
-        Parameters
-        ----------
-        key : uint64 ndarray, shape (1, 2)
-            Of the episode.
-        """
-        return NoiseRows(partial(self._motion_by_step, key), first=1)
-
-    def sensor_rows(self, key: WordArray) -> NoiseRows[SensorNoise]:
-        """Return the sensor noise of an episode from the start, step 0, on."""
-        return NoiseRows(partial(self._sensor_by_step, key))
-
-    def _motion_by_step(self, key: WordArray, steps: IntArray) -> list[list[float]]:
-        return cast("list[list[float]]", self.motion(key, steps).tolist())
-
-    def _sensor_by_step(self, key: WordArray, steps: IntArray) -> Iterable[SensorNoise]:
-        error, nearest, clutter, order = self.sensor(key, steps)
-        fields = _by_step(error), nearest, _by_step(clutter), order
-        rows = (repeat(None) if field is None else field for field in fields)
-        return cast("Iterable[SensorNoise]", zip(*rows, strict=False))
+    def sensor_rows(self) -> NoiseRows[SensorNoise]:
+        """Return the sensor noise of one world, step by step."""
+        return NoiseRows(self.sensor, row_of)
 
 
 class PoseSensors:
@@ -242,7 +235,7 @@ class PoseSensors:
             True poses [m, m, rad].
         """
         unit = np.empty((len(steps), 3))
-        streams.draw_normals(keys, steps, streams.POSE, unit[None])
+        streams.draw_normals(keys, steps, streams.POSE, unit)
         readings = poses + unit * self.std
         readings[:, 2] = (readings[:, 2] + np.pi) % (2 * np.pi) - np.pi
         is_due = (self._every > 0) & (steps[:, None] % np.maximum(self._every, 1) == 0)
@@ -262,32 +255,6 @@ def _uniform(keys: WordArray, steps: IntArray, stream: int, width: int) -> Array
     drawn = np.empty((len(steps), width))
     streams.draw_uniforms(keys, steps, stream, drawn)
     return drawn
-
-
-def _by_step(pairs: Array | None) -> Array | None:
-    """Move the axis of steps to the front."""
-    return None if pairs is None else np.ascontiguousarray(pairs.transpose(1, 0, 2))
-
-
-@jit
-def _scale(
-    unit: Array, settings: Array, bias: float, smallest: float, nearest: Array
-) -> None:
-    """Turn unit noise ε, (2, K, N), into errors; write the range r of `SensorNoise`.
-
-    This is the range above which r + (σr + k r) ε + bias > 0, at least `smallest`.
-    """
-    for row in range(len(nearest)):
-        first, second, std, growth = settings[min(row, len(settings) - 1), :4]
-        for i in range(nearest.shape[1]):
-            noise = unit[1, row, i]
-            reach = -std * noise - bias
-            if growth > 0.0:
-                slope = 1.0 + growth * noise
-                reach = reach / slope if slope > 0.0 else np.inf
-            nearest[row, i] = max(reach, smallest)
-            unit[0, row, i] *= first
-            unit[1, row, i] *= second
 
 
 def _poisson_cdf(mean: float, largest: int) -> Array:

@@ -61,10 +61,8 @@ class UnicycleBody(Restorable):
 
     Attributes
     ----------
-    position : complex ndarray, shape ()
-        x + iy [m]; every step overwrites it.
-    inverse_heading : complex ndarray, shape ()
-        cos θ - i sin θ; every step overwrites it.
+    position, heading : complex ndarray, shape (1,)
+        x + iy [m] and cos θ + i sin θ; every step overwrites them.
 
     Examples
     --------
@@ -85,8 +83,7 @@ class UnicycleBody(Restorable):
         self._body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self._space.add(self._body)
         self._contacts = WallContacts(radius, self._walls)
-        self.position = np.zeros((), dtype=np.complex128)
-        self.inverse_heading = np.zeros((), dtype=np.complex128)
+        self.position, self.heading = np.zeros((2, 1), dtype=np.complex128)
         self.place((0.0, 0.0, 0.0))
 
     def state(self) -> State:
@@ -104,8 +101,9 @@ class UnicycleBody(Restorable):
 
     def place(self, pose: Sequence[float]) -> None:
         """Put the body at (x, y, θ) [m, m, rad]."""
-        self._body.position = pose[0], pose[1]
-        self._arrive(pose[2])
+        x, y, heading = map(float, pose)
+        self._body.position = x, y
+        self._arrive(x, y, heading)
 
     def drive(
         self, command: Sequence[float], slip: Sequence[float] = _NO_SLIP
@@ -125,7 +123,10 @@ class UnicycleBody(Restorable):
             Share of the displacement, in [0, 1], that the walls allowed. Walls do not
             affect the turn.
         """
-        forward, sideways = _path(self._drive, command, slip)
+        forward, sideways = command[0] + slip[0], slip[1]
+        if self._drive is not None:
+            ahead, aside = self._drive.path(*command)
+            forward, sideways = ahead + slip[0], aside + slip[1]
         dx, dy = displacement(forward, sideways, self._cos, self._sin)
         share = 1.0
         if self._walls:
@@ -135,17 +136,16 @@ class UnicycleBody(Restorable):
             dx, dy = share * dx, share * dy
         self._body.velocity = dx, dy
         self._space.step(1.0)
-        self._arrive(self._pose[2] + (command[1] + slip[2]))
+        turned = self._pose[2] + (command[1] + slip[2])
+        self._arrive(*self._body.position, turned)
         return share
 
-    def _arrive(self, heading: float) -> None:
-        """Read the position from the engine and set the heading."""
-        x, y = self._body.position
+    def _arrive(self, x: float, y: float, heading: float) -> None:
+        """Set position and heading."""
         cos, sin = float(np.cos(heading)), float(np.sin(heading))
         self._pose = x, y, heading
         self._cos, self._sin = cos, sin
-        self.position[()] = complex(x, y)
-        self.inverse_heading[()] = complex(cos, -sin)
+        self.position[0], self.heading[0] = complex(x, y), complex(cos, sin)
 
     def __getstate__(self) -> dict[str, Any]:
         return {
@@ -217,7 +217,9 @@ class WallContacts:
         self._space = pymunk.Space()
         for wall in self._walls:
             self._space.add(*_inflated(wall, radius, self._space.static_body))
-        self._ends = np.array(self._walls, dtype=np.float64).reshape(-1, 4)
+        #: Ends of the walls, shape (W, 4), and how near a way must come to one [m].
+        self.ends = np.array(self._walls, dtype=np.float64).reshape(-1, 4)
+        self.reach = radius + _NEAR
 
     def free_share(self, x: float, y: float, dx: float, dy: float) -> float:
         """Return the share of a displacement up to 1 µm before the first contact.
@@ -243,15 +245,6 @@ class WallContacts:
                 share = min(share, hit.alpha - _SKIN / approach)
         return max(share, 0.0)
 
-    def free_shares(self, x: Array, y: Array, dx: Array, dy: Array) -> Array:
-        """Return the shares of B displacements, arrays of shape (B,) [m]."""
-        shares = np.ones(len(x))
-        near = np.empty(len(x), dtype=np.int64)
-        count = _find_near((x, y, dx, dy), self._ends, self._radius + _NEAR, near)
-        for k in near[:count].tolist():
-            shares[k] = self.free_share(x.item(k), y.item(k), dx.item(k), dy.item(k))
-        return shares
-
     def __reduce__(self) -> tuple[Any, ...]:
         return WallContacts, (self._radius, self._walls)
 
@@ -275,28 +268,19 @@ def _outward(
     return hit.shape.point_query(start).gradient
 
 
-@jit
-def _find_near(
-    moves: tuple[Array, Array, Array, Array], walls: Array, reach: float, near: IntArray
-) -> int:
-    """List the moves (x, y, dx, dy) that come within reach of a wall; return how many.
+@njit_internal
+def _is_near(way: Wall, walls: Array, reach: float) -> bool:
+    """Return whether a way comes within reach of a wall.
 
-    A wall beyond the length of the move from its start is out of reach at once.
+    A wall beyond the length of the way from its start is out of reach at once.
     """
-    x, y, dx, dy = moves
-    count = 0
-    for k in range(len(x)):
-        way = x[k], y[k], x[k] + dx[k], y[k] + dy[k]
-        length = math.sqrt(dx[k] * dx[k] + dy[k] * dy[k])
-        if length == 0.0:  # a wall stops only approaches
-            continue
-        for w in range(len(walls)):
-            wall = walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
-            if _gap(way[0], way[1], wall) <= reach + length and _meet(way, wall, reach):
-                near[count] = k
-                count += 1
-                break
-    return count
+    dx, dy = way[2] - way[0], way[3] - way[1]
+    length = math.sqrt(dx * dx + dy * dy)
+    for w in range(len(walls)):
+        wall = walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
+        if _gap(way[0], way[1], wall) <= reach + length and _meet(way, wall, reach):
+            return True
+    return False
 
 
 @njit_internal
@@ -348,10 +332,8 @@ class UnicycleBodies(Restorable):
 
     Attributes
     ----------
-    position : complex ndarray, shape (B, 1)
-        x + iy [m]; every step overwrites it.
-    inverse_heading : complex ndarray, shape (B, 1)
-        cos θ - i sin θ; every step overwrites it.
+    position, heading : complex ndarray, shape (B,)
+        x + iy [m] and cos θ + i sin θ; every step overwrites them.
 
     Examples
     --------
@@ -371,11 +353,11 @@ class UnicycleBodies(Restorable):
         drive: Drive | None = None,
     ) -> None:
         self._drive = drive
-        self._contacts = WallContacts(radius, walls) if walls else None
-        self._pose = np.zeros((3, count))  # rows x, y, θ
-        self.position = np.zeros((count, 1), dtype=np.complex128)
-        self.inverse_heading = np.zeros((count, 1), dtype=np.complex128)
-        self._arrive(self._pose)
+        self._contacts = WallContacts(radius, walls)
+        self._all, self._near = np.ones(count, np.bool_), np.zeros(count, np.int64)
+        self._no_path = np.empty((0, 2))
+        self.position, self.heading = np.zeros((2, count), dtype=np.complex128)
+        self._arrive(np.zeros((3, count)))  # rows x, y, θ
 
     def state(self) -> State:
         """Return the poses, for `restore`."""
@@ -415,43 +397,79 @@ class UnicycleBodies(Restorable):
             Shares of the displacements, in [0, 1], that the walls allowed, 1 for bodies
             that do not move; None without walls.
         """
-        change = np.empty(self._pose.shape)
-        forward, sideways = _path(self._drive, commands.T, slip.T)
-        change[0], change[1] = displacement(forward, sideways, self._cos, self._sin)
-        if moving is not None:
-            change[:2] *= moving  # no wall is asked about those that stay
-        share = None
-        if self._contacts is not None:
-            share = self._contacts.free_shares(*self._pose[:2], *change[:2])
-            change[:2] *= share
-        np.add(commands[:, 1], slip[:, 2], out=change[2])
-        change += self._pose
-        if moving is not None:
-            change = np.where(moving, change, self._pose)
-        self._arrive(change)
-        return share
+        path = self._no_path
+        if self._drive is not None:
+            path = np.column_stack(self._drive.path(*commands.T))
+        pose, after = self._pose, np.empty(self._pose.shape)
+        contacts, near = self._contacts, self._near
+        free = self._all if moving is None else moving
+        bodies = pose, self.heading, free, commands, path, slip
+        walls, reach = contacts.ends, contacts.reach
+        count = _move(*bodies, walls, reach, after, near)
+        share = np.ones(len(commands))
+        for k in near[:count].tolist():
+            way = *pose[:2, k].tolist(), *after[:2, k].tolist()
+            share[k] = contacts.free_share(*way)
+            after[:2, k] = share[k] * after[:2, k] + pose[:2, k]
+        self._arrive(after)
+        return share if len(walls) else None
 
     def _arrive(self, pose: Array) -> None:
         """Set positions and headings."""
         self._pose = pose
-        self._cos, self._sin = np.cos(pose[2]), np.sin(pose[2])
-        _as_pairs(self.position)[...] = pose[:2].T
-        heading = _as_pairs(self.inverse_heading)
-        heading[:, 0] = self._cos
-        np.negative(self._sin, out=heading[:, 1])
+        self.position.real, self.position.imag = pose[0], pose[1]
+        self.heading.real, self.heading.imag = np.cos(pose[2]), np.sin(pose[2])
 
 
-def _as_pairs(numbers: ComplexArray) -> Array:
-    """View complex numbers, (B, 1), as rows (real, imaginary), (B, 2)."""
-    return numbers.view(np.float64)
+@jit
+def _move(  # noqa: PLR0917 (numba takes arrays more quickly than tuples of them)
+    pose: Array,
+    heading: ComplexArray,
+    moving: BoolArray,
+    commands: Array,
+    path: Array,
+    slip: Array,
+    walls: Array,
+    reach: float,
+    after: Array,
+    near: IntArray,
+) -> int:
+    """Move B bodies, except those that come within reach of a wall; list these.
 
+    Parameters
+    ----------
+    pose, heading, moving, commands, slip
+        See `UnicycleBodies`.
+    path : ndarray, shape (B, 2), or (0, 2) of unicycles
+        Displacements in the robots' frames without slip [m].
+    walls : ndarray, shape (W, 4)
+        Their ends [m].
+    after : ndarray, shape (3, B)
+        Receives the poses; of listed bodies the displacement and the heading.
 
-def _path(drive: Drive | None, command: Any, slip: Any) -> tuple[Any, Any]:
-    """Return the displacement in the robot's frame; numbers or arrays."""
-    if drive is None:
-        return command[0] + slip[0], slip[1]
-    forward, sideways = drive.path(command[0], command[1])
-    return forward + slip[0], sideways + slip[1]
+    Returns
+    -------
+    int
+        The number of those listed in `near`.
+    """
+    count = 0
+    for b in range(len(moving)):
+        x, y, after[2, b] = pose[0, b], pose[1, b], pose[2, b]
+        after[0, b], after[1, b] = x, y
+        if not moving[b]:
+            continue
+        forward, sideways = commands[b, 0] + slip[b, 0], slip[b, 1]
+        if len(path) > 0:
+            forward, sideways = path[b, 0] + slip[b, 0], path[b, 1] + slip[b, 1]
+        dx, dy = displacement_jit(forward, sideways, heading[b].real, heading[b].imag)
+        after[2, b] += commands[b, 1] + slip[b, 2]
+        if dx * dx + dy * dy > 0.0 and _is_near((x, y, x + dx, y + dy), walls, reach):
+            after[0, b], after[1, b] = dx, dy
+            near[count] = b
+            count += 1
+        else:
+            after[0, b], after[1, b] = dx + x, dy + y
+    return count
 
 
 def displacement(
@@ -477,6 +495,9 @@ def displacement(
     (-0.5, 2.0)
     """
     return forward * cos - sideways * sin, forward * sin + sideways * cos
+
+
+displacement_jit = njit_internal(displacement)
 
 
 # --------------------------------------------------------------------------------------

@@ -38,8 +38,10 @@ def episode_keys(generators: Sequence[np.random.Generator]) -> WordArray:
     >>> bool((keys == episode_keys([rng])).all())
     True
     """
-    keys = [rng.bit_generator.random_raw(2) for rng in generators]
-    return np.array(keys, dtype=np.uint64).reshape(-1, 2)
+    keys = np.empty((len(generators), 2), dtype=np.uint64)
+    for row, rng in enumerate(generators):
+        keys[row] = rng.bit_generator.random_raw(2)
+    return keys
 
 
 def drawn_scenarios(scenario: Scenario, keys: WordArray) -> list[Scenario]:
@@ -79,10 +81,10 @@ class EpisodeStarts:
         """Return true and estimated start poses, each of shape (K, 3) [m, m, rad]."""
         drawn = np.empty((len(keys), 3))
         steps = np.zeros(len(keys), dtype=np.int64)
-        draw_normals(keys, steps, START, drawn[None])
-        drawn *= self._std
-        drawn += self._pose
-        centre = self._pose[None].repeat(len(keys), axis=0)
+        draw_normals(keys, steps, START, drawn)
+        drawn = drawn * self._std + self._pose
+        centre = np.empty(drawn.shape)
+        centre[:] = self._pose
         return (drawn, centre) if self._draws_truth else (centre, drawn)
 
     def landmarks(self, keys: WordArray) -> ComplexArray:
@@ -119,20 +121,18 @@ def draw_normals(keys: WordArray, steps: IntArray, stream: int, out: Array) -> N
     steps : int64 ndarray, shape (K,)
     stream : int
         Its number, as `MOTION`.
-    out : ndarray, shape (H, K, W)
-        Contiguous. Row k of part h takes the numbers h W to (h + 1) W of its step.
+    out : ndarray, shape (K, W)
+        Contiguous.
     """
-    parts, rows, width = out.shape
+    rows, width = out.shape
     for row in range(rows):
         (k0, k1), step = keys[min(row, len(keys) - 1)], steps[row]
-        part, column = 0, 0
-        for block in range((parts * width + 3) // 4):
+        column = 0
+        for block in range((width + 3) // 4):
             for word in random_block(k0, k1, block + 1, step, stream):
-                if part < parts:
-                    out[part, row, column] = shifted(word)
+                if column < width:
+                    out[row, column] = shifted(word)
                     column += 1
-                    if column == width:
-                        part, column = part + 1, 0
     make_normal(out.reshape(-1))
 
 

@@ -327,20 +327,16 @@ class WorldBatch(Restorable):
         bodies, drawn = self._bodies, self._drawn
         settings = None if drawn is None else drawn.settings
         keys, steps, landmarks = self._keys, self.steps, self._landmarks
-        position, inverse_heading = bodies.position, bodies.inverse_heading
+        position, heading = bodies.position, bodies.heading
         if worlds is not None:
             keys, steps, landmarks = keys[worlds], steps[worlds], landmarks[worlds]
-            position, inverse_heading = position[worlds], inverse_heading[worlds]
+            position, heading = position[worlds], heading[worlds]
             if settings is not None:
                 settings = SensorSettings(*(each[worlds] for each in settings))
         noise = self._noise.sensor(keys, steps, settings)
-        readings, mask = self._sensor.scan(
-            landmarks, position, inverse_heading, noise, settings
-        )
-        ids = None
-        if self._hides_identities:
-            readings, mask, ids = hide_identities(readings, mask, noise)
-        return readings.transpose(1, 2, 0).copy(), mask, ids
+        scan = self._sensor.scan(landmarks, position, heading, noise, settings)
+        hides = self._hides_identities
+        return hide_identities(*scan, noise) if hides else (*scan, None)
 
 
 def _replaced(old: AnyArray, worlds: IndexArray, value: Any) -> AnyArray:

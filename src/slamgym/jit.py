@@ -5,6 +5,7 @@ Python: ``NUMBA_DISABLE_JIT=1`` turns compilation off, for a debugger.
 """
 
 import contextlib
+import ctypes
 import hashlib
 import os
 import pickle
@@ -164,6 +165,14 @@ def _recompiled(function: Any, like: Any) -> Any:
     return _kept(kernel) if isinstance(like._cache, KernelCache) else kernel
 
 
+_FMA_IN_C = ctypes.CFUNCTYPE(*4 * [ctypes.c_double])(("fma", ctypes.CDLL(None)))
+
+
+def _fma(a: float, b: float, c: float) -> np.float64:
+    """Return a b + c, rounded once, in plain Python."""
+    return np.float64(_FMA_IN_C(a, b, c))
+
+
 def _emitted_fma(_typing: Any, _a: Any, _b: Any, _c: Any) -> tuple[Any, Any]:
     def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         return builder.fma(*arguments)
@@ -173,10 +182,10 @@ def _emitted_fma(_typing: Any, _a: Any, _b: Any, _c: Any) -> tuple[Any, Any]:
 
 # A compiler that is free to fuse (``fastmath``) does so depending on what is inlined
 # where.  One kernel would then give different bits alone and inside another kernel.
-#: a b + c, rounded once; twice in plain Python.
+#: a b + c, rounded once.
 fma = cast(
     "Callable[[float, float, float], float]",
-    (lambda a, b, c: a * b + c) if _PLAIN else intrinsic(_emitted_fma),
+    _fma if _PLAIN else intrinsic(_emitted_fma),
 )
 
 

@@ -35,24 +35,34 @@ def noise_of_steps(scenario, count):
     return WorldNoise(scenario).sensor(keys, np.arange(count))
 
 
+def rows_of(scenario, seed=0):
+    rows = WorldNoise(scenario).sensor_rows()
+    rows.begin(key_of(seed), first=0)
+    return rows
+
+
 def noise_of(scenario, seed=0):
-    return next(WorldNoise(scenario).sensor_rows(key_of(seed)))
+    return next(rows_of(scenario, seed))
+
+
+def unit_noise(bearings, ranges):
+    """Noise of a sensor without dropout, in standard deviations."""
+    return np.concatenate([bearings, ranges])[None], np.empty((1, 0)), None, None
 
 
 def silent(scenario):
-    """Noise of a sensor that never errs and reads nothing nearer than min_range."""
-    count = scenario.landmarks.count
-    nearest = np.nextafter(scenario.sensor.min_range, -1.0)
-    return np.zeros((2, count)), np.full(count, nearest), None, None
+    """Noise of a sensor that never errs."""
+    return unit_noise(*np.zeros((2, scenario.landmarks.count)))
 
 
 def scan(scenario, landmarks, pose, noise):
+    """Return all bearings and all ranges, (2, N), and the mask."""
     x, y, theta = pose
-    heading = complex(np.cos(theta), np.sin(theta))
+    position, heading = np.array([x + 1j * y]), np.exp([1j * theta])
+    heading.real, heading.imag = np.cos([theta]), np.sin([theta])
     sensor = BearingRangeSensor(scenario)
-    return sensor.scan(
-        landmarks, np.array(complex(x, y)), np.array(heading.conjugate()), noise
-    )
+    measurements, mask = sensor.scan(landmarks[None], position, heading, noise)
+    return measurements[0].T, mask[0]
 
 
 def true_readings(landmarks, pose):
@@ -85,7 +95,8 @@ def test_readings_are_the_measurement_model_plus_noise():
         pose, landmarks = (*rng.uniform(-5, 5, 2), rng.uniform(-20, 20)), points(rng)
         noise = noise_of(BASE, seed)
         readings, mask = scan(BASE, landmarks, pose, noise)
-        expected = true_readings(landmarks, pose) + noise[0]
+        error = noise[0].reshape(2, -1) * np.array(BASE.sensor.std)[:, None]
+        expected = true_readings(landmarks, pose) + error
         assert mask.sum() > 30
         assert angle_gap(readings[0], expected[0])[mask].max() < 1e-12
         assert np.abs(readings[1] - expected[1])[mask].max() < 1e-12
@@ -114,15 +125,15 @@ def test_a_landmark_straight_behind_reads_minus_pi():
 def test_noise_takes_a_bearing_across_the_back_by_wrapping(sign, view):
     scenario, landmarks = one_landmark(sign * 2.95, 2.0)
     scenario = scenario.with_changes(sensor={"field_of_view": view, "std": [0.1, 0.1]})
-    noise = (np.array([[sign * 0.3], [0.0]]), np.array([0.05]), None, None)
+    noise = unit_noise([sign * 3.0], [0.0])
     readings, _ = scan(scenario, landmarks, (0, 0, 0), noise)
     assert readings[0, 0] == pytest.approx(sign * (3.25 - 2 * np.pi))
 
 
 def wrapped_by_noise(angles):
     """Return the bearings that are read straight ahead with angles as noise."""
-    ahead, error = np.ones(len(angles)) + 0j, np.stack([angles, 0.0 * angles])
-    return scan(BASE, ahead, (0, 0, 0), (error, 0.0 * angles, None, None))[0][0]
+    scenario, ahead = scenario_with(std=(1.0, 1.0)), np.ones(len(angles)) + 0j
+    return scan(scenario, ahead, (0, 0, 0), unit_noise(angles, 0.0 * angles))[0][0]
 
 
 def test_wrapped_bearings_lie_in_range_and_those_in_range_keep_every_bit():
@@ -139,10 +150,9 @@ def test_wrapped_bearings_lie_in_range_and_those_in_range_keep_every_bit():
 
 def test_range_noise_grows_with_the_range():
     grown = scenario_with(range_std_per_metre=0.2, std=(0.01, 0.05))
-    plain = scenario_with(std=(0.01, 1.0))
     landmarks = points(np.random.default_rng(0))
     truth = true_readings(landmarks, POSE)
-    unit = noise_of(plain)[0][1]
+    unit = noise_of(BASE)[0][0, COUNT:]
     readings, mask = scan(grown, landmarks, POSE, noise_of(grown))
     expected = truth[1] + (0.05 + 0.2 * truth[1]) * unit
     np.testing.assert_allclose(readings[1, mask], expected[mask], atol=1e-12)
@@ -155,13 +165,13 @@ def test_a_reading_without_a_positive_range_is_not_reported(per_metre):
         std=(0.01, 2.0), range_std_per_metre=per_metre, min_range=0.0
     )
     rng, dropped = np.random.default_rng(0), 0
-    rows = WorldNoise(scenario).sensor_rows(key_of(0))
+    rows = rows_of(scenario)
     for _ in range(300):
         noise, landmarks = next(rows), points(rng)
         readings, mask = scan(scenario, landmarks, POSE, noise)
         true = true_readings(landmarks, POSE)[1]
-        scale = 2.0 + per_metre * true if per_metre else 1.0
-        np.testing.assert_array_equal(mask, true + scale * noise[0][1] > 0.0)
+        error = (2.0 + per_metre * true) * noise[0][0, COUNT:]
+        np.testing.assert_array_equal(mask, true + error > 0.0)
         assert (readings[1, mask] > 0.0).all()
         dropped += (~mask).sum()
     assert dropped > 200
@@ -175,13 +185,11 @@ def test_a_reading_without_a_positive_range_is_not_reported(per_metre):
 )
 def test_the_true_range_decides_what_is_in_reach_limits_included(distance, seen):
     scenario, _ = one_landmark(0.0, 1.0)
-    scenario = scenario.with_changes(sensor={"min_range": 1.0, "max_range": 4.0})
-    error, nearest, *rest = silent(scenario)
-    for noise in (-0.5, 0.0, 0.5):  # the noisy range crosses the limits, in vain
-        _, mask = scan(
-            scenario, np.array([distance + 0j]), (0, 0, 0),
-            (error + np.array([[0.0], [noise]]), nearest, *rest),
-        )  # fmt: skip
+    limits = {"min_range": 1.0, "max_range": 4.0, "std": [0.1, 0.5]}
+    scenario = scenario.with_changes(sensor=limits)
+    for unit in (-1.0, 0.0, 1.0):  # the noisy range crosses the limits, in vain
+        noise = unit_noise([0.0], [unit])
+        _, mask = scan(scenario, np.array([distance + 0j]), (0, 0, 0), noise)
         assert mask.tolist() == [seen]
 
 
@@ -197,9 +205,10 @@ def test_a_landmark_at_the_nearest_range_itself_is_read():
 def test_the_true_bearing_decides_what_is_in_view(view, side):
     for offset, seen in ((-1e-9, True), (1e-9, False)):
         scenario, landmarks = one_landmark(side * (view / 2 + offset), 3.0, theta=1.0)
-        scenario = scenario.with_changes(sensor={"field_of_view": view})
-        for error in (-0.2, 0.0, 0.2):
-            noise = (np.array([[error], [0.0]]), np.array([0.05]), None, None)
+        sensor = {"field_of_view": view, "std": [0.1, 0.1]}
+        scenario = scenario.with_changes(sensor=sensor)
+        for unit in (-2.0, 0.0, 2.0):
+            noise = unit_noise([unit], [0.0])
             _, mask = scan(scenario, landmarks, (0, 0, 1.0), noise)
             assert mask.tolist() == [seen]
 
@@ -212,12 +221,12 @@ def test_a_full_view_sees_all_around():
 
 def test_a_reading_drops_out_with_the_given_probability():
     scenario = scenario_with(dropout=0.3, min_range=0.0, std=(0.01, 0.0))
-    _, nearest, *_ = noise_of_steps(scenario, 5000)
-    dropped = np.isinf(nearest)
+    lots = noise_of_steps(scenario, 5000)[1]
+    dropped = lots < 0.3
     assert dropped.mean() == pytest.approx(0.3, abs=0.005)
     assert np.abs(np.corrcoef(dropped.T) - np.eye(COUNT)).max() < 0.08
     landmarks = points(np.random.default_rng(1))
-    noise = (np.zeros((2, COUNT)), nearest[0], None, None)
+    noise = (np.zeros((1, 2 * COUNT)), lots[:1], None, None)
     np.testing.assert_array_equal(
         scan(scenario, landmarks, POSE, noise)[1], ~dropped[0]
     )
@@ -281,19 +290,19 @@ HIDDEN = scenario_with(
 
 
 def hidden_scans(count, scenario=HIDDEN):
-    rows = WorldNoise(scenario).sensor_rows(key_of(5))
+    rows = rows_of(scenario, 5)
     landmarks = points(np.random.default_rng(6))
     for _ in range(count):
         noise = next(rows)
         readings, mask = scan(scenario, landmarks, POSE, noise)
-        yield readings, mask, noise, hide_identities(readings, mask, noise)
+        yield readings.T, mask, noise, hide_identities(readings.T, mask, noise)
 
 
 def test_rows_are_packed_at_the_front():
     for _, _, _, anonymous in hidden_scans(200):
         count = anonymous.mask.sum()
         assert anonymous.mask.tolist() == [True] * count + [False] * (49 - count)
-        assert (anonymous.readings[:, count:] == 0.0).all()
+        assert (anonymous.readings[count:] == 0.0).all()
         assert (anonymous.landmark_ids[count:] == -1).all()
 
 
@@ -302,12 +311,10 @@ def test_ids_tell_the_landmark_of_every_row_and_the_rest_is_the_clutter():
         ids = anonymous.landmark_ids
         real = ids >= 0
         assert sorted(ids[real].tolist()) == np.flatnonzero(mask).tolist()
-        np.testing.assert_array_equal(
-            anonymous.readings[:, real], readings[:, ids[real]]
-        )
-        false = anonymous.readings[:, anonymous.mask & ~real]
-        clutter = noise[2]
-        assert sorted(false[1].tolist()) == sorted(clutter[1][clutter[1] > 0].tolist())
+        np.testing.assert_array_equal(anonymous.readings[real], readings[ids[real]])
+        false = anonymous.readings[anonymous.mask & ~real, 1]
+        clutter = noise[2][:, 1]
+        assert sorted(false.tolist()) == sorted(clutter[clutter > 0].tolist())
 
 
 def test_every_order_of_the_rows_is_equally_likely():
@@ -319,7 +326,7 @@ def test_every_order_of_the_rows_is_equally_likely():
 
 
 def test_clutter_is_uniform_over_what_the_sensor_sees_and_poisson_in_number():
-    bearings, ranges = noise_of_steps(HIDDEN, 20000)[2]
+    bearings, ranges = np.moveaxis(noise_of_steps(HIDDEN, 20000)[2], -1, 0)
     present = ranges > 0
     counts = present.sum(axis=1)
     assert counts.mean() == pytest.approx(2.0, abs=0.03)
@@ -347,7 +354,7 @@ def test_the_length_of_a_block_changes_nothing(monkeypatch):
     def rows(steps):
         monkeypatch.setattr("slamgym.envs.noise_streams._FIRST_BLOCK", steps)
         scenario = HIDDEN.with_changes(sensor={"dropout": 0.2})
-        noise = WorldNoise(scenario).sensor_rows(key_of(0))
+        noise = rows_of(scenario)
         return [next(noise) for _ in range(40)]
 
     for row, other in zip(rows(7), rows(64), strict=True):
@@ -356,9 +363,17 @@ def test_the_length_of_a_block_changes_nothing(monkeypatch):
 
 
 def test_noise_has_the_given_standard_deviations():
-    error = noise_of_steps(BASE, 3000)[0]
-    np.testing.assert_allclose(error.std(axis=(1, 2)), BASE.sensor.std, rtol=0.01)
-    assert abs(np.corrcoef(error[0].ravel(), error[1].ravel())[0, 1]) < 0.01
+    count, landmarks = 3000, points(np.random.default_rng(0))
+    here, ahead = np.zeros((2, count), dtype=complex)
+    ahead += 1.0
+    readings, mask = BearingRangeSensor(BASE).scan(
+        np.tile(landmarks, (count, 1)), here, ahead, noise_of_steps(BASE, count)
+    )
+    error = readings - true_readings(landmarks, (0.0, 0.0, 0.0)).T
+    error[..., 0] = np.angle(np.exp(1j * error[..., 0]))
+    error = error[mask]
+    np.testing.assert_allclose(error.std(axis=0), BASE.sensor.std, rtol=0.01)
+    assert abs(np.corrcoef(error.T)[0, 1]) < 0.01
 
 
 # --- worlds side by side ---
@@ -373,32 +388,27 @@ def test_many_worlds_at_once_are_each_alone_to_the_last_bit():
         },
     )  # fmt: skip
     noises = [noise_of(scenario, seed) for seed in range(worlds)]
-    error, nearest, clutter, order = (
-        np.stack(part, axis=part[0].ndim - 1) for part in zip(*noises, strict=True)
-    )
+    unit, lots, clutter, order = zip(*noises, strict=True)
+    together = *map(np.concatenate, (unit, lots)), np.stack(clutter), np.stack(order)
     landmarks = np.stack([points(rng) for _ in range(worlds)])
     positions, headings = points(rng, worlds, 3.0), rng.uniform(-9, 9, worlds)
-    inverse = np.cos(headings) - 1j * np.sin(headings)
+    headings = np.cos(headings) + 1j * np.sin(headings)
     sensor = BearingRangeSensor(scenario)
-    together = (error, nearest, clutter, order)
-    readings, mask = sensor.scan(
-        landmarks, positions[:, None], inverse[:, None], together
-    )
+    readings, mask = sensor.scan(landmarks, positions, headings, together)
     hidden = hide_identities(readings, mask, together)
     for e, noise in enumerate(noises):
-        alone = sensor.scan(
-            landmarks[e], np.array(positions[e]), np.array(inverse[e]), noise
-        )
-        np.testing.assert_array_equal(readings[:, e], alone[0])
-        np.testing.assert_array_equal(mask[e], alone[1])
-        packed = hide_identities(*alone, noise)
-        np.testing.assert_array_equal(hidden.readings[:, e], packed.readings)
+        at = slice(e, e + 1)
+        alone = sensor.scan(landmarks[at], positions[at], headings[at], noise)
+        np.testing.assert_array_equal(readings[at], alone[0])
+        np.testing.assert_array_equal(mask[at], alone[1])
+        packed = hide_identities(alone[0][0], alone[1][0], noise)
+        np.testing.assert_array_equal(hidden.readings[e], packed.readings)
         np.testing.assert_array_equal(hidden.mask[e], packed.mask)
         np.testing.assert_array_equal(hidden.landmark_ids[e], packed.landmark_ids)
     assert 10 < mask.sum() < mask.size - 10
 
 
 def test_neighbouring_steps_have_different_noise():
-    rows = WorldNoise(BASE).sensor_rows(key_of(0))
+    rows = rows_of(BASE)
     for before, after in pairwise(next(rows) for _ in range(200)):
         assert (before[0] != after[0]).all()

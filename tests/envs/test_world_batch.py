@@ -11,7 +11,8 @@ from presets import KINDS
 from worlds import RANDOM_MAP, WALLS
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.envs.robot import WallContacts
+from slamgym.envs.drives import BicycleDrive
+from slamgym.envs.robot import UnicycleBodies, UnicycleBody
 from slamgym.envs.vector import WorldBatch
 from slamgym.sim_configs import load_scenario
 
@@ -214,14 +215,21 @@ def test_a_copy_goes_on_as_the_original_would(duplicate):
 # --- walls ---
 
 
-def test_free_shares_are_the_single_ones_near_and_far_from_walls():
-    contacts = WallContacts(0.2, WALLS)
-    rng = np.random.default_rng(0)
-    x, y = rng.uniform(-8, 10, (2, 3000))
-    dx, dy = rng.normal(0.0, 1.0, (2, 3000)) * rng.choice([0.0, 0.01, 0.3, 3.0], 3000)
-    expected = [contacts.free_share(*each) for each in zip(x, y, dx, dy, strict=True)]
-    assert 50 < np.count_nonzero(np.less(expected, 1.0)) < 2500
-    assert bits(contacts.free_shares(x, y, dx, dy)) == bits(expected)
+@pytest.mark.parametrize("drive", [None, BicycleDrive(0.5, 3.0, (0.3, 0.1))])
+def test_bodies_move_like_single_ones_near_and_far_from_walls(drive):
+    rng, count = np.random.default_rng(0), 3000
+    body = UnicycleBody(0.2, WALLS, drive)
+    bodies = UnicycleBodies(count, 0.2, WALLS, drive)
+    starts = np.column_stack([rng.uniform(-8, 10, (count, 2)), rng.normal(size=count)])
+    scale = rng.choice([0.0, 0.01, 0.3, 3.0], count)[:, None]
+    commands, slip = (scale * rng.normal(size=(count, n)) for n in (2, 3))
+    bodies.place(np.arange(count), starts)
+    shares = bodies.drive(commands, slip).tolist()
+    for k, pose in enumerate(starts.tolist()):
+        body.place(pose)
+        assert body.drive(commands[k].tolist(), slip[k].tolist()) == shares[k]
+        assert bits(body.pose) == bits(bodies.poses()[k])
+    assert 50 < np.count_nonzero(np.less(shares, 1.0)) < 2500
 
 
 # --- steps in which some worlds begin ---
