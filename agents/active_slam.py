@@ -320,7 +320,6 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
             estimator_options,
         )
         self._explorers = Explorers(self._filters, self.task)
-        self._all = np.ones(num_envs, dtype=np.bool_)
 
     def beliefs(self) -> BatchBeliefs:
         """Return the present beliefs of all filters."""

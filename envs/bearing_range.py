@@ -67,8 +67,7 @@ class BearingRangeSensor:
     def scan(
         self,
         landmarks: ComplexArray,
-        position: ComplexArray,
-        heading: ComplexArray,
+        frame: Array,
         noise: SensorNoise,
         settings: SensorSettings | None = None,
     ) -> tuple[Array, BoolArray]:
@@ -82,8 +81,8 @@ class BearingRangeSensor:
         ----------
         landmarks : complex ndarray, shape (K, N)
             l [m].
-        position, heading : complex ndarray, shape (K,)
-            x + iy [m] and cos θ + i sin θ.
+        frame : ndarray, shape (5, K)
+            Rows x, y, θ, cos θ and sin θ.
         noise : SensorNoise
             Noise of this step.
         settings : SensorSettings, optional
@@ -101,7 +100,7 @@ class BearingRangeSensor:
         if self._room[0].shape != shape:
             self._room = np.empty(shape, np.complex128), np.empty((2, *shape))
         relative, places = self._room
-        _relate(landmarks, position, heading, relative, places)
+        _relate(landmarks, frame, relative, places)
         y, x, readings = places[0], places[1], places
         if self._reads_places is not None:
             readings = np.stack(self._reads_places(x, y))
@@ -114,7 +113,8 @@ class BearingRangeSensor:
             *(measurements, mask),
         )
         if self._sight is not None:
-            mask &= ~self._sight.blocked(landmarks, position[:, None])
+            position = (frame[0] + 1j * frame[1])[:, None]
+            mask &= ~self._sight.blocked(landmarks, position)
             measurements = np.where(mask[..., None], measurements, 0.0)
         if self._reads_one:
             if self._reads_ranges:
@@ -125,19 +125,15 @@ class BearingRangeSensor:
 
 @jit
 def _relate(
-    landmarks: ComplexArray,
-    position: ComplexArray,
-    heading: ComplexArray,
-    relative: ComplexArray,
-    places: Array,
+    landmarks: ComplexArray, frame: Array, relative: ComplexArray, places: Array
 ) -> None:
     """Write δ of the landmarks of K worlds, also as its y and its x, (2, K, N) [m]."""
     for world in range(len(landmarks)):
-        p, cos, sin = position[world], heading[world].real, heading[world].imag
+        cos, sin = frame[3, world], frame[4, world]
         for i in range(landmarks.shape[1]):
-            away = landmarks[world, i] - p
-            x = fma(away.real, cos, away.imag * sin)
-            y = fma(away.real, -sin, away.imag * cos)
+            dx = landmarks[world, i].real - frame[0, world]
+            dy = landmarks[world, i].imag - frame[1, world]
+            x, y = fma(dx, cos, dy * sin), fma(dx, -sin, dy * cos)
             relative[world, i] = complex(x, y)
             places[0, world, i], places[1, world, i] = y, x
 

@@ -291,7 +291,7 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         self, odometry: Array, collision: bool
     ) -> tuple[Observation, dict[str, Any]]:
         body, noise = self._body, next(self._sensor_noise)
-        scan = self._sensor.scan(self._landmarks, body.position, body.heading, noise)
+        scan = self._sensor.scan(self._landmarks, body.frame, noise)
         measurements, mask = scan[0][0], scan[1][0]
         info: dict[str, Any] = {"pose": body.pose, "collision": collision}
         if self._hides_identities:

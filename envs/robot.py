@@ -61,8 +61,8 @@ class UnicycleBody(Restorable):
 
     Attributes
     ----------
-    position, heading : complex ndarray, shape (1,)
-        x + iy [m] and cos θ + i sin θ; every step overwrites them.
+    frame : ndarray, shape (5, 1)
+        x, y, θ, cos θ and sin θ; every step overwrites it.
 
     Examples
     --------
@@ -83,7 +83,7 @@ class UnicycleBody(Restorable):
         self._body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self._space.add(self._body)
         self._contacts = WallContacts(radius, self._walls)
-        self.position, self.heading = np.zeros((2, 1), dtype=np.complex128)
+        self.frame = np.zeros((5, 1))
         self.place((0.0, 0.0, 0.0))
 
     def state(self) -> State:
@@ -145,7 +145,7 @@ class UnicycleBody(Restorable):
         cos, sin = float(np.cos(heading)), float(np.sin(heading))
         self._pose = x, y, heading
         self._cos, self._sin = cos, sin
-        self.position[0], self.heading[0] = complex(x, y), complex(cos, sin)
+        self.frame[:, 0] = x, y, heading, cos, sin
 
     def __getstate__(self) -> dict[str, Any]:
         return {
@@ -332,8 +332,8 @@ class UnicycleBodies(Restorable):
 
     Attributes
     ----------
-    position, heading : complex ndarray, shape (B,)
-        x + iy [m] and cos θ + i sin θ; every step overwrites them.
+    frame : ndarray, shape (5, B)
+        Rows x, y, θ, cos θ and sin θ; every step replaces it.
 
     Examples
     --------
@@ -356,26 +356,26 @@ class UnicycleBodies(Restorable):
         self._contacts = WallContacts(radius, walls)
         self._all, self._near = np.ones(count, np.bool_), np.zeros(count, np.int64)
         self._no_path = np.empty((0, 2))
-        self.position, self.heading = np.zeros((2, count), dtype=np.complex128)
-        self._arrive(np.zeros((3, count)))  # rows x, y, θ
+        self.frame: Array = np.zeros((5, count))
+        self._arrive(self.frame)
 
     def state(self) -> State:
         """Return the poses, for `restore`."""
-        return (self._pose,)  # which every move replaces
+        return (self.frame,)
 
     def restore(self, state: State) -> None:
         """Return to poses."""
-        self._arrive(*state)
+        (self.frame,) = state
 
     def poses(self) -> Array:
         """(x, y, θ), shape (B, 3) [m, m, rad], a fresh array; θ is not wrapped."""
-        return self._pose.T.copy()
+        return self.frame[:3].T.copy()
 
     def place(self, worlds: IndexArray, poses: Array) -> None:
         """Put some bodies at poses, rows (x, y, θ) [m, m, rad]."""
-        pose = self._pose.copy()
-        pose[:, worlds] = poses.T
-        self._arrive(pose)
+        frame = self.frame.copy()
+        frame[:3, worlds] = poses.T
+        self._arrive(frame)
 
     def drive(
         self, commands: Array, slip: Array, moving: BoolArray | None = None
@@ -400,31 +400,30 @@ class UnicycleBodies(Restorable):
         path = self._no_path
         if self._drive is not None:
             path = np.column_stack(self._drive.path(*commands.T))
-        pose, after = self._pose, np.empty(self._pose.shape)
+        frame, after = self.frame, np.empty(self.frame.shape)
         contacts, near = self._contacts, self._near
-        free = self._all if moving is None else moving
-        bodies = pose, self.heading, free, commands, path, slip
+        bodies = frame, self._all if moving is None else moving, commands, path, slip
         walls, reach = contacts.ends, contacts.reach
         count = _move(*bodies, walls, reach, after, near)
         share = np.ones(len(commands))
         for k in near[:count].tolist():
-            way = *pose[:2, k].tolist(), *after[:2, k].tolist()
+            way = *frame[:2, k].tolist(), *after[:2, k].tolist()
             share[k] = contacts.free_share(*way)
-            after[:2, k] = share[k] * after[:2, k] + pose[:2, k]
+            after[:2, k] = share[k] * after[:2, k] + frame[:2, k]
         self._arrive(after)
         return share if len(walls) else None
 
-    def _arrive(self, pose: Array) -> None:
-        """Set positions and headings."""
-        self._pose = pose
-        self.position.real, self.position.imag = pose[0], pose[1]
-        self.heading.real, self.heading.imag = np.cos(pose[2]), np.sin(pose[2])
+    def _arrive(self, frame: Array) -> None:
+        """Take new poses, rows x, y, θ of a frame, and fill in the others."""
+        heading = frame[2]
+        np.cos(heading, frame[3])
+        np.sin(heading, frame[4])
+        self.frame = frame
 
 
 @jit
 def _move(  # noqa: PLR0917 (numba takes arrays more quickly than tuples of them)
-    pose: Array,
-    heading: ComplexArray,
+    frame: Array,
     moving: BoolArray,
     commands: Array,
     path: Array,
@@ -438,14 +437,14 @@ def _move(  # noqa: PLR0917 (numba takes arrays more quickly than tuples of them
 
     Parameters
     ----------
-    pose, heading, moving, commands, slip
+    frame, moving, commands, slip
         See `UnicycleBodies`.
     path : ndarray, shape (B, 2), or (0, 2) of unicycles
         Displacements in the robots' frames without slip [m].
     walls : ndarray, shape (W, 4)
         Their ends [m].
-    after : ndarray, shape (3, B)
-        Receives the poses; of listed bodies the displacement and the heading.
+    after : ndarray, shape (5, B)
+        Receives x, y and θ; of listed bodies the displacement and θ.
 
     Returns
     -------
@@ -454,14 +453,14 @@ def _move(  # noqa: PLR0917 (numba takes arrays more quickly than tuples of them
     """
     count = 0
     for b in range(len(moving)):
-        x, y, after[2, b] = pose[0, b], pose[1, b], pose[2, b]
+        x, y, after[2, b] = frame[0, b], frame[1, b], frame[2, b]
         after[0, b], after[1, b] = x, y
         if not moving[b]:
             continue
         forward, sideways = commands[b, 0] + slip[b, 0], slip[b, 1]
         if len(path) > 0:
             forward, sideways = path[b, 0] + slip[b, 0], path[b, 1] + slip[b, 1]
-        dx, dy = displacement_jit(forward, sideways, heading[b].real, heading[b].imag)
+        dx, dy = displacement_jit(forward, sideways, frame[3, b], frame[4, b])
         after[2, b] += commands[b, 1] + slip[b, 2]
         if dx * dx + dy * dy > 0.0 and _is_near((x, y, x + dx, y + dy), walls, reach):
             after[0, b], after[1, b] = dx, dy

@@ -99,11 +99,12 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
                 EpisodeRenderer(self.scenario, render_mode, fps)
                 for _ in range(num_envs)
             ]
-        self._steps = episode_steps(self.scenario, max_episode_steps)
+        self._steps = np.array(episode_steps(self.scenario, max_episode_steps))
         self._worlds = WorldBatch(self.scenario, num_envs)
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int] = [-1] * num_envs
         self._ended = np.zeros(num_envs, dtype=np.bool_)
+        self._all = ~self._ended
 
     def reset(
         self,
@@ -153,8 +154,9 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
             Before `reset`. Without autoreset also for worlds that have ended.
         """
         resetting = self._ended
-        moving, some_begin = ~resetting, np.count_nonzero(resetting) > 0
+        moving, some_begin = self._all, np.count_nonzero(resetting) > 0
         if some_begin:
+            moving = ~resetting
             self._refuse_without_autoreset(resetting)
             self._worlds.step(actions, moving, self._generators())
         else:
@@ -163,8 +165,8 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
         if some_begin:
             self._note_begun(resetting)
         rewards, terminated = self._reward(actions, moving)
-        truncated = ~terminated & (self._worlds.steps >= self._steps)
-        ended, final = terminated | truncated, {}
+        ended, final = terminated | (self._worlds.steps >= self._steps), {}
+        truncated = ended ^ terminated
         self._ended = ended
         if self.autoreset_mode == AutoresetMode.SAME_STEP and np.count_nonzero(ended):
             final = final_infos(self._observations(), self._infos(), ended)

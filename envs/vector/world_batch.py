@@ -324,17 +324,16 @@ class WorldBatch(Restorable):
         return np.concatenate(measurements), np.concatenate(masks), all_ids
 
     def _scan(self, worlds: IndexArray | slice | None = None) -> Scan:
-        bodies, drawn = self._bodies, self._drawn
+        frame, drawn = self._bodies.frame, self._drawn
         settings = None if drawn is None else drawn.settings
         keys, steps, landmarks = self._keys, self.steps, self._landmarks
-        position, heading = bodies.position, bodies.heading
         if worlds is not None:
             keys, steps, landmarks = keys[worlds], steps[worlds], landmarks[worlds]
-            position, heading = position[worlds], heading[worlds]
+            frame = np.ascontiguousarray(frame[:, worlds])
             if settings is not None:
                 settings = SensorSettings(*(each[worlds] for each in settings))
         noise = self._noise.sensor(keys, steps, settings)
-        scan = self._sensor.scan(landmarks, position, heading, noise, settings)
+        scan = self._sensor.scan(landmarks, frame, noise, settings)
         hides = self._hides_identities
         return hide_identities(*scan, noise) if hides else (*scan, None)
 

@@ -55,13 +55,14 @@ def silent(scenario):
     return unit_noise(*np.zeros((2, scenario.landmarks.count)))
 
 
+def frames(x, y, theta):
+    return np.array([x, y, theta, np.cos(theta), np.sin(theta)], dtype=float)
+
+
 def scan(scenario, landmarks, pose, noise):
     """Return all bearings and all ranges, (2, N), and the mask."""
-    x, y, theta = pose
-    position, heading = np.array([x + 1j * y]), np.exp([1j * theta])
-    heading.real, heading.imag = np.cos([theta]), np.sin([theta])
-    sensor = BearingRangeSensor(scenario)
-    measurements, mask = sensor.scan(landmarks[None], position, heading, noise)
+    sensor, frame = BearingRangeSensor(scenario), frames(*pose)[:, None]
+    measurements, mask = sensor.scan(landmarks[None], frame, noise)
     return measurements[0].T, mask[0]
 
 
@@ -364,10 +365,10 @@ def test_the_length_of_a_block_changes_nothing(monkeypatch):
 
 def test_noise_has_the_given_standard_deviations():
     count, landmarks = 3000, points(np.random.default_rng(0))
-    here, ahead = np.zeros((2, count), dtype=complex)
-    ahead += 1.0
     readings, mask = BearingRangeSensor(BASE).scan(
-        np.tile(landmarks, (count, 1)), here, ahead, noise_of_steps(BASE, count)
+        np.tile(landmarks, (count, 1)),
+        frames(*np.zeros((3, count))),
+        noise_of_steps(BASE, count),
     )
     error = readings - true_readings(landmarks, (0.0, 0.0, 0.0)).T
     error[..., 0] = np.angle(np.exp(1j * error[..., 0]))
@@ -392,13 +393,13 @@ def test_many_worlds_at_once_are_each_alone_to_the_last_bit():
     together = *map(np.concatenate, (unit, lots)), np.stack(clutter), np.stack(order)
     landmarks = np.stack([points(rng) for _ in range(worlds)])
     positions, headings = points(rng, worlds, 3.0), rng.uniform(-9, 9, worlds)
-    headings = np.cos(headings) + 1j * np.sin(headings)
+    frame = frames(positions.real, positions.imag, headings)
     sensor = BearingRangeSensor(scenario)
-    readings, mask = sensor.scan(landmarks, positions, headings, together)
+    readings, mask = sensor.scan(landmarks, frame, together)
     hidden = hide_identities(readings, mask, together)
     for e, noise in enumerate(noises):
         at = slice(e, e + 1)
-        alone = sensor.scan(landmarks[at], positions[at], headings[at], noise)
+        alone = sensor.scan(landmarks[at], frame[:, at].copy(), noise)
         np.testing.assert_array_equal(readings[at], alone[0])
         np.testing.assert_array_equal(mask[at], alone[1])
         packed = hide_identities(alone[0][0], alone[1][0], noise)

@@ -68,13 +68,12 @@ def test_a_step_is_the_turn_last_model_to_the_last_bit():
         assert body.pose.tolist() == [x, y, theta]
 
 
-def test_position_and_heading_are_the_pose():
+def test_the_frame_is_that_of_the_pose():
     body = UnicycleBody(RADIUS)
     body.drive((1.0, 2.0))
     body.drive((0.5, 0.1), (0.0, 0.2, 0.0))
     x, y, theta = body.pose
-    assert body.position == complex(x, y)
-    assert body.heading == complex(np.cos(theta), np.sin(theta))
+    assert body.frame[:, 0].tolist() == [x, y, theta, np.cos(theta), np.sin(theta)]
 
 
 def test_the_robot_stops_a_skin_before_a_wall_and_says_how_far_it_came():
@@ -137,7 +136,7 @@ def test_random_driving_agrees_with_a_closed_form_and_never_touches_a_wall():
     body.place((-3.0, 0.0, 0.3))
     hits = 0
     for d, alpha in rng.normal([0.3, 0.0], [0.4, 0.8], size=(4000, 2)).tolist():
-        start, move = body.position.item(), d * np.exp(1j * body.pose[2])
+        start, move = complex(*body.pose[:2]), d * np.exp(1j * body.pose[2])
         share = body.drive((d, alpha))
         contact = min(first_contact(start, move, wall) for wall in ARENA)
         assert share <= contact + 1e-9

@@ -116,10 +116,8 @@ def visible_cells(scenario, cells, poses):
     """Return which cells the world's own sensor would see from poses, (B, C)."""
     longer = np.ones((len(poses), 2 * len(cells))), np.empty((1, 0)), None, None
     sensor = BearingRangeSensor(scenario.with_changes(sensor={"min_range": 0.0}))
-    position, inverse_heading = complex_poses(poses)
-    cells = np.tile(cells, (len(poses), 1))
-    pose = position[:, 0], inverse_heading[:, 0].conj()
-    return sensor.scan(cells, *pose, longer)[1]
+    frame = np.array([*poses.T, np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+    return sensor.scan(np.tile(cells, (len(poses), 1)), frame, longer)[1]
 
 
 def sector_sums(poses, points, weights, reach):
