@@ -28,6 +28,7 @@ from ..restorable import Restorable
 from ..sim_configs import Scenario
 from .active_slam_task import ActiveSlamTask, AssociationRecord, split_settings
 from .belief_observation import (
+    ONE_WORLD,
     Filters,
     SeparateFilters,
     choose_filters,
@@ -38,8 +39,6 @@ from .estimator_choice import EstimatorChoice, choose_estimator
 from .wall_routes import AgentKnowledge
 
 Observation = dict[str, Any]
-
-_ONE_WORLD = np.ones(1, dtype=np.bool_)
 
 
 class ActiveSlamEnv(LandmarkWorldEnv):
@@ -187,10 +186,10 @@ class ActiveSlamEnv(LandmarkWorldEnv):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode with a new map, and take the first scan."""
         observation, info = super().reset(seed=seed, options=options)
-        self._explorers.begin(self.start_estimate[None], _ONE_WORLD)
-        self._scan(observation, info, moved=~_ONE_WORLD)
-        self.task.begin(self._filters.storage(), _ONE_WORLD)
-        return self._output(info, ~_ONE_WORLD)
+        self._explorers.begin(self.start_estimate[None], ONE_WORLD)
+        self._scan(observation, info, moved=~ONE_WORLD)
+        self.task.begin(self._filters.storage(), ONE_WORLD)
+        return self._output(info, ~ONE_WORLD)
 
     def step(
         self, action: ArrayLike
@@ -204,10 +203,10 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         """
         self._steps()  # refuses to step before `reset`
         observation, _, _, _, info = super().step(action)
-        self._scan(observation, info, moved=_ONE_WORLD)
+        self._scan(observation, info, moved=ONE_WORLD)
         beliefs, collision = self._filters.storage(), np.array([info["collision"]])
         actions = np.asarray(action, dtype=np.float64)[None]
-        outcome = self.task.proceed(beliefs, _ONE_WORLD, actions, collision)
+        outcome = self.task.proceed(beliefs, ONE_WORLD, actions, collision)
         seen, info = self._output(info, outcome.terminated | outcome.truncated)
         ends = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         return seen, float(outcome.rewards[0]), *ends, info
@@ -240,7 +239,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         true_ids = info.get("landmark_ids")
         scan = scan_of_one(observation)
         self._explorers.scan(
-            scan, _ONE_WORLD, moved, None if true_ids is None else true_ids[None]
+            scan, ONE_WORLD, moved, None if true_ids is None else true_ids[None]
         )
         if self.render_mode is not None:
             self.show_belief(self._filters.belief(0))

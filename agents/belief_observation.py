@@ -44,7 +44,7 @@ from .estimator_choice import (
 
 Observation = dict[str, Any]
 
-_ONE_WORLD = np.ones(1, dtype=np.bool_)
+ONE_WORLD = np.ones(1, dtype=np.bool_)
 
 
 class BeliefObservation(
@@ -135,19 +135,19 @@ class BeliefObservation(
         """Start an episode; the estimator starts from the start estimate."""
         observation, info = self.env.reset(seed=seed, options=options)
         estimate = self.env.get_wrapper_attr("start_estimate")
-        self._filters.reset(estimate[None], self.scenario.start.std, runs=_ONE_WORLD)
-        return self._update(observation, moved=~_ONE_WORLD), info
+        self._filters.reset(estimate[None], self.scenario.start.std, runs=ONE_WORLD)
+        return self._update(observation, moved=~ONE_WORLD), info
 
     def step(
         self, action: Any
     ) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step the world, then predict and update."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        seen = self._update(observation, moved=_ONE_WORLD)
+        seen = self._update(observation, moved=ONE_WORLD)
         return seen, reward, terminated, truncated, info
 
     def _update(self, observation: Observation, *, moved: BoolArray) -> Observation:
-        self._filters.update(scan_of_one(observation), _ONE_WORLD, moved=moved)
+        self._filters.update(scan_of_one(observation), ONE_WORLD, moved=moved)
         if self.env.render_mode is not None:
             self.env.get_wrapper_attr("show_belief")(self.belief)
         features = belief_features(self._filters.storage(), self._bounds)

@@ -31,12 +31,14 @@ from ..arrays import Array, BoolArray, IndexArray
 from ..envs.robot import wrap_angle
 from ..estimator.filters.imagine import imagine
 from ..estimator.kernels.imagine import Imagined
+from ..jit import jit, njit_internal
 from ..sim_configs import Robot
 from .belief_features import largest_variances
 from .wall_routes import AgentKnowledge, as_points
 
 _CLEARANCE = 0.5  # of arcs, distance kept from walls beyond the robot's radius [m]
 _ALIGNED = 0.5  # heading error below which a robot drives while it turns [rad]
+_wrap_angle_jit = njit_internal(wrap_angle)
 _TURNS = (-1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0)  # of the largest turn rate
 
 
@@ -262,29 +264,41 @@ def _spread_out(points: Array, position: Array, most: int) -> IndexArray:
 def _driven(knowledge: AgentKnowledge, tours: Array, steps: int) -> Array:
     """Return plans that drive to the goals of tours (K, 2, 2), (K, T, 2).
 
-    They drive around inner walls. A robot at its last goal turns on the spot and looks
-    around.
+    They drive around inner walls.
     """
-    tours = knowledge.grid.routes.tours(knowledge.belief.pose[:2], tours)
-    robot, dt = knowledge.scenario.robot, knowledge.scenario.dt
+    pose, scenario = knowledge.belief.pose, knowledge.scenario
+    robot, dt = scenario.robot, scenario.dt
     longest, turning = robot.max_speed * dt, robot.max_turn_rate * dt
-    x, y, heading = np.tile(knowledge.belief.pose, (len(tours), 1)).T
-    leg, plans = np.zeros(len(tours), dtype=np.intp), np.empty((len(tours), steps, 2))
-    each = np.arange(len(tours))
-    for t in range(steps):
-        goal = tours[each, np.minimum(leg, tours.shape[1] - 1)]
-        dx, dy = goal[:, 0] - x, goal[:, 1] - y
-        distance = np.hypot(dx, dy)
-        arrived = distance < 0.5 * longest
-        error = wrap_angle(np.arctan2(dy, dx) - heading)
-        turn = np.minimum(np.maximum(error, -turning), turning)
-        turn[arrived] = turning
-        ahead = (np.abs(error) < _ALIGNED) & ~arrived
-        drive = np.where(ahead, np.minimum(distance, longest), 0.0)
-        plans[:, t, 0], plans[:, t, 1] = drive, turn
-        x, y = x + drive * np.cos(heading), y + drive * np.sin(heading)
-        heading, leg = heading + turn, leg + arrived
+    routes = np.ascontiguousarray(knowledge.grid.routes.tours(pose[:2], tours))
+    plans = np.empty((len(tours), steps, 2))
+    drive_routes(pose.copy(), routes, longest, turning, plans)
     return plans
+
+
+@jit
+def drive_routes(
+    pose: Array, routes: Array, longest: float, turning: float, plans: Array
+) -> None:
+    """Fill plans (K, T, 2) that drive from a pose along routes (K, L, 2) of points.
+
+    A robot at its last point turns on the spot and looks around.
+    """
+    for k in range(len(routes)):
+        x, y, heading = pose[0], pose[1], pose[2]
+        leg = 0
+        for t in range(plans.shape[1]):
+            goal = routes[k, min(leg, routes.shape[1] - 1)]
+            dx, dy = goal[0] - x, goal[1] - y
+            distance, drive, turn = math.hypot(dx, dy), 0.0, turning
+            if distance < 0.5 * longest:
+                leg += 1
+            else:
+                error = _wrap_angle_jit(math.atan2(dy, dx) - heading)
+                turn = min(max(error, -turning), turning)
+                drive = min(distance, longest) if abs(error) < _ALIGNED else 0.0
+            plans[k, t, 0], plans[k, t, 1] = drive, turn
+            x, y = x + drive * math.cos(heading), y + drive * math.sin(heading)
+            heading += turn
 
 
 def _distances(points: Array, position: Array) -> Array:

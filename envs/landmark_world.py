@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from operator import getitem
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,7 +19,7 @@ from ..restorable import Restorable, State
 from ..sim_configs import Scenario, load_scenario
 from .bearing_range import BearingRangeSensor, hide_identities
 from .drives import drive_of
-from .noise_streams import PoseSensors, WorldNoise
+from .noise_streams import NoiseRows, PoseSensors, WorldNoise, row_of
 from .rendering.episode_renderer import EpisodeRenderer
 from .rendering.render_state import RENDER_MODES, BeliefLike
 from .robot import OdometrySensor, UnicycleBody
@@ -253,8 +254,8 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         self._sensor = BearingRangeSensor(scenario)
         self._starts = EpisodeStarts(scenario)
         noise = WorldNoise(scenario)
-        self._motion_noise = noise.motion_rows()
-        self._sensor_noise = noise.sensor_rows()
+        self._motion_noise = NoiseRows(noise.motion, getitem)
+        self._sensor_noise = NoiseRows(noise.sensor, row_of)
 
     @property
     def drawn_scenario(self) -> Scenario:

@@ -8,7 +8,6 @@ effect, and a world has the same noise alone and among others.
 
 import math
 from collections.abc import Callable
-from operator import getitem
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -54,7 +53,7 @@ class NoiseRows(Restorable, Generic[Row]):
 
     Examples
     --------
-    >>> rows = NoiseRows(lambda key, steps: key + steps / 10, getitem)
+    >>> rows = NoiseRows(lambda key, steps: key + steps / 10, lambda noise, k: noise[k])
     >>> rows.begin(3.0, first=1)
     >>> float(next(rows)), float(next(rows))
     (3.1, 3.2)
@@ -196,14 +195,6 @@ class WorldNoise:
         present = np.arange(rows) < counts
         readings = np.stack([bearings, ranges], axis=-1)
         return np.where(present[..., None], readings, 0.0)
-
-    def motion_rows(self) -> NoiseRows[Array]:
-        """Return the motion noise of one world, step by step."""
-        return NoiseRows(self.motion, getitem)
-
-    def sensor_rows(self) -> NoiseRows[SensorNoise]:
-        """Return the sensor noise of one world, step by step."""
-        return NoiseRows(self.sensor, row_of)
 
 
 class PoseSensors:

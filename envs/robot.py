@@ -345,6 +345,9 @@ class UnicycleBodies(Restorable):
            [1.5, 0. , 0. ]])
     """
 
+    changing = ()
+    replaced = ("frame",)
+
     def __init__(
         self,
         count: int,
@@ -355,17 +358,8 @@ class UnicycleBodies(Restorable):
         self._drive = drive
         self._contacts = WallContacts(radius, walls)
         self._all, self._near = np.ones(count, np.bool_), np.zeros(count, np.int64)
-        self._no_path = np.empty((0, 2))
         self.frame: Array = np.zeros((5, count))
         self._arrive(self.frame)
-
-    def state(self) -> State:
-        """Return the poses, for `restore`."""
-        return (self.frame,)
-
-    def restore(self, state: State) -> None:
-        """Return to poses."""
-        (self.frame,) = state
 
     def poses(self) -> Array:
         """(x, y, θ), shape (B, 3) [m, m, rad], a fresh array; θ is not wrapped."""
@@ -397,7 +391,7 @@ class UnicycleBodies(Restorable):
             Shares of the displacements, in [0, 1], that the walls allowed, 1 for bodies
             that do not move; None without walls.
         """
-        path = self._no_path
+        path = commands[:0]
         if self._drive is not None:
             path = np.column_stack(self._drive.path(*commands.T))
         frame, after = self.frame, np.empty(self.frame.shape)

@@ -38,10 +38,8 @@ def episode_keys(generators: Sequence[np.random.Generator]) -> WordArray:
     >>> bool((keys == episode_keys([rng])).all())
     True
     """
-    keys = np.empty((len(generators), 2), dtype=np.uint64)
-    for row, rng in enumerate(generators):
-        keys[row] = rng.bit_generator.random_raw(2)
-    return keys
+    keys = [rng.bit_generator.random_raw(2) for rng in generators]
+    return np.array(keys, dtype=np.uint64).reshape(-1, 2)
 
 
 def drawn_scenarios(scenario: Scenario, keys: WordArray) -> list[Scenario]:

@@ -124,11 +124,7 @@ class WorldBatch(Restorable):
         limits = robot.max_speed, robot.max_turn_rate
         self._limits = np.tile(limits, (count, 1))  # tiled: numpy runs one loop
         self._hides_identities = not scenario.sensor.identities
-        self.begun = False
-        self._clear()
-
-    def _clear(self) -> None:
-        count, rows = self.count, count_rows(self.scenario)
+        self.begun, rows = False, count_rows(scenario)
         self.measurements = np.zeros((count, rows, 2))
         self.mask = np.zeros((count, rows), dtype=np.bool_)
         self.odometry = np.zeros((count, 2))
@@ -138,7 +134,7 @@ class WorldBatch(Restorable):
         if self._hides_identities:
             self.landmark_ids = np.full((count, rows), -1)
         self._start_estimates = np.zeros((count, 3))
-        shape = (count, self.scenario.landmarks.count)
+        shape = count, scenario.landmarks.count
         self._landmarks = np.zeros(shape, dtype=np.complex128)
 
     @property

@@ -485,8 +485,8 @@ def step_scans(
 
 
 def _writeable(array: AnyArray) -> AnyArray:
-    """Return an array of the kind that the kernels are compiled for."""
-    return np.require(array, requirements=["C", "W"])
+    """Return an array that kernels are compiled for; a broadcast one is not."""
+    return array if array.flags.writeable else array.copy()
 
 
 def chosen_runs(runs: ArrayLike | None, count: int) -> BoolArray:

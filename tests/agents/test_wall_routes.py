@@ -9,7 +9,9 @@ from scipy.sparse.csgraph import dijkstra
 from slamgym.agents import ActiveSlamEnv
 from slamgym.agents.active_slam_baselines import BASELINES, make_baseline
 from slamgym.agents.active_slam_scores import VALIDATION, baseline_policy, run_episode
+from slamgym.agents.belief_space_planner import drive_routes
 from slamgym.agents.wall_routes import CoverageGrid
+from slamgym.envs.robot import wrap_angle
 from slamgym.sim_configs import load_scenario
 
 ROOMS = load_scenario("active_rooms")
@@ -128,3 +130,35 @@ def test_every_baseline_acts_where_walls_leave_no_room(name):
     env.reset(seed=1)
     action = make_baseline(name, scenario, np.random.default_rng(0)).act(env.knowledge)
     assert env.action_space.contains(np.asarray(action, env.action_space.dtype))
+
+
+def driven_in_numpy(pose, routes, longest, turning, steps):
+    """Return the plans of `drive_routes`, step by step for all routes together."""
+    x, y, heading = np.tile(pose, (len(routes), 1)).T
+    each, leg = np.arange(len(routes)), np.zeros(len(routes), dtype=int)
+    plans = np.empty((len(routes), steps, 2))
+    for t in range(steps):
+        goal = routes[each, np.minimum(leg, routes.shape[1] - 1)]
+        dx, dy = goal[:, 0] - x, goal[:, 1] - y
+        distance = np.hypot(dx, dy)
+        arrived = distance < 0.5 * longest
+        error = wrap_angle(np.arctan2(dy, dx) - heading)
+        turn = np.where(arrived, turning, np.clip(error, -turning, turning))
+        ahead = (np.abs(error) < 0.5) & ~arrived
+        drive = np.where(ahead, np.minimum(distance, longest), 0.0)
+        plans[:, t] = np.column_stack([drive, turn])
+        x, y = x + drive * np.cos(heading), y + drive * np.sin(heading)
+        heading, leg = heading + turn, leg + arrived
+    return plans
+
+
+@pytest.mark.parametrize("legs", [1, 2, 5])
+def test_plans_along_routes_are_those_of_numpy(legs):
+    routes, pose = points(200 * legs).reshape(200, legs, 2), np.array([1.0, -2.0, 9.0])
+    routes[:20, 0] = pose[:2]  # there already
+    plans, limits = np.empty((200, 60, 2)), (0.7, 0.6)
+    drive_routes(pose, routes, *limits, plans)
+    expected = driven_in_numpy(pose, routes, *limits, 60)
+    np.testing.assert_allclose(plans, expected, rtol=0, atol=1e-12)
+    assert (plans[:, :, 0] == 0.0).any()
+    assert (plans[:, :, 0] == 0.7).any()

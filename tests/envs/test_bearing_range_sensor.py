@@ -6,7 +6,7 @@ import pytest
 from worlds import RANDOM_MAP
 
 from slamgym.envs.bearing_range import BearingRangeSensor, LineOfSight, hide_identities
-from slamgym.envs.noise_streams import WorldNoise
+from slamgym.envs.noise_streams import NoiseRows, WorldNoise, row_of
 from slamgym.envs.streams import episode_keys
 from slamgym.sim_configs import load_scenario
 
@@ -36,7 +36,7 @@ def noise_of_steps(scenario, count):
 
 
 def rows_of(scenario, seed=0):
-    rows = WorldNoise(scenario).sensor_rows()
+    rows = NoiseRows(WorldNoise(scenario).sensor, row_of)
     rows.begin(key_of(seed), first=0)
     return rows
 
