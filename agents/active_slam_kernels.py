@@ -302,12 +302,18 @@ def cells_in_view(
     poses: Array, cells: Array, view: tuple[Any, ...], seen: BoolArray
 ) -> None:
     """Mark the cells (2, C) in view from any of poses (B, T, 3), in `seen` (B, C)."""
-    points = np.empty((3, cells.shape[1]))
+    points, sight = np.empty((3, cells.shape[1])), View(*view)
     for b in range(len(poses)):
         for t in range(poses.shape[1]):
             x, y, heading = poses[b, t, 0], poses[b, t, 1], poses[b, t, 2]
-            pose = x, y, math.cos(heading), math.sin(heading)
-            mark_cells(pose, cells, View(*view), seen[b], points)
+            cos, sin = math.cos(heading), math.sin(heading)
+            if len(sight.walls) > 0:
+                mark_cells((x, y, cos, sin), cells, sight, seen[b], points)
+                continue
+            for c in range(cells.shape[1]):
+                dx, dy = cells[0, c] - x, cells[1, c] - y
+                ahead, distance = dx * cos + dy * sin, math.sqrt(dx * dx + dy * dy)
+                seen[b, c] |= is_in_view(ahead, distance, sight)
 
 
 @njit_internal
