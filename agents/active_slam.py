@@ -351,8 +351,9 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
     def _seen(self) -> Observations:
         return self.task.observations()
 
-    def _more_infos(self) -> dict[str, Any]:
-        return self._explorers.infos(self._worlds.complex_landmarks, self._ended)
+    def _infos(self) -> dict[str, Any]:
+        landmarks, ended = self._worlds.complex_landmarks, self._ended
+        return super()._infos() | self._explorers.infos(landmarks, ended)
 
 
 # --------------------------------------------------------------------------------------

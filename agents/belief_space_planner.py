@@ -142,17 +142,11 @@ def plan_values(
     points = as_points(knowledge.grid.cells)
     counts = knowledge.missing * chance / chance.sum()
     kept = counts > 0.02 * counts.max() if knowledge.missing else counts > 0
-    density = points[kept], counts[kept]
     now = np.linalg.slogdet(knowledge.belief.covariance[3:, 3:])[1]
     steps = plans.shape[1]
-    after = imagine(
-        slam,
-        plans,
-        scenario.sensor,
-        walls=scenario.walls,
-        density=density,
-        horizons=(steps // 4, steps // 2, steps),
-    )
+    density, horizons = (points[kept], counts[kept]), (steps // 4, steps // 2, steps)
+    known_world = {"walls": scenario.walls, "density": density}
+    after = imagine(slam, plans, scenario.sensor, horizons=horizons, **known_world)
     known = after.worst_variances[0] <= knowledge.accuracy**2
     values: Array = ((now - after.log_det[0]) / (6.0 * size)).sum(axis=1)
     values += settings.known_bonus * known.sum(axis=(1, 2)) / 3.0

@@ -25,8 +25,6 @@ from ..suggestions import imported
 from .noise_streams import SensorNoise, SensorSettings
 from .robot import wrapped_bearing
 
-_LAST = np.array(np.inf)  # sorts after every other row
-
 
 class AnonymousScan(NamedTuple):
     """Readings without identities, in random order, empty rows last."""
@@ -245,7 +243,7 @@ def hide_identities(
     rows[..., :count, :2], rows[..., count:, :2] = measurements, clutter
     rows[..., 2] = -1.0
     np.copyto(rows[..., :count, 2], np.arange(count), where=mask)
-    places = np.argsort(np.where(rows[..., 1] > 0.0, order, _LAST), axis=-1)
+    places = np.argsort(np.where(rows[..., 1] > 0.0, order, np.inf), axis=-1)
     if places.ndim == 1:
         rows = rows[places]  # 20 µs faster
     else:

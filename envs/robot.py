@@ -147,17 +147,11 @@ class UnicycleBody(Restorable):
         self._cos, self._sin = cos, sin
         self.frame[:, 0] = x, y, heading, cos, sin
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {
-            "radius": self._radius,
-            "walls": self._walls,
-            "drive": self._drive,
-            "pose": self._pose,
-        }
+    def __reduce__(self) -> tuple[Any, ...]:
+        return UnicycleBody, (self._radius, self._walls, self._drive), self._pose
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        UnicycleBody.__init__(self, state["radius"], state["walls"], state["drive"])
-        self.place(state["pose"])
+    def __setstate__(self, pose: tuple[float, float, float]) -> None:
+        self.place(pose)
 
 
 # --------------------------------------------------------------------------------------

@@ -122,21 +122,21 @@ def draw_normals(keys: WordArray, steps: IntArray, stream: int, out: Array) -> N
     out : ndarray, shape (K, W)
         Contiguous.
     """
-    rows, width = out.shape
-    for row in range(rows):
-        (k0, k1), step = keys[min(row, len(keys) - 1)], steps[row]
-        column = 0
-        for block in range((width + 3) // 4):
-            for word in random_block(k0, k1, block + 1, step, stream):
-                if column < width:
-                    out[row, column] = shifted(word)
-                    column += 1
+    _fill(keys, steps, stream, out, True)
     make_normal(out.reshape(-1))
 
 
 @jit
 def draw_uniforms(keys: WordArray, steps: IntArray, stream: int, out: Array) -> None:
     """Fill an array, (K, W), with uniform numbers in [0, 1); see `draw_normals`."""
+    _fill(keys, steps, stream, out, False)
+
+
+@njit_internal
+def _fill(
+    keys: WordArray, steps: IntArray, stream: int, out: Array, is_shifted: bool
+) -> None:
+    """Fill an array with the numbers of `uniform_of`, or of `shifted`."""
     rows, width = out.shape
     for row in range(rows):
         (k0, k1), step = keys[min(row, len(keys) - 1)], steps[row]
@@ -144,7 +144,7 @@ def draw_uniforms(keys: WordArray, steps: IntArray, stream: int, out: Array) -> 
         for block in range((width + 3) // 4):
             for word in random_block(k0, k1, block + 1, step, stream):
                 if column < width:
-                    out[row, column] = uniform_of(word)
+                    out[row, column] = shifted(word) if is_shifted else uniform_of(word)
                     column += 1
 
 

@@ -336,11 +336,7 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
             infos["landmark_ids"] = worlds.landmark_ids
         if worlds.pose_readings is not None:
             infos |= worlds.pose_sensors.by_name(worlds.pose_readings)
-        return infos | self._more_infos()
-
-    def _more_infos(self) -> Infos:
-        """Return the infos besides those of the worlds."""
-        return {}
+        return infos
 
     def _begun_worlds(self) -> WorldBatch:
         if not self._worlds.begun:
