@@ -7,7 +7,8 @@ neighbour, or the most likely joint assignment.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp
+from functools import lru_cache
+from math import exp, inf
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +31,8 @@ from ..support import argument_checks
 BRANCH_SPREAD = 16.0
 
 TINY = float(np.finfo(np.float64).tiny)
+
+TWO_LN_2PI = float(2 * np.log(2 * np.pi))
 
 #: Beliefs with the same landmarks are one if no coordinate changes by more σ.
 SAME = 1.0
@@ -93,7 +96,7 @@ def assign_scan(
     missing = np.zeros(count) if pairs_first else missing_costs(density)
     if most is None:
         most = policy.branches if policy.association == "hypotheses" else 1
-    scan = readings, missing, _limits(policy, count)
+    scan = readings, missing, _limits(policy.pair_gate if pairs_first else inf, count)
     gates = float(policy.new_gate), float(policy.pair_gate), float(ceiling)
     search = pairs_first, policy.search_nodes
     slots = np.empty((most, count), dtype=np.int64)
@@ -180,13 +183,11 @@ def _is_superfluous(
     return False
 
 
-def _limits(policy: AssociationPolicy, rows: int) -> Array:
-    """Return the largest νᵀ S⁻¹ ν of 0 … m pairs together."""
-    limits = np.full(rows + 1, np.inf)
-    if policy.association == "compatibility":
-        tail = exp(-policy.pair_gate / 2)  # P(χ² > pair_gate), 2 degrees of freedom
-        limits[1:] = chdtri(2.0 * np.arange(1, rows + 1), tail)
-    return limits
+@lru_cache(maxsize=64)
+def _limits(gate: float, rows: int) -> Array:
+    """Return the largest νᵀ S⁻¹ ν of 0 … m pairs together, from that of one pair."""
+    tail = exp(-gate / 2)  # P(χ² > gate), 2 degrees of freedom
+    return np.append(np.inf, chdtri(2.0 * np.arange(1, rows + 1), tail))
 
 
 def missing_costs(density: Array) -> Array:
@@ -197,7 +198,7 @@ def missing_costs(density: Array) -> Array:
     >>> missing_costs(np.array([0.02])).round(2)
     array([4.15])
     """
-    return np.asarray(-2 * np.log(density) - 2 * np.log(2 * np.pi))
+    return np.asarray(-2 * np.log(density) - TWO_LN_2PI)
 
 
 ASSOCIATIONS = ("auto", "nearest", "joint", "compatibility", "hypotheses")

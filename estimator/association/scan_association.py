@@ -95,7 +95,7 @@ class ScanAssociation:
         new = [k for k, (i, label) in rows if i is None and not 0 <= label < known]
         density = self._density.after(self._readings, new, len(self.confirmed))
         evidence = self.detections.evidence.with_heading(view)
-        detections = self.detections._replace(evidence=evidence)
+        detections = Detections(*self.detections[:4], evidence)
         changed = self._tentative, self._waiting, self._next_id, self.scan + 1
         return Candidates(*changed, density, detections)
 
@@ -117,18 +117,18 @@ class ScanAssociation:
         """Associate by given identities, except those merged or not yet trusted."""
         known = set(mapped)
         for row, given in enumerate(ids):
-            landmark_id = aliases.get(given, given)
+            landmark_id = aliases.get(given, given) if aliases else given
             if landmark_id in self.explained:  # two names of one landmark in one scan
                 self.ambiguous_rows.append(row)
                 continue
             self.explained.add(landmark_id)
-            self._next_id = max(self._next_id, landmark_id + 1)
             if landmark_id in known or self._policy.trust_ids:
                 self.row_ids[row] = landmark_id
             elif self._has_waited(landmark_id):
                 self._confirm(row, landmark_id, NO_LABEL)
             else:
                 self.tentative_rows.append(row)
+        self._next_id = max(self._next_id, 1 + max(self.explained, default=-1))
 
     def _match_tentative(self, rows: IntArray, noise: Noise) -> None:
         """Match rows that no landmark explains with tentative ones; confirm these.
@@ -322,8 +322,10 @@ class Detections(NamedTuple):
         longest : float
             Longest range read so far [m].
         """
-        ids, shown, first_new = view.ids, self.shown, self.evidence.first_new
-        proven = [i < first_new and shown.get(i, 0) >= PROVEN for i in ids]
+        ids, first_new = view.ids, self.evidence.first_new
+        times = [self.shown.get(i, 0) for i in ids]
+        pairs = zip(ids, times, strict=True)
+        proven = [i < first_new and count >= PROVEN for i, count in pairs]
         is_telling, scan = np.array(proven, dtype=np.bool_), (slots, explained)
         missed = np.array([self.missed.get(i, 1.0) for i in ids])
         counts = self.seen.copy(), self.expected.copy()
@@ -332,14 +334,11 @@ class Detections(NamedTuple):
         if left or min(chances, default=1.0) < 1:
             left = {**left, **dict(zip(ids, chances, strict=True))}
             left = {i: chance for i, chance in left.items() if chance < 1}
-        seen = [ids[slot] for slot in slots.tolist() if slot >= 0]
-        more = {i: shown.get(i, 0) + 1 for i in seen if shown.get(i, 0) < PROVEN}
-        return cost, Detections(
-            *counts,
-            left,
-            {**shown, **more} if more else shown,
-            self.evidence.after(fewer, view.mapped),
-        )
+        seen = [slot for slot in slots.tolist() if slot >= 0]
+        more = {ids[j]: times[j] + 1 for j in seen if times[j] < PROVEN}
+        shown = {**self.shown, **more} if more else self.shown
+        evidence = self.evidence.after(fewer, view.mapped)
+        return cost, Detections(*counts, left, shown, evidence)
 
     def chance_to_miss(self, view: MapView, longest: float) -> Array:
         """Return the probability that a scan does not show a landmark, shape (n,)."""
@@ -582,10 +581,9 @@ def associate(
         association = ScanAssociation(policy, candidates, readings)
         association.detections = detections
         association.explained = {view.ids[slot] for slot in found.explained.tolist()}
-        if len(slots) < len(readings):
-            slots, given = np.full(len(readings), AMBIGUOUS), slots
-            slots[usable] = given
-        association.assign(slots, view, noise)
+        whole = np.full(len(readings), AMBIGUOUS)
+        whole[usable] = slots
+        association.assign(whole, view, noise)
         return association
 
     options = []

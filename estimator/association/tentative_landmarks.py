@@ -211,8 +211,9 @@ class UnexplainedDensity(NamedTuple):
         with n readings per scan, r the longest range, and half a reading added to every
         sector and ring.
         """
-        density = np.full(len(readings), self.per_scan / (2 * np.pi * self.longest))
-        _shape_density(self.cells, readings, self.longest, density)
+        mean = self.per_scan / (2 * np.pi * self.longest)
+        density = np.empty(len(readings))
+        _fill_density(self.cells, readings, self.longest, mean, density)
         return density
 
     @property
@@ -249,15 +250,15 @@ def _cell(bearing: float, distance: float, longest: float) -> tuple[int, int]:
 
 
 @jit
-def _shape_density(
-    cells: Array, readings: Array, longest: float, density: Array
+def _fill_density(
+    cells: Array, readings: Array, longest: float, mean: float, density: Array
 ) -> None:
-    """Multiply a density by the shares of the sector and the ring of each reading."""
+    """Fill the mean density times the shares of the sector and ring of each reading."""
     sectors, rings = cells.sum(axis=1) + 0.5, cells.sum(axis=0) + 0.5
     usual, usual_ring = sectors.sum() / SECTORS, rings.sum() / RINGS
     for k in range(len(readings)):
         sector, ring = _cell(readings[k, 0], readings[k, 1], longest)
-        density[k] *= sectors[sector] / usual * rings[ring] / usual_ring
+        density[k] = mean * (sectors[sector] / usual * rings[ring] / usual_ring)
 
 
 @jit

@@ -655,22 +655,22 @@ class ScanReport(UpdateReport):
         parts = self._parts
         return int(parts.numbers[IN_USE]) * int(parts.values[gain.NUMBERS_READ])
 
-    @cached_property
+    @property
     def associated_ids(self) -> tuple[int, ...]:
         """Mapped landmarks whose readings corrected the belief."""
         return self._with_outcome(gain.USED)
 
-    @cached_property
+    @property
     def added_ids(self) -> tuple[int, ...]:
         """Landmarks that entered the map."""
         return self._with_outcome(gain.ADDED)
 
-    @cached_property
+    @property
     def rejected_ids(self) -> tuple[int, ...]:
         """Mapped landmarks whose readings the chi-square gate rejected."""
         return self._with_outcome(gain.GATED)
 
-    @cached_property
+    @property
     def skipped_ids(self) -> tuple[int, ...]:
         """Landmarks whose readings are too close to use."""
         return self._with_outcome(gain.SKIPPED)

@@ -174,7 +174,8 @@ class ManagedSlam:
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], dt multiplies its noise variance."""
         reading = argument_checks.pair("odometry", odometry)
-        argument_checks.duration(dt)
+        if dt != 1.0:
+            argument_checks.duration(dt)
         candidates, noise = self.candidates, self._motion_noise
         if len(candidates.tentative.seen):
             displacement = noise.motion.moved(reading)

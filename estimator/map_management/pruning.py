@@ -254,7 +254,6 @@ class LandmarkRecords(Restorable):
     [7, 9]
     """
 
-    changing = ()
     replaced = (
         *("ids", "_slots", "sightings", "misses", "information"),
         *("apart", "aliases", "doubtful"),

@@ -113,7 +113,7 @@ class RecentScans(Restorable):
         if scan.begins:
             scan = scan._replace(before=self._slam.state_dict())
         scans = [*self.scans, scan][-self._window - 1 :]
-        return scans, _relabel(scans, plan.confirmed)
+        return scans, _relabel(scans, plan.confirmed) if plan.confirmed else None
 
     def feed(
         self, scans: list[RecentScan], first: int | None, plan: ScanAssociation
@@ -323,10 +323,7 @@ class RecentScan(NamedTuple):
     @property
     def begins(self) -> bool:
         """Whether a tentative landmark is seen here for the first time."""
-        return any(
-            label != NO_LABEL and label >> LABEL_BITS == self.number
-            for label in self.labels
-        )
+        return max(self.labels, default=NO_LABEL) >= self.number << LABEL_BITS
 
     def feed(self, slam: SlamEstimator) -> UpdateReport:
         """Update a filter with the rows that it uses."""

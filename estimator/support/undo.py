@@ -48,7 +48,7 @@ def attributes(*objects: object) -> Undo:
 
     Arrays, lists, dicts and sets must not be changed in place; see :func:`contents`.
     """
-    before = [(vars(each), vars(each).copy()) for each in objects]
+    before = [(values := vars(each), values.copy()) for each in objects]
 
     def undo() -> None:
         for values, old in before:

@@ -18,7 +18,7 @@ class Restorable:
     states share them.
     """
 
-    changing: ClassVar[tuple[str, ...]]
+    changing: ClassVar[tuple[str, ...]] = ()
     replaced: ClassVar[tuple[str, ...]] = ()
 
     def state(self) -> State:
