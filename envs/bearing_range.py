@@ -52,8 +52,7 @@ class BearingRangeSensor:
         sensor = scenario.sensor
         self._settings = SensorSettings.of(sensor)
         self._reads_places, wraps = _reading_of_places(sensor.kind)
-        self._reads_ranges = sensor.kind == "range"
-        self._reads_one = sensor.kind in ("bearing", "range")
+        self._only = {"bearing": 0, "range": 1}.get(sensor.kind)
         faults = scenario.present_faults
         bias = faults.bearing_bias, faults.range_bias
         smallest = math.nextafter(sensor.min_range, -1.0)
@@ -111,12 +110,10 @@ class BearingRangeSensor:
             *(measurements, mask),
         )
         if self._sight is not None:
-            position = (frame[0] + 1j * frame[1])[:, None]
-            mask &= ~self._sight.blocked(landmarks, position)
-            measurements = np.where(mask[..., None], measurements, 0.0)
-        if self._reads_one:
-            if self._reads_ranges:
-                measurements[..., 0] = measurements[..., 1]
+            mask &= ~self._sight.blocked(landmarks, frame)
+            measurements[~mask] = 0.0
+        if self._only is not None:  # one number of a reading
+            measurements[..., 0] = measurements[..., self._only]
             measurements[..., 1] = 0.0
         return measurements, mask
 
@@ -268,21 +265,18 @@ class LineOfSight:
     Examples
     --------
     >>> sight = LineOfSight([(1.0, -1.0, 1.0, 1.0)])
-    >>> landmarks = np.array([2.0 + 0.0j, 0.5 + 0.0j, 2.0 + 5.0j])
-    >>> sight.blocked(landmarks, position=np.array(0j))
-    array([ True, False, False])
+    >>> landmarks = np.array([[2.0 + 0.0j, 0.5 + 0.0j, 2.0 + 5.0j]])
+    >>> sight.blocked(landmarks, frame=np.zeros((2, 1)))
+    array([[ True, False, False]])
     """
 
     def __init__(self, walls: Sequence[tuple[float, float, float, float]]) -> None:
-        ends = np.array(walls, dtype=np.float64).reshape(-1, 2, 2)
-        a, b = np.moveaxis(ends[..., 0] + 1j * ends[..., 1], 1, 0)
-        self._conjugate_ends = np.conj(np.concatenate([a, b]))
-        self._count = len(a)
-        self._along = b - a
-        self._origin_side = _cross(a, b)
-        self._mounted = _MOUNTED * np.abs(self._along)
+        ends = np.array(walls, dtype=np.float64).reshape(-1, 4)
+        a, b = ends.view(np.complex128).T
+        margins = _MOUNTED * np.abs(b - a)
+        self._walls = np.column_stack([ends, (np.conj(a) * b).imag, margins])
 
-    def blocked(self, landmarks: ComplexArray, position: ComplexArray) -> BoolArray:
+    def blocked(self, landmarks: ComplexArray, frame: Array) -> BoolArray:
         """Return which lines of sight cross a wall; its end points belong to it.
 
         With δ = l - p, and the ends a and b of a wall relative to p, the line from p
@@ -293,27 +287,34 @@ class LineOfSight:
 
         Parameters
         ----------
-        landmarks : complex ndarray, shape (…, N)
+        landmarks : complex ndarray, shape (K, N)
             l as x + iy [m].
-        position : complex ndarray, shape () or (…, 1)
-            p as x + iy [m].
+        frame : ndarray, shape (2 or more, K)
+            Rows x and y of p [m], and others.
 
         Returns
         -------
-        bool ndarray, shape (…, N)
+        bool ndarray, shape (K, N)
         """
-        p = position[..., None]
-        ends = self._conjugate_ends - np.conj(p)
-        sides = ((landmarks - position)[..., None] * ends).imag  # a × δ, then b × δ
-        side_a, side_b = sides[..., : self._count], sides[..., self._count :]
-        robot_side = self._origin_side - _cross(p, self._along)
-        nearer = np.abs(robot_side) + self._mounted
-        behind = (side_a - side_b) * np.sign(robot_side) > nearer
-        behind &= side_a * side_b <= 0.0
-        blocked: BoolArray = np.logical_or.reduce(behind, axis=-1)
+        blocked = np.zeros(landmarks.shape, dtype=np.bool_)
+        _find_blocked(landmarks, frame, self._walls, blocked)
         return blocked
 
 
-def _cross(u: ComplexArray, v: ComplexArray) -> Array:
-    product: Array = (np.conj(u) * v).imag
-    return product
+@jit
+def _find_blocked(
+    landmarks: ComplexArray, frame: Array, walls: Array, blocked: BoolArray
+) -> None:
+    """Mark the blocked lines of sight; walls have rows (a, b, a × b, margin)."""
+    for world in range(len(landmarks)):
+        x, y = frame[0, world], frame[1, world]
+        for w in range(len(walls)):
+            ax, ay, bx, by, origin_side, margin = walls[w]
+            robot_side = origin_side - fma(x, by - ay, -y * (bx - ax))
+            nearer, sign = abs(robot_side) + margin, np.sign(robot_side)
+            for i in range(landmarks.shape[1]):
+                dx, dy = landmarks[world, i].real - x, landmarks[world, i].imag - y
+                side_a = fma(dx, y - ay, dy * (ax - x))  # a × δ
+                side_b = fma(dx, y - by, dy * (bx - x))
+                is_behind = (side_a - side_b) * sign > nearer
+                blocked[world, i] |= is_behind & (side_a * side_b <= 0.0)

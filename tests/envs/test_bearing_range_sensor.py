@@ -255,8 +255,8 @@ def test_occlusion_is_the_exact_crossing_of_segments():
         walls = rng.integers(-6, 7, (5, 4)).tolist()
         walls = [wall for wall in walls if wall[:2] != wall[2:]]
         grid, robot = rng.integers(-8, 9, (COUNT, 2)), rng.integers(-8, 9, 2).tolist()
-        places, eye = grid @ np.array([1, 1j]), np.array(complex(*robot))
-        blocked = LineOfSight(walls).blocked(places, eye)
+        places, eye = grid @ np.array([1, 1j]), np.array(robot, dtype=float)
+        (blocked,) = LineOfSight(walls).blocked(places[None], eye[:, None])
         for to, found in zip(grid.tolist(), blocked, strict=True):
             assert found == any(crosses(robot, to, wall) for wall in walls)
         hidden += blocked.sum()
@@ -268,7 +268,8 @@ def test_a_landmark_mounted_on_a_wall_is_seen_from_both_sides(height):
     wall = (0.1, 0.3, 3.7, 1.9)
     a, b = complex(*wall[:2]), complex(*wall[2:])
     mounted = a + np.linspace(0.01, 0.99, 99) * (b - a)
-    assert not LineOfSight([wall]).blocked(mounted, np.array(2.0 + 5j * height)).any()
+    robot = np.array([[2.0], [5.0 * height]])
+    assert not LineOfSight([wall]).blocked(mounted[None], robot).any()
 
 
 def test_walls_hide_landmarks_only_when_asked_to():

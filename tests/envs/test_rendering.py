@@ -424,14 +424,13 @@ def test_the_view_ends_at_walls_that_hide():
     pose = np.array([0.3, 0.2, 0.4])
     walls = np.reshape(corridor.walls, (-1, 2, 2))
     area = visible_area(pose, 2 * np.pi, 8.0, walls)
-    sight = LineOfSight(corridor.walls)
-    position = np.array(complex(*pose[:2]))
+    sight, frame = LineOfSight(corridor.walls), pose[:, None]
     inner = pose[:2] + (1 - 1e-6) * (area - pose[:2])
     outer = pose[:2] + (1 + 1e-4) * (area - pose[:2])
-    assert not sight.blocked(inner @ np.array([1, 1j]), position).any()
+    assert not sight.blocked((inner @ np.array([1, 1j]))[None], frame).any()
     ended = np.linalg.norm(area - pose[:2], axis=1) < 8.0 - 1e-9
     assert 10 < ended.sum() < len(area)
-    assert sight.blocked(outer[ended] @ np.array([1, 1j]), position).all()
+    assert sight.blocked((outer[ended] @ np.array([1, 1j]))[None], frame).all()
     free = visible_area(pose, 2 * np.pi, 8.0, walls[:0])
     assert np.linalg.norm(free - pose[:2], axis=1) == pytest.approx(8.0)
 

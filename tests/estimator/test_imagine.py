@@ -70,8 +70,8 @@ def in_view(_, __, readings):
 
 
 def not_hidden(pose, landmarks, readings):
-    position = np.array(complex(*pose[:2]))
-    hidden = LineOfSight(WALLS).blocked(landmarks @ [1, 1j], position)
+    places, frame = (landmarks @ [1, 1j])[None], np.array(pose, dtype=float)[:, None]
+    (hidden,) = LineOfSight(WALLS).blocked(places, frame)
     return in_view(pose, landmarks, readings) & ~hidden
 
 
@@ -211,8 +211,8 @@ def test_a_point_is_hidden_as_in_the_world():
     kernel = getattr(is_hidden, "py_func", is_hidden)  # only kernels call it
     for wall in rng.uniform(-1.0, 1.0, (300, 4)):
         (x, y), (dx, dy) = rng.uniform(-1.0, 1.0, (2, 2))
-        point, robot = np.array([complex(x + dx, y + dy)]), np.array(complex(x, y))
-        expected = bool(LineOfSight([tuple(wall)]).blocked(point, robot)[0])
+        point, robot = np.array([[complex(x + dx, y + dy)]]), np.array([[x], [y]])
+        expected = bool(LineOfSight([tuple(wall)]).blocked(point, robot)[0, 0])
         assert kernel(x, y, dx, dy, wall[None]) == expected
         hidden += expected
     assert 20 < hidden < 280
