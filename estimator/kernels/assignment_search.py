@@ -455,28 +455,27 @@ def least_distances(problem: Problem, marks: IntArray) -> Array:
         Infinite where there is none.
     """
     innovations, variances = problem.innovations, problem.variances
-    rows, landmarks = problem.feasible.shape
-    distances = np.full(marks.shape, np.inf)
+    landmarks, distances = problem.feasible.shape[1], np.full(marks.shape, np.inf)
     shifts = np.empty((2, landmarks, 2))
     joints = np.empty((2, 2 * landmarks, 2 * landmarks))
     taken = np.zeros(landmarks, np.bool_)
     for s in range(len(marks)):
+        open_ = np.flatnonzero(marks[s] == UNPAIRED)
+        if not len(open_):
+            continue
         here = condition_on_all(problem, marks[s], shifts, joints)
         taken[:] = False
-        for i in range(rows):
-            if marks[s, i] != UNPAIRED:
-                taken[marks[s, i]] = True
-        for i in range(rows):
-            if marks[s, i] == UNPAIRED:
-                for j in range(landmarks):
-                    if taken[j]:
-                        continue
-                    x, determinant = fit(
-                        innovations[i], variances[i], shifts[here], joints[here], j, 1.0
-                    )
-                    q = variances[i, j]
-                    if determinant <= SURE * q[0] * q[1]:
-                        distances[s, i] = min(distances[s, i], x)
+        taken[marks[s][marks[s] != UNPAIRED]] = True
+        for i in open_:
+            for j in range(landmarks):
+                if taken[j]:
+                    continue
+                x, determinant = fit(
+                    innovations[i], variances[i], shifts[here], joints[here], j, 1.0
+                )
+                q = variances[i, j]
+                if determinant <= SURE * q[0] * q[1]:
+                    distances[s, i] = min(distances[s, i], x)
     return distances
 
 
