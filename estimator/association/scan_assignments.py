@@ -140,9 +140,10 @@ def assign_jointly(
     noise, rows = Noise(*of_sensor), len(readings)
     squared = np.full((rows, len(explained)), np.inf)
     _compare(mean, P, readings, of_sensor, new_gate, (squared, squared.copy()))
-    some = np.flatnonzero(np.array([np.isfinite(d).any() for d in squared.T]))
-    near = len(some)
-    explained[:near] = some
+    near = 0
+    for j in range(len(explained)):
+        explained[near] = j
+        near += np.isfinite(squared[:, j]).any()
     expected, joint = np.empty((near, 2)), np.empty((2 * near, 2 * near))
     fill_expected(mean, P, explained[:near], expected, joint)
     innovations, variances = np.empty((rows, near, 2)), np.empty((rows, near, 2))
@@ -177,7 +178,7 @@ def _is_superfluous(
 ) -> bool:
     """Return whether these only leave out readings that hardly change the belief."""
     for other in better:
-        is_part = (slots[marks != other] == AMBIGUOUS).all()
+        is_part = ((slots == AMBIGUOUS) | (marks == other)).all()
         if is_part and largest_change(of_scan, other, marks) < SAME:
             return True
     return False

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, BoolArray, IntArray
-from ...jit import jit
+from ...jit import jit, njit_internal
 from ..interface import MapView
 from ..kernels.assignment_search import reading_covariance
 from ..models.bearing_range import (
@@ -524,7 +524,7 @@ def _count(
     return cost, fewer
 
 
-@jit
+@njit_internal
 def _shares_around(
     shares: Array, place: Place, longest: float, margin: float
 ) -> tuple[float, float]:
@@ -543,7 +543,7 @@ def _shares_around(
     return least, likely
 
 
-@jit
+@njit_internal
 def _place_in_scan(mean: Array, P: Array, j: int) -> Place:
     """Return where a scan is expected to show landmark j."""
     c = 3 + 2 * j

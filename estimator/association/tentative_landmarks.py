@@ -269,7 +269,8 @@ def _count_readings(
     for bearing, distance in readings:
         if np.isfinite(bearing) and np.isfinite(distance):
             longest = max(longest, distance)
-    for bearing, distance in readings[new]:
+    for k in new:
+        bearing, distance = readings[k, 0], readings[k, 1]
         if np.isfinite(bearing) and np.isfinite(distance):
             cells[_cell(bearing, distance, longest)] += 1.0
     return longest

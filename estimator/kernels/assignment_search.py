@@ -260,8 +260,10 @@ def best_assignments(
                 continue
         depth += 1
         is_new = True
-    marks = marks[: (np.isfinite(costs) & (costs <= costs[0] + spread)).sum()]
-    return costs[: len(marks)], marks, least_distances(problem, marks), visited < nodes
+    while found > 0 and costs[found - 1] > costs[0] + spread:
+        found -= 1
+    costs, marks = costs[:found], marks[:found]
+    return costs, marks, least_distances(problem, marks), visited < nodes
 
 
 # --------------------------------------------------------------------------------------
@@ -460,15 +462,16 @@ def least_distances(problem: Problem, marks: IntArray) -> Array:
     joints = np.empty((2, 2 * landmarks, 2 * landmarks))
     taken = np.zeros(landmarks, np.bool_)
     for s in range(len(marks)):
-        open_ = np.flatnonzero(marks[s] == UNPAIRED)
-        if not len(open_):
+        taken[:], pairs = False, 0
+        for mark in marks[s]:
+            if mark != UNPAIRED:
+                taken[mark], pairs = True, pairs + 1
+        if pairs == len(marks[s]):
             continue
         here = condition_on_all(problem, marks[s], shifts, joints)
-        taken[:] = False
-        taken[marks[s][marks[s] != UNPAIRED]] = True
-        for i in open_:
+        for i in range(len(marks[s])):
             for j in range(landmarks):
-                if taken[j]:
+                if taken[j] or marks[s, i] != UNPAIRED:
                     continue
                 x, determinant = fit(
                     innovations[i], variances[i], shifts[here], joints[here], j, 1.0
