@@ -128,7 +128,7 @@ def assign_jointly(
     of_sensor : tuple
         The fields of a :class:`Noise`.
     gates : tuple
-        Those of new landmarks and of pairs, and the ceiling of the cost.
+        Those of explained landmarks and of pairs, and the ceiling of the cost.
     search : tuple
         ``pairs_first`` of the :class:`Problem`, and the limit of nodes.
     result : tuple
@@ -163,7 +163,7 @@ def assign_jointly(
     marks, kept = found[1], 0
     for s in range(len(marks)):
         for i in range(rows):
-            slots[kept, i] = AMBIGUOUS if found[2][s, i] <= new_gate else NEW
+            slots[kept, i] = AMBIGUOUS if found[2][s, i] <= pair_gate else NEW
             if marks[s, i] != UNPAIRED:
                 slots[kept, i] = explained[marks[s, i]]
         if not _is_superfluous(problem, marks[:kept], marks[s], slots[kept]):
@@ -235,14 +235,15 @@ class AssociationPolicy:
     #: taken.
     search_nodes: int = 2000
     #: A joint assignment pairs a reading and a landmark up to this νᵀ S⁻¹ ν, given the
-    #: other pairs.
+    #: other pairs.  Beyond it from all landmarks without a reading, a reading is new.
     pair_gate: float = 15.0
     #: Whether the sightings before the confirming one count: the filter then repeats
     #: the scans since the first sighting, with the new landmark in them.
     backdate: bool = True
     #: A reading is of a landmark only up to this νᵀ S⁻¹ ν; χ² of 2 dof, here 99 %.
     match_gate: float = 9.21
-    #: A reading is of a new landmark only beyond this from all that are known.
+    #: By nearest neighbour, a reading is of a new landmark only beyond this from all
+    #: that are known.  A landmark within it of some reading is not missing.
     new_gate: float = 25.0
     #: Left out where two landmarks differ by less than this in −2 ln likelihood.
     ambiguity: float = 1.0

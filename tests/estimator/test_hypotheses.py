@@ -503,3 +503,15 @@ def test_a_copy_continues_like_its_original_where_views_are_a_part_of_the_map():
         for each in (slam, copied):
             each.take(readings, complete)
         assert digest(copied) == digest(slam)
+
+
+@pytest.mark.parametrize("method", ["joint", "hypotheses"])
+@pytest.mark.parametrize(("aside", "new_rows"), [(0.7, ()), (0.85, (0,))])
+def test_a_reading_too_far_from_a_landmark_for_a_pair_is_new(method, aside, new_rows):
+    """Its νᵀ S⁻¹ ν is 12 or 18 with σ = 0.2 rad; a pair may have 15."""
+    noise = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.2, 0.1)}
+    policy = {"association": method, "confirm": (2, 3)}
+    slam = make_estimator("ekf", **noise, management=policy)
+    for _ in range(20):
+        slam.update([(0.0, 5.0)])
+    assert slam.update([(aside, 5.0)]).tentative_rows == new_rows

@@ -80,7 +80,7 @@ def assign_plainly(policy, view, readings, noise, density, *, limits, most):
     found = solve(problem, most, BRANCH_SPREAD)
     kept, chosen = [], []
     for cost, marks, distances in zip(*found[:3], strict=True):
-        slots = np.where(distances <= policy.new_gate, AMBIGUOUS, NEW)
+        slots = np.where(distances <= policy.pair_gate, AMBIGUOUS, NEW)
         slots[marks != UNPAIRED] = explained[marks[marks != UNPAIRED]]
         if not any(
             (slots[marks != other] == AMBIGUOUS).all()
