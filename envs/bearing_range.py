@@ -57,7 +57,6 @@ class BearingRangeSensor:
         bias = faults.bearing_bias, faults.range_bias
         smallest = math.nextafter(sensor.min_range, -1.0)
         self._constants = np.array([smallest, *bias, *wraps])
-        self._room = np.empty((0, 0), np.complex128), np.empty((2, 0, 0))
         hides = sensor.occlusion and scenario.walls
         self._sight = LineOfSight(scenario.walls) if hides else None
 
@@ -94,13 +93,12 @@ class BearingRangeSensor:
             Landmarks that the sensor reads.
         """
         shape = landmarks.shape
-        if self._room[0].shape != shape:
-            self._room = np.empty(shape, np.complex128), np.empty((2, *shape))
-        relative, places = self._room
+        relative, places = np.empty(shape, np.complex128), np.empty((2, *shape))
         _relate(landmarks, frame, relative, places)
         y, x, readings = places[0], places[1], places
         if self._reads_places is not None:
-            readings = np.stack(self._reads_places(x, y))
+            readings = np.empty(places.shape)
+            readings[0], readings[1] = self._reads_places(x, y)
         np.arctan2(y, x, y)
         np.abs(relative, x)
         measurements, mask = np.empty((*shape, 2)), np.empty(shape, np.bool_)

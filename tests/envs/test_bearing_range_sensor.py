@@ -1,4 +1,5 @@
 import math
+import pickle
 from itertools import pairwise
 
 import numpy as np
@@ -408,6 +409,13 @@ def test_many_worlds_at_once_are_each_alone_to_the_last_bit():
         np.testing.assert_array_equal(hidden.mask[e], packed.mask)
         np.testing.assert_array_equal(hidden.landmark_ids[e], packed.landmark_ids)
     assert 10 < mask.sum() < mask.size - 10
+
+
+def test_a_scan_changes_nothing_in_the_sensor():
+    sensor, landmarks = BearingRangeSensor(BASE), points(np.random.default_rng(0))
+    before = pickle.dumps(sensor)
+    sensor.scan(landmarks[None], frames(*POSE)[:, None], noise_of(BASE))
+    assert pickle.dumps(sensor) == before  # states share it, also between threads
 
 
 def test_neighbouring_steps_have_different_noise():

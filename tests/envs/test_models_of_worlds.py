@@ -6,7 +6,7 @@ from gymnasium.utils import seeding
 from gymnasium.utils.env_checker import check_env
 
 from slamgym import make_estimator
-from slamgym.envs import LandmarkWorldEnv
+from slamgym.envs import LandmarkWorldEnv, LandmarkWorldVectorEnv
 from slamgym.envs.controllers import make_controller, planned_path
 from slamgym.envs.drives import drive_of
 from slamgym.envs.rendering.render_state import drawn_readings
@@ -236,6 +236,35 @@ def test_a_world_simulates_a_sensor_of_the_user(tmp_path, monkeypatch):
         scaled = second["landmarks"] * [1.0, 750.0]  # 1500 m/s, there and back
         np.testing.assert_allclose(scaled, first["landmarks"], atol=1e-9)
         first, second = plain.step([0.5, 0.2])[0], echoes.step([0.5, 0.2])[0]
+
+
+RANGE_ONLY = """
+import numpy as np
+
+from slamgym.estimator import Sensor
+
+def h(x, y):
+    r = np.sqrt(x * x + y * y)
+    return (r, 0.0), (x / r, y / r, 0.0, 0.0)
+
+ECHO = Sensor("range_only:ECHO", ("range",), ("m",), h)
+"""
+
+
+def test_worlds_simulate_a_sensor_of_the_user_that_reads_one_number(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "range_only.py").write_text(RANGE_ONLY)
+    monkeypatch.syspath_prepend(tmp_path)
+    changes = {"sensor": {"kind": "range_only:ECHO", "std": (0.1, 0.01)}}
+    env = LandmarkWorldEnv("six_landmarks", **changes)
+    worlds = LandmarkWorldVectorEnv(3, "six_landmarks", **changes)
+    readings = env.reset(seed=3)[0]["landmarks"]
+    true = np.linalg.norm(env.landmarks - env.pose[:2], axis=1)
+    np.testing.assert_allclose(readings[:, 0], true, atol=0.5)
+    np.testing.assert_allclose(readings[:, 1], 0.0, atol=0.05)
+    together = worlds.reset(seed=3)[0]["landmarks"]
+    np.testing.assert_array_equal(together[0], readings)
 
 
 def test_a_sensor_that_cannot_be_imported_is_named():
