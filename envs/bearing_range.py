@@ -14,6 +14,7 @@ Every function takes several worlds that are simulated together, along the first
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -204,11 +205,23 @@ def _reading_of_places(kind: str) -> tuple[Any, tuple[bool, bool]]:
     sensor that the user has written.
     """
     if ":" not in kind:
-        of_places = (lambda x, y: (x, y)) if kind == "position" else None
+        of_places = _position if kind == "position" else None
         return of_places, ("bearing" in kind, False)
     refusal = f"cannot import sensor.kind = '{kind}': "
     h, wraps = (imported(f"{kind}.{part}", refusal) for part in ("h", "wraps"))
-    return (lambda x, y: h(x, y)[0]), (bool(wraps[0]), bool(wraps[1]))
+    return partial(_reading_by, h), (bool(wraps[0]), bool(wraps[1]))
+
+
+# A world that holds these functions can be pickled; lambdas cannot.
+
+
+def _position(x: Array, y: Array) -> tuple[Array, Array]:
+    return x, y
+
+
+def _reading_by(h: Any, x: Array, y: Array) -> Any:
+    reading, _ = h(x, y)
+    return reading
 
 
 def hide_identities(

@@ -1,5 +1,7 @@
 """Worlds with other sensors and drives than bearing-range and the unicycle."""
 
+import pickle
+
 import numpy as np
 import pytest
 from gymnasium.utils import seeding
@@ -238,6 +240,21 @@ def test_a_world_simulates_a_sensor_of_the_user(tmp_path, monkeypatch):
         first, second = plain.step([0.5, 0.2])[0], echoes.step([0.5, 0.2])[0]
 
 
+def assert_a_pickled_world_continues(env):
+    twin = pickle.loads(pickle.dumps(env))
+    for _ in range(10):
+        seen, expected = (each.step([0.5, 0.2])[0] for each in (twin, env))
+        np.testing.assert_array_equal(seen["landmarks"], expected["landmarks"])
+
+
+@pytest.mark.parametrize("kind", STDS)
+def test_worlds_with_every_kind_of_sensor_can_be_pickled(kind):
+    sensor = {"kind": kind, "std": STDS[kind]}
+    env = LandmarkWorldEnv("six_landmarks", sensor=sensor)
+    env.reset(seed=0)
+    assert_a_pickled_world_continues(env)
+
+
 RANGE_ONLY = """
 import numpy as np
 
@@ -265,6 +282,7 @@ def test_worlds_simulate_a_sensor_of_the_user_that_reads_one_number(
     np.testing.assert_allclose(readings[:, 1], 0.0, atol=0.05)
     together = worlds.reset(seed=3)[0]["landmarks"]
     np.testing.assert_array_equal(together[0], readings)
+    assert_a_pickled_world_continues(env)
 
 
 def test_a_sensor_that_cannot_be_imported_is_named():
