@@ -76,8 +76,8 @@ class NoiseRows(Restorable, Generic[Row]):
         step = self._step
         if step == self._end:  # of the block
             size = min(_GROWTH * (step - self._first), _LONGEST_BLOCK) or _FIRST_BLOCK
-            self._first, self._end = step, step + size
             self._drawn = self._draw(self._key, np.arange(step, step + size))
+            self._first, self._end = step, step + size
         self._step = step + 1
         return self._row(self._drawn, step - self._first)
 

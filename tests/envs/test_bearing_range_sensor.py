@@ -365,6 +365,24 @@ def test_the_length_of_a_block_changes_nothing(monkeypatch):
             np.testing.assert_array_equal(a, b)
 
 
+def test_an_interrupted_draw_is_drawn_again_at_the_next_call():
+    interrupts = iter([True, False] * 10)
+
+    def draw(key, steps):
+        if next(interrupts):
+            raise KeyboardInterrupt
+        return key + steps
+
+    rows = NoiseRows(draw, lambda noise, k: noise[k])
+    rows.begin(100, first=1)
+    for step in range(1, 50):
+        try:
+            row = next(rows)
+        except KeyboardInterrupt:
+            row = next(rows)
+        assert row == 100 + step
+
+
 def test_noise_has_the_given_standard_deviations():
     count, landmarks = 3000, points(np.random.default_rng(0))
     readings, mask = BearingRangeSensor(BASE).scan(
