@@ -165,12 +165,15 @@ def _recompiled(function: Any, like: Any) -> Any:
     return _kept(kernel) if isinstance(like._cache, KernelCache) else kernel
 
 
-_FMA_IN_C = ctypes.CFUNCTYPE(*4 * [ctypes.c_double])(("fma", ctypes.CDLL(None)))
+@cache
+def _fma_in_c() -> Any:
+    """Find the function in the C library; compiled kernels do without it."""
+    return ctypes.CFUNCTYPE(*4 * [ctypes.c_double])(("fma", ctypes.CDLL(None)))
 
 
 def _fma(a: float, b: float, c: float) -> np.float64:
     """Return a b + c, rounded once, in plain Python."""
-    return np.float64(_FMA_IN_C(a, b, c))
+    return np.float64(_fma_in_c()(a, b, c))
 
 
 def _emitted_fma(_typing: Any, _a: Any, _b: Any, _c: Any) -> tuple[Any, Any]:

@@ -4,10 +4,16 @@ import os
 import re
 import subprocess
 import sys
+from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
 import pytest
 from drives import MEASUREMENT_STD, MOTION_STD
+from numba import njit
+
+from slamgym import jit
+from slamgym.jit import fma
 
 ROOT = Path(__file__).parents[2]
 NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
@@ -124,6 +130,37 @@ def test_the_tests_of_the_filter_pass_in_plain_python():
         check=False,
     )
     assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.slow
+def test_compiled_kernels_need_no_symbols_of_the_running_program():
+    """``CDLL(None)``, which finds them, fails on Windows."""
+    code = """
+import ctypes
+class Library(ctypes.CDLL):
+    def __init__(self, name, *args, **keywords):
+        if name is None:
+            raise TypeError
+        super().__init__(name, *args, **keywords)
+ctypes.CDLL = Library
+import slamgym.jit
+"""
+    run_python(code)
+
+
+@njit
+def multiply_add_jit(a, b, c):
+    return fma(a, b, c)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_multiply_add_rounds_once(compiled):
+    numbers = np.random.default_rng(0).normal(size=(1000, 3))
+    numbers[:, 2] -= numbers[:, 0] * numbers[:, 1]  # some digits cancel
+    multiply_add = multiply_add_jit if compiled else jit._fma
+    for a, b, c in numbers.tolist():
+        exact = Fraction(a) * Fraction(b) + Fraction(c)
+        assert multiply_add(a, b, c) == float(exact)
 
 
 @pytest.mark.slow
