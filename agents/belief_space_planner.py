@@ -144,9 +144,14 @@ def plan_values(
     kept = counts > 0.02 * counts.max() if knowledge.missing else counts > 0
     now = np.linalg.slogdet(knowledge.belief.covariance[3:, 3:])[1]
     steps = plans.shape[1]
-    density, horizons = (points[kept], counts[kept]), (steps // 4, steps // 2, steps)
-    known_world = {"walls": scenario.walls, "density": density}
-    after = imagine(slam, plans, scenario.sensor, horizons=horizons, **known_world)
+    after = imagine(
+        slam,
+        plans,
+        scenario.sensor,
+        walls=scenario.walls,
+        density=(points[kept], counts[kept]),
+        horizons=(steps // 4, steps // 2, steps),
+    )
     known = after.worst_variances[0] <= knowledge.accuracy**2
     values: Array = ((now - after.log_det[0]) / (6.0 * size)).sum(axis=1)
     values += settings.known_bonus * known.sum(axis=(1, 2)) / 3.0
@@ -258,7 +263,7 @@ def _spread_out(points: Array, position: Array, most: int) -> IndexArray:
 def _driven(knowledge: AgentKnowledge, tours: Array, steps: int) -> Array:
     """Return plans that drive to the goals of tours (K, 2, 2), (K, T, 2).
 
-    They drive around inner walls.
+    The plans lead around inner walls.
     """
     pose, scenario = knowledge.belief.pose, knowledge.scenario
     robot, dt = scenario.robot, scenario.dt

@@ -9,7 +9,7 @@ p = (x, y, θ)  true robot pose in the world frame [m, m, rad]
 l = (lx, ly)   landmark [m, m], as the complex number lx + i ly
 z = (β, r)     reading: bearing from the robot's heading, and range [rad, m]
 
-Every function takes several worlds that are simulated together, along the first axis.
+Arrays of worlds that are simulated together have the worlds along the first axis.
 """
 
 import math
@@ -111,7 +111,7 @@ class BearingRangeSensor:
         if self._sight is not None:
             mask &= ~self._sight.blocked(landmarks, frame)
             measurements[~mask] = 0.0
-        if self._only is not None:  # one number of a reading
+        if self._only is not None:  # the sensor reads one number
             measurements[..., 0] = measurements[..., self._only]
             measurements[..., 1] = 0.0
         return measurements, mask
@@ -121,7 +121,17 @@ class BearingRangeSensor:
 def _relate(
     landmarks: ComplexArray, frame: Array, relative: ComplexArray, places: Array
 ) -> None:
-    """Write δ of the landmarks of K worlds, also as its y and its x, (2, K, N) [m]."""
+    """Write the δ of the landmarks of K worlds.
+
+    Parameters
+    ----------
+    landmarks, frame : ndarray
+        See `BearingRangeSensor.scan`.
+    relative : complex ndarray, shape (K, N)
+        Receives δ [m].
+    places : ndarray, shape (2, K, N)
+        Receives the imaginary and the real parts of δ: all y, then all x [m].
+    """
     for world in range(len(landmarks)):
         cos, sin = frame[3, world], frame[4, world]
         for i in range(landmarks.shape[1]):
@@ -150,14 +160,15 @@ def _disturb(  # noqa: PLR0917 (numba takes arrays more quickly than tuples of t
     places : ndarray, shape (2, K, N)
         True (β, r) [rad, m].
     readings : ndarray, shape (2, K, N)
-        Without noise; `places` of a sensor that reads β and r.
+        Readings without noise; may be `places`.
     unit, lots : ndarray
         See `SensorNoise`.
     settings : ndarray, shape (K or 1, 7)
         See `SensorSettings`.
     constants : ndarray, shape (5,)
-        The range above which landmarks are read [m], what is added to either number of
-        a reading, and 1 for each of them that is an angle.
+        The sensor reads landmarks above the first number, a range [m]. Two biases
+        follow, which are added to the two numbers of a reading. The last two numbers
+        are 1 where the number of a reading is an angle, and 0 elsewhere.
     measurements : ndarray, shape (K, N, 2)
         Receives the readings, zeros where unseen.
     mask : bool ndarray, shape (K, N)
@@ -316,7 +327,7 @@ class LineOfSight:
 def _find_blocked(
     landmarks: ComplexArray, frame: Array, walls: Array, blocked: BoolArray
 ) -> None:
-    """Mark the blocked lines of sight; walls have rows (a, b, a × b, margin)."""
+    """Mark the blocked lines of sight; `walls` has rows (a, b, a × b, margin)."""
     for world in range(len(landmarks)):
         x, y = frame[0, world], frame[1, world]
         for w in range(len(walls)):

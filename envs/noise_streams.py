@@ -1,9 +1,9 @@
 """Noise of the sensor and the motion: one random stream per source.
 
-`WorldNoise` scales the noise of one world to its scenario, and `VectorNoise` that of
-many. Every step of every stream has its own random numbers in a fixed layout. So the
-settings of one source do not affect the noise of another, the length of a block has no
-effect, and a world has the same noise alone and among others.
+`WorldNoise` draws the noise of one world or of many worlds of a scenario. Every step of
+every stream has its own random numbers in a fixed layout. So the settings of one source
+do not affect the noise of another, the length of a block has no effect, and a world has
+the same noise alone and among others.
 """
 
 import math
@@ -26,13 +26,14 @@ _LONGEST_BLOCK = 128  # steps
 
 # Random effects on the sensor in one step of K worlds: (unit, lots, clutter, order).
 #
-# A plain tuple, because a named one costs 1 % of a step. N landmarks, C rows for
-# clutter.
+# It is a plain tuple, because a named one costs 1 % of a step. There are N landmarks,
+# and C rows for clutter.
 #
 # unit : shape (K, 2N)
 #     Noise of the bearings, then of the ranges, in standard deviations.
 # lots : shape (K, N), or (K, 0) without dropout
-#     Uniform random numbers; a reading drops out where they are below its probability.
+#     Uniform random numbers. A reading drops out if its number is below the probability
+#     of dropout.
 # clutter : shape (K, C, 2), or None with identities
 #     False readings (β, r), zeros where there is none [rad, m].
 # order : shape (K, N + C), or None with identities
@@ -49,7 +50,7 @@ class NoiseRows(Restorable, Generic[Row]):
         Takes the key of an episode and an array of step numbers, and draws the noise of
         these steps.
     row : callable
-        Takes this noise and a place in it, and returns the row.
+        Takes the noise of several steps and an index k, and returns the row of step k.
 
     Examples
     --------
@@ -68,13 +69,13 @@ class NoiseRows(Restorable, Generic[Row]):
         self._draw, self._row = draw, row
 
     def begin(self, key: Any, first: int) -> None:
-        """Continue with the rows of an episode from a step on."""
+        """Start the rows of an episode; the next one is that of the step `first`."""
         self._key, self._drawn = key, None
         self._first = self._step = self._end = first
 
     def __next__(self) -> Row:
         step = self._step
-        if step == self._end:  # of the block
+        if step == self._end:  # the block is used up
             size = min(_GROWTH * (step - self._first), _LONGEST_BLOCK) or _FIRST_BLOCK
             self._drawn = self._draw(self._key, np.arange(step, step + size))
             self._first, self._end = step, step + size
@@ -82,13 +83,13 @@ class NoiseRows(Restorable, Generic[Row]):
         return self._row(self._drawn, step - self._first)
 
 
-def row_of(noise: SensorNoise, step: int) -> SensorNoise:
-    """Return the noise of one of many steps of a world."""
+def row_of(noise: SensorNoise, k: int) -> SensorNoise:
+    """Return the noise of step k from the noise of many steps of a world."""
     unit, lots, clutter, order = noise
-    unit, lots = unit[step : step + 1], lots[step : step + 1]
+    unit, lots = unit[k : k + 1], lots[k : k + 1]
     if clutter is None or order is None:
         return unit, lots, None, None
-    return unit, lots, clutter[step], order[step]
+    return unit, lots, clutter[k], order[k]
 
 
 class SensorSettings(NamedTuple):

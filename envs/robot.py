@@ -211,8 +211,9 @@ class WallContacts:
         self._space = pymunk.Space()
         for wall in self._walls:
             self._space.add(*_inflated(wall, radius, self._space.static_body))
-        #: Ends of the walls, shape (W, 4), and how near a way must come to one [m].
+        #: Ends of the walls, shape (W, 4) [m].
         self.ends = np.array(self._walls, dtype=np.float64).reshape(-1, 4)
+        #: A way that stays farther than this from a wall does not touch it [m].
         self.reach = radius + _NEAR
 
     def free_share(self, x: float, y: float, dx: float, dy: float) -> float:
@@ -402,7 +403,7 @@ class UnicycleBodies(Restorable):
         return share if len(walls) else None
 
     def _arrive(self, frame: Array) -> None:
-        """Take new poses, rows x, y, θ of a frame, and fill in the others."""
+        """Adopt a frame with new rows x, y and θ, and compute its other rows."""
         heading = frame[2]
         np.cos(heading, frame[3])
         np.sin(heading, frame[4])
@@ -421,23 +422,27 @@ def _move(  # noqa: PLR0917 (numba takes arrays more quickly than tuples of them
     after: Array,
     near: IntArray,
 ) -> int:
-    """Move B bodies, except those that come within reach of a wall; list these.
+    """Move B bodies, and list those that come within reach of a wall instead.
 
     Parameters
     ----------
     frame, moving, commands, slip
         See `UnicycleBodies`.
-    path : ndarray, shape (B, 2), or (0, 2) of unicycles
+    path : ndarray, shape (B, 2), or (0, 2) for unicycles
         Displacements in the robots' frames without slip [m].
     walls : ndarray, shape (W, 4)
-        Their ends [m].
+        Ends of the walls [m].
+    reach : float
+        See `WallContacts`.
     after : ndarray, shape (5, B)
-        Receives x, y and θ; of listed bodies the displacement and θ.
+        Receives x, y and θ; for listed bodies dx, dy and θ.
+    near : int64 ndarray, shape (B,)
+        Receives the indices of the listed bodies at its front.
 
     Returns
     -------
     int
-        The number of those listed in `near`.
+        The number of listed bodies.
     """
     count = 0
     for b in range(len(moving)):

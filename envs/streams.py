@@ -136,7 +136,7 @@ def draw_uniforms(keys: WordArray, steps: IntArray, stream: int, out: Array) -> 
 def _fill(
     keys: WordArray, steps: IntArray, stream: int, out: Array, is_shifted: bool
 ) -> None:
-    """Fill an array with the numbers of `uniform_of`, or of `shifted`."""
+    """Fill an array with `uniform_of` or `shifted` of random words, step by step."""
     rows, width = out.shape
     for row in range(rows):
         (k0, k1), step = keys[min(row, len(keys) - 1)], steps[row]
