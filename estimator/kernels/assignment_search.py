@@ -43,6 +43,8 @@ def _decision_order(feasible: BoolArray, innovations: Array) -> IntArray:
     """
     options = feasible.sum(axis=1)
     order = np.arange(len(options))
+    if feasible.shape[1] == 0:  # there are no innovations to compare
+        return order
     for i in range(1, len(options)):
         k = i
         while k > 0:
@@ -454,7 +456,7 @@ def least_distances(problem: Problem, marks: IntArray) -> Array:
     Returns
     -------
     ndarray, shape (M, m)
-        Infinite where there is none.
+        Infinite for paired readings, and where no such landmark is left.
     """
     innovations, variances = problem.innovations, problem.variances
     landmarks, distances = problem.feasible.shape[1], np.full(marks.shape, np.inf)

@@ -164,6 +164,20 @@ def test_a_multiply_add_rounds_once(compiled):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("method", ["joint", "compatibility", "hypotheses"])
+def test_a_first_scan_without_identities_is_associated_in_plain_python(method):
+    """Plain Python refuses an index out of bounds, which a kernel does not notice."""
+    code = (
+        "import sys; from slamgym import make_estimator;"
+        "noise = {'motion_std': (0.1, 0.1, 0.05), 'measurement_std': (0.02, 0.1)};"
+        "policy = {'association': sys.argv[1]};"
+        "slam = make_estimator('ekf', management=policy, **noise);"
+        "print(slam.update([(0.1, 3.0), (0.5, 4.0)]).tentative_rows)"
+    )
+    assert run_python(code, method, NUMBA_DISABLE_JIT="1") == "(0, 1)\n"
+
+
+@pytest.mark.slow
 def test_kernels_compiled_and_kernels_loaded_give_the_same_bits(tmp_path):
     """Those of the motion, which are compiled in little time."""
     code = """
