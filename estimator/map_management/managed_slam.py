@@ -174,7 +174,7 @@ class ManagedSlam:
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], dt multiplies its noise variance."""
         reading = argument_checks.pair("odometry", odometry)
-        if dt != 1.0:
+        if type(dt) is not float or dt != 1.0:
             argument_checks.duration(dt)
         candidates, noise = self.candidates, self._motion_noise
         if len(candidates.tentative.seen):

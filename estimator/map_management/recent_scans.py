@@ -329,7 +329,7 @@ class RecentScan(NamedTuple):
         """Update a filter with the rows that it uses."""
         ids = [i for i in self.row_ids if i is not None]
         if len(ids) == len(self.row_ids):
-            return slam.update(self.readings, ids)
+            return slam.update(self.readings.copy(), ids)  # the scan may be repeated
         rows = [row for row, i in enumerate(self.row_ids) if i is not None]
         return slam.update(self.readings[rows], ids)
 

@@ -149,6 +149,51 @@ def test_the_caller_may_fill_the_same_array_with_every_scan(association):
     assert_same_bits(reusing.belief(), twin.belief())
 
 
+class Own:
+    """A filter without checks that writes into the array that it is given."""
+
+    def __init__(self, spoils, **options):
+        self._slam, self._spoils = make_estimator("ekf", **options), spoils
+
+    def predict(self, odometry, dt=1.0):
+        self._slam.predict(odometry, float(np.ravel(dt)[0].real))
+
+    def update(self, measurements, landmark_ids=None):
+        report = self._slam.update(measurements.copy(), landmark_ids)
+        if self._spoils:
+            measurements[:] = 0.0
+        return report
+
+    def __getattr__(self, name):
+        return getattr(self._slam, name)
+
+
+def test_a_filter_that_writes_into_a_scan_does_not_change_what_is_repeated():
+    policy, rng = {"association": "joint", "backdate": True}, np.random.default_rng(1)
+    writing, twin = (
+        ManagedSlam(
+            partial(Own, spoils), MOTION_STD, MEASUREMENT_STD, management=policy
+        )
+        for spoils in (True, False)
+    )
+    for k in range(12):  # the second landmark enters after scans of the first alone
+        scan = np.array([(0.3, 4.0), (-0.5, 3.0)])[: 1 if k < 4 or k % 2 else 2]
+        scan += rng.normal(scale=0.01, size=scan.shape)
+        for slam in (writing, twin):
+            slam.predict((0.1, 0.0))
+            slam.update(scan.copy())
+    assert len(twin.landmark_ids) == 2
+    assert_same_bits(writing.belief(), twin.belief())
+
+
+@pytest.mark.parametrize("dt", [np.ones(1), np.ones(2), 1 + 0j, np.ma.masked])
+def test_a_duration_that_is_no_number_is_refused_for_a_filter_without_checks(dt):
+    slam = ManagedSlam(partial(Own, False), MOTION_STD, MEASUREMENT_STD)
+    with pytest.raises(ValueError, match="dt must be a finite number >= 0, got"):
+        slam.predict((0.1, 0.0), dt)
+    assert slam.steps == 0
+
+
 def test_too_few_sightings_leave_no_trace():
     slam, bare = make(management={"confirm": (3, 4)}), make(management=None)
     clutter = [(1.0, 5.0)]
