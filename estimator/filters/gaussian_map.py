@@ -104,10 +104,9 @@ class GaussianMap:
 
     def resume(self, memory: Array) -> None:
         """Continue with a copy of a memory, in place where its layout is the same."""
+        self._detach_report()
         starts = slice(STARTS, NUMBERS)
         if memory[starts].tobytes() == self.block[starts].tobytes():
-            if (last := self._last()) is not None:  # somebody still holds the report
-                last.detach()
             self._slots, self.block[:] = {}, memory
         else:
             self._become(aligned_copy(memory))
@@ -220,6 +219,7 @@ class GaussianMap:
         steps : int
             Number of steps that have led to this belief.
         """
+        self._detach_report()
         if block is None:
             block = self.blank(max(FIRST_LANDMARKS, len(ids)))
         parts = parts_of(block)
@@ -250,8 +250,7 @@ class GaussianMap:
         ids : ndarray of int64, shape (m,)
             The landmark of each reading.
         """
-        if (last := self._last()) is not None:  # somebody still holds the report
-            last.detach()
+        self._detach_report()
         status = update(self.block, readings, ids)
         if status == NO_ROOM:
             self.make_room(len(ids))
@@ -263,6 +262,11 @@ class GaussianMap:
         report = ScanReport(self.parts)
         self._last = ref(report)
         return report
+
+    def _detach_report(self) -> None:
+        """Let a report that somebody still holds do without the present memory."""
+        if (last := self._last()) is not None:
+            last.detach()
 
     def last_report(self) -> ScanReport:
         """Return the report of the last scan once more."""
@@ -612,10 +616,10 @@ class ScanReport(UpdateReport):
     _parts: Parts
 
     def __init__(self, parts: Parts) -> None:
-        self.__dict__["_parts"] = parts  # past a frozen dataclass
+        self.__dict__["_parts"] = parts  # a frozen dataclass refuses setattr
 
     def detach(self) -> None:
-        """Copy the results: the next update is about to overwrite them."""
+        """Copy the results, since the memory is about to change or to be replaced."""
         if not self.is_detached:
             _ = self.nis, self.degrees_of_freedom, self._record
             del self.__dict__["_parts"]
@@ -631,7 +635,7 @@ class ScanReport(UpdateReport):
         return self.__dict__
 
     def completed(self, **parts: Any) -> ScanReport:
-        """Take parts that the filter did not know, without reading the others."""
+        """Add parts that the filter did not know; return this report itself."""
         self.__dict__.update(parts)
         return self
 
@@ -686,9 +690,12 @@ class ScanReport(UpdateReport):
         return self._record.rows[:, gain.INNOVATION].reshape(-1, 2)
 
     def _with_outcome(self, value: int) -> tuple[int, ...]:
+        """Return the landmarks of the readings with this outcome."""
         return tuple([i for i, found in self._outcomes if found == value])
 
-    _outcomes = cached_property(lambda self: self._entries(gain.OUTCOME))
+    @cached_property
+    def _outcomes(self) -> list[tuple[int, int]]:
+        return self._entries(gain.OUTCOME)
 
     def _entries(self, row: int) -> list[tuple[int, int]]:
         """Return the landmark of each reading, and its entry in a row of the ledger."""

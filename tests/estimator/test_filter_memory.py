@@ -3,6 +3,7 @@
 import copy
 import pickle
 from itertools import combinations
+from weakref import ref
 
 import numpy as np
 import pytest
@@ -162,6 +163,28 @@ def test_the_last_report_is_the_one_that_is_still_held():
     slam.update([(0.2, 4.0)], [5])
     assert slam.report().added_ids == (5,)
     assert report.added_ids == (4,)
+
+
+@pytest.mark.parametrize("management", [None, True])
+@pytest.mark.parametrize("change", ["remove", "resume"])
+def test_a_report_that_is_held_does_not_keep_a_memory_that_was_replaced(
+    management, change
+):
+    large = make_estimator("ekf", management=management, **NOISE)
+    large.update([(0.1 * k, 3.0) for k in range(30)], range(30))
+    slam, twin = (
+        make_estimator("ekf", management=management, **NOISE) for _ in range(2)
+    )
+    scan = [(0.1, 3.0), (0.2, 4.0)], [4, 5]
+    report, expected = slam.update(*scan), twin.update(*scan).replace()
+    gaussian = slam.map if management is None else slam.filter.map
+    memory = ref(gaussian.block.base)
+    if change == "remove":
+        slam.remove([4])
+    else:
+        slam.resume(large.snapshot())
+    assert memory() is None
+    assert report == expected
 
 
 @pytest.mark.parametrize("name", [*FAMILY, "compressed", "sparse_information"])
