@@ -661,7 +661,8 @@ class UpdateReport:
     def completed(self, **parts: Any) -> UpdateReport:
         """Return the report with parts that its filter did not know.
 
-        It may be this report itself, so nobody else may hold it.
+        A subclass may change and return this report itself.  Call this before anybody
+        else has received the report.
         """
         return self.replace(**parts)
 

@@ -128,7 +128,8 @@ def assign_jointly(
     of_sensor : tuple
         The fields of a :class:`Noise`.
     gates : tuple
-        Those of explained landmarks and of pairs, and the ceiling of the cost.
+        Largest νᵀ S⁻¹ ν of a reading and an explained landmark, and of a pair; cost
+        beyond which only the first assignment found is of interest.
     search : tuple
         ``pairs_first`` of the :class:`Problem`, and the limit of nodes.
     result : tuple
@@ -235,15 +236,17 @@ class AssociationPolicy:
     #: taken.
     search_nodes: int = 2000
     #: A joint assignment pairs a reading and a landmark up to this νᵀ S⁻¹ ν, given the
-    #: other pairs.  Beyond it from all landmarks without a reading, a reading is new.
+    #: other pairs.  A reading that is farther than this from every landmark without a
+    #: reading is of a new landmark.
     pair_gate: float = 15.0
     #: Whether the sightings before the confirming one count: the filter then repeats
     #: the scans since the first sighting, with the new landmark in them.
     backdate: bool = True
     #: A reading is of a landmark only up to this νᵀ S⁻¹ ν; χ² of 2 dof, here 99 %.
     match_gate: float = 9.21
-    #: By nearest neighbour, a reading is of a new landmark only beyond this from all
-    #: that are known.  A landmark within it of some reading is not missing.
+    #: With "nearest", a reading is of a new landmark only if its νᵀ S⁻¹ ν to every
+    #: known one is larger than this.  With every method, a landmark with a smaller
+    #: νᵀ S⁻¹ ν to some reading is not missing.
     new_gate: float = 25.0
     #: Left out where two landmarks differ by less than this in −2 ln likelihood.
     ambiguity: float = 1.0

@@ -75,7 +75,7 @@ class ScanAssociation:
         self._waiting = dict(candidates.waiting)
         self._next_id, self.scan = candidates.next_id, candidates.scan
         self._density, self._readings = candidates.density, readings
-        #: After the scan.
+        #: Which landmarks the scans have shown; `associate` adds this scan.
         self.detections = candidates.detections
         #: For each row the landmark that the filter associates it with, if any.
         self.row_ids: list[int | None] = [None] * len(readings)
@@ -91,7 +91,7 @@ class ScanAssociation:
     def candidates_after(self, view: MapView) -> Candidates:
         """Return the candidates after the scan, given the belief after it."""
         rows = enumerate(zip(self.row_ids, self.labels, strict=True))
-        known = self.scan << LABEL_BITS  # labels below are of tentative landmarks
+        known = self.scan << LABEL_BITS  # lower labels are those of earlier scans
         new = [k for k, (i, label) in rows if i is None and not 0 <= label < known]
         density = self._density.after(self._readings, new, len(self.confirmed))
         evidence = self.detections.evidence.with_heading(view)
@@ -343,9 +343,9 @@ class Detections(NamedTuple):
     def chance_to_miss(self, view: MapView, longest: float) -> Array:
         """Return the probability that a scan does not show a landmark, shape (n,)."""
         count, none = len(view.ids), np.zeros(0, dtype=np.int64)
-        chance, known = np.ones(count), np.zeros(count, dtype=np.bool_)
+        chance, is_telling = np.ones(count), np.zeros(count, dtype=np.bool_)
         counts = self.seen.copy(), self.expected.copy()
-        _count(view[:2], (none, none), known, longest, counts, chance)
+        _count(view[:2], (none, none), is_telling, longest, counts, chance)
         return chance
 
 
@@ -483,9 +483,21 @@ def _count(
 ) -> tuple[float, float]:
     """Count a scan; return its cost, and the evidence that the run is lost.
 
-    Of the map, the scan holds the slots of the landmarks that it shows, and of those
-    that are no evidence if it does not.  For every landmark, ``is_telling`` holds
-    whether it is evidence at all.
+    Parameters
+    ----------
+    belief : tuple
+        Mean and covariance of the map.
+    scan : tuple
+        The landmark that each row shows (m,), below 0: none; and the landmarks (k,)
+        that some row may belong to: to miss these is no evidence.
+    is_telling : ndarray, shape (n,)
+        Whether each landmark can be evidence.  Overwritten.
+    longest : float
+        Longest range read so far [m].
+    counts : tuple
+        ``seen`` and ``expected`` of the :class:`Detections`.  The scan is added.
+    missed : ndarray, shape (n,)
+        Probability of missing each landmark so often.  Updated.
     """
     (mean, P), (slots, explained), (seen, expected) = belief, scan, counts
     is_seen = np.zeros(len(missed), np.bool_)

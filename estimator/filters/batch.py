@@ -485,7 +485,7 @@ def step_scans(
 
 
 def _writeable(array: AnyArray) -> AnyArray:
-    """Return an array that kernels are compiled for; a broadcast one is not."""
+    """Return the array, or a copy if it is read-only: kernels take no such array."""
     return array if array.flags.writeable else array.copy()
 
 

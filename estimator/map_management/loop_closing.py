@@ -55,7 +55,7 @@ def lost(view: MapView, rules: Constellations | None) -> BoolArray:
     if rules is None or not (rules.always or len(view.mapped) >= 2 * rules.least):
         return is_lost
     local, known = _find_lost(*view[:2], float(rules.lost_std), is_lost)
-    # A part of the map may leave out landmarks near the robot.
+    # A view of a part of the map may lack some landmarks near the robot.
     is_known = local >= rules.least or view.whole is not None
     can_match = is_known and len(view.mapped) - known >= 2 * rules.least
     return is_lost if can_match or rules.always else np.zeros_like(is_lost)

@@ -55,7 +55,7 @@ class MapEditor:
         self._read: Any = partial(view_map, slam)
         if hasattr(slam, "map_view") and not hides_its_belief(slam):
             self._read = slam.map_view
-        #: Whether the filter can show the map around the robot alone.
+        #: Whether the filter can show only the landmarks around the robot.
         self.is_local = hasattr(slam, "local_view")
         wanted = ("remove", "merge") if merging else ("remove",)
         has_all = all(hasattr(slam, name) for name in wanted)

@@ -141,7 +141,8 @@ class MapPruner:
         most, records = self._policy.remove_after, self.records
         if most is None:
             return []
-        records.renewed()[1][records.slots(missed)] += 1
+        _, misses, _ = records.renewed()
+        misses[records.slots(missed)] += 1
         overdue = np.flatnonzero(records.misses >= most)
         return self.remove([records.ids[k] for k in overdue.tolist()])
 
@@ -313,7 +314,10 @@ class LandmarkRecords(Restorable):
         _add_sightings(self.renewed(), rows, readings, heading, noise)
 
     def renewed(self) -> tuple[IntArray, IntArray, Array]:
-        """Replace the arrays by copies, which may be changed; return these."""
+        """Replace sightings, misses and information by copies; return the copies.
+
+        The caller may change these in place, since no saved state shares them.
+        """
         self.sightings, self.misses = self.sightings.copy(), self.misses.copy()
         self.information = self.information.copy()
         return self.sightings, self.misses, self.information
@@ -381,7 +385,7 @@ def _add_sightings(
 ) -> None:
     """Count a sighting by each reading with a slot ≥ 0; Λ ← Λ + H_lᵀ Q⁻¹ H_l.
 
-    The counts are sightings, misses and, as xx, xy, yy, the information.
+    ``counts`` are sightings, misses, and the information as xx, xy, yy.
     """
     sightings, misses, information = counts
     bearing_std, range_std, per_metre, metres = noise
