@@ -605,13 +605,7 @@ class ScanRecord(NamedTuple):
 
 
 class ScanReport(UpdateReport):
-    """The results of one scan, read from the memory of the filter when asked for.
-
-    Parameters
-    ----------
-    parts : Parts
-        The memory, until :meth:`detach` is called.
-    """
+    """The results of a scan, read from the filter's memory until it changes."""
 
     _parts: Parts
 
@@ -690,7 +684,6 @@ class ScanReport(UpdateReport):
         return self._record.rows[:, gain.INNOVATION].reshape(-1, 2)
 
     def _with_outcome(self, value: int) -> tuple[int, ...]:
-        """Return the landmarks of the readings with this outcome."""
         return tuple([i for i, found in self._outcomes if found == value])
 
     @cached_property
