@@ -492,26 +492,3 @@ def nearest_neighbours(
         is_clear &= others.min(axis=1) - np.where(is_clear, score, 0.0) > ambiguity
     chosen[is_clear] = best[is_clear]
     return chosen
-
-
-# --------------------------------------------------------------------------------------
-# The most likely joint assignments of a scan's readings to landmarks.
-#
-# An assignment gives each reading one landmark or none, and each landmark at most one
-# reading.  Its cost is −2 ln of its likelihood, up to a constant of the scan::
-#
-#     cost = νᵀ S⁻¹ ν + ln det S + Σ λᵢ,    λᵢ = −2 ln ρᵢ − 2 ln 2π
-#
-# ν and S = H P Hᵀ + Q belong to the paired readings together, the sum is over the
-# readings left out, and ρᵢ is the density, at the reading, of those that come from no
-# landmark of the map: clutter and landmarks that are not mapped yet [1 / (rad m)].
-#
-# A depth-first branch and bound decides one reading after the other.  A pair conditions
-# the expected readings of all landmarks.  By the chain rule of the Gaussian, the cost
-# of an assignment is the sum of the costs of its pairs, each given the pairs before::
-#
-#     h ← h + K (z − h),  C ← C − K C,    K = C Hⱼᵀ (Cⱼⱼ + Q)⁻¹,    C = H P Hᵀ
-#
-# The k readings still open add at least the following, since C ⪯ k blockdiag(Cⱼⱼ)::
-#
-#     Σᵢ min(λᵢ, minⱼ νᵀ (k Cⱼⱼ + Q)⁻¹ ν + ln det Q)

@@ -1,6 +1,24 @@
 """Search for the cheapest joint assignments of a scan, compiled.
 
-:mod:`slamgym.estimator.association.scan_assignments` has the equations.
+An assignment gives each reading one landmark or none, and each landmark at most one
+reading.  Its cost is −2 ln of its likelihood, up to a constant of the scan::
+
+    cost = νᵀ S⁻¹ ν + ln det S + Σ λᵢ,    λᵢ = −2 ln ρᵢ − 2 ln 2π
+
+ν and S = H P Hᵀ + Q belong to the paired readings together, the sum is over the
+readings left out, and ρᵢ is the density, at the reading, of those that come from no
+landmark of the map: clutter and landmarks that are not mapped yet [1 / (rad m)].
+
+A depth-first branch and bound decides one reading after the other.  A pair conditions
+the expected readings of all landmarks.  By the chain rule of the Gaussian, the cost
+of an assignment is the sum of the costs of its pairs, each given the pairs before::
+
+    h ← h + K (z − h),  C ← C − K C,    K = C Hⱼᵀ (Cⱼⱼ + Q)⁻¹,    C = H P Hᵀ
+
+The k readings still open add at least the following, since C ⪯ k blockdiag(Cⱼⱼ)::
+
+    Σᵢ min(λᵢ, minⱼ νᵀ (k Cⱼⱼ + Q)⁻¹ ν + ln det Q)
+
 `best_assignments` decides at depth d of the search tree the reading ``order[d]``.
 The expected readings given the pairs so far stand at ``level[d]`` of ``shifts`` and
 ``joints``. `search_clique` finds the largest set of landmark pairs that agree.
@@ -19,7 +37,6 @@ from ..models.bearing_range import (
     reading_slopes_jit,
     wrap_angle_jit,
 )
-from ..models.bearing_range import wrap_angle_jit as wrap
 
 
 @njit_internal
@@ -324,7 +341,7 @@ def fill_expected(
         columns[j, 3], columns[j, 4] = c, c + 1
         dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
         bearing, expected[j, 1] = expected_reading_jit(dx, dy, mean[2])
-        expected[j, 0] = wrap(bearing)
+        expected[j, 0] = wrap_angle_jit(bearing)
         slopes = reading_slopes_jit(dx, dy)
         for i in range(2):
             x, y = slopes[2 * i], slopes[2 * i + 1]
