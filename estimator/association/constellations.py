@@ -301,12 +301,12 @@ def extended(places: TwoPlaces, match: Match) -> Match:
     r, S = _offsets(places, every, phi)
     k = 2 * len(match.local)
     gain = np.linalg.solve(S[:k, :k], S[:k, k:]).T
-    r_left, S_left = r[k:] - gain @ r[:k], S[k:, k:] - gain @ S[:k, k:]
-    good = [
-        row
-        for row in range(len(i))
-        if _chi_square(r_left, S_left, slice(2 * row, 2 * row + 2)) <= PAIR_GATE
-    ]
+    r_left, own = (r[k:] - gain @ r[:k]).reshape(-1, 2, 1), np.arange(len(i))
+    S_left = _blocks(S[k:, k:] - gain @ S[:k, k:])[own, own]
+    sound = np.flatnonzero(np.linalg.det(S_left) > 0)
+    r_left, S_left = r_left[sound], S_left[sound]
+    squared = (r_left * np.linalg.solve(S_left, r_left)).sum(axis=(1, 2))
+    good = sound[squared <= PAIR_GATE]
     return Match(np.append(match.local, i[good]), np.append(match.older, p[good]))
 
 
@@ -337,13 +337,6 @@ def _unexplained(r: Array, modes: Array) -> float:
     """Return what remains of ‖r‖² after a least-squares fit of some modes."""
     fit = np.linalg.lstsq(modes, r, rcond=None)[0]
     return float(np.sum((r - modes @ fit) ** 2))
-
-
-def _chi_square(r: Array, S: Array, rows: slice) -> float:
-    part = S[rows, rows]
-    if not np.linalg.det(part) > 0:
-        return np.inf
-    return float(r[rows] @ np.linalg.solve(part, r[rows]))
 
 
 def _matched(places: TwoPlaces, match: Match) -> tuple[ComplexArray, ComplexArray]:

@@ -7,6 +7,7 @@ accepted the scan.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -35,6 +36,7 @@ from .scan_assignments import (
     innovation_distances,
 )
 from .tentative_landmarks import (
+    MEMORY,
     NO_COUNTS,
     RINGS,
     SECTORS,
@@ -94,8 +96,11 @@ class ScanAssociation:
         known = self.scan << LABEL_BITS  # lower labels are those of earlier scans
         new = [k for k, (i, label) in rows if i is None and not 0 <= label < known]
         density = self._density.after(self._readings, new, len(self.confirmed))
-        evidence = self.detections.evidence.with_heading(view)
-        detections = Detections(*self.detections[:4], evidence)
+        strange = sum(label >= known for label in self.labels)
+        numbers = strange, len(self.labels) - len(new)
+        evidence = self.detections.evidence.with_heading(view.covariance[2, 2])
+        evidence = evidence.with_readings(*numbers, self._density)
+        detections = self.detections._replace(evidence=evidence)
         changed = self._tentative, self._waiting, self._next_id, self.scan + 1
         return Candidates(*changed, density, detections)
 
@@ -216,11 +221,21 @@ class ScanAssociation:
 # last scan at which g was 0, a lost filter may have mapped it a second time.  P_D
 # learns the rates of a lost run, too, so g falls again: the largest g counts.
 #
-# A lost run whose landmarks all stay in view misses none.  Many of these have lost the
-# heading: linearised equations do not hold where its standard deviation is a radian.
-# Scans in succession that leave the heading unknown count c / 2 each::
+# A robot whose odometry fails where no landmark is in view for sure misses none.  Its
+# readings are strange instead: they fit neither the map nor those of earlier scans.  A
+# second sum compares the likelihoods of n strange readings and m others if as many are
+# strange as so far, μ in a scan, or if 1 − ρ of those that fitted so far, e in a scan,
+# are strange, too::
 #
-#     h ← h + c / 2  if min(σ²_θ, π²/3) > least + 0.8 rad² and there is a map
+#     w ← max(0, w + min(c / 2, n ln (1 + δ / μ) − δ + m ln ρ)),    δ = (1 − ρ) e
+#
+# A new landmark is strange in its first scan only, which counts c / 2 at most.
+#
+# A lost run whose landmarks all stay in view misses none, either.  Many of these have
+# lost the heading: linearised equations do not hold where its standard deviation is a
+# radian.  Scans in succession that leave the heading unknown count c / 2 each::
+#
+#     h ← h + c / 2  if min(σ²_θ, π²/3) > least + 0.8 rad²
 #     h ← 0          otherwise
 #
 # π²/3 is the variance of a uniform heading: one that is unknown at the start is no
@@ -242,8 +257,12 @@ class LostEvidence(NamedTuple):
     first_new: int = 0
     #: Least variance of the heading so far [rad²].
     surest: float = UNIFORM
-    #: How many scans in succession have left the heading unknown.
-    unknown: int = 0
+    #: h, of scans in succession that have left the heading unknown.
+    unknown: float = 0.0
+    #: w, of strange readings.
+    unexplained: float = 0.0
+    #: Running sum of other readings.
+    explained: float = 0.0
 
     def after(self, more: float, mapped: Sequence[int]) -> LostEvidence:
         """Add the evidence of a scan before which these landmarks were in the map."""
@@ -251,27 +270,36 @@ class LostEvidence(NamedTuple):
         first_new = self.first_new
         if present == 0:
             first_new = max(first_new, 1 + max(mapped, default=-1))
-        largest = max(self.largest, present)
-        return LostEvidence(present, largest, first_new, *self[3:])
+        return LostEvidence(present, max(self.largest, present), first_new, *self[3:])
 
-    def with_heading(self, view: MapView) -> LostEvidence:
-        """Count a scan after which the belief is ``view``.
+    def with_heading(self, variance: float) -> LostEvidence:
+        """Count a scan that leaves a variance of the heading [rad²].
 
         Examples
         --------
         >>> evidence = LostEvidence()
         >>> for variance in (0.01, 0.9, 1.0, 1.1):
-        ...     view = MapView(np.zeros(5), variance * np.eye(5), (7,))
-        ...     evidence = evidence.with_heading(view)
-        >>> evidence.unknown, evidence.largest > LOST_SCORE
-        (3, True)
+        ...     evidence = evidence.with_heading(variance)
+        >>> evidence.unknown > LOST_SCORE
+        True
         """
-        variance = min(float(view.covariance[2, 2]), UNIFORM)
-        surest = min(self.surest, variance)
-        is_unknown = len(view.mapped) > 0 and variance - surest > UNKNOWN
-        unknown = self.unknown + 1 if is_unknown else 0
-        largest = max(self.largest, MOST_OF_SCAN / 2 * unknown)
-        return LostEvidence(self.present, largest, self.first_new, surest, unknown)
+        variance = min(float(variance), UNIFORM)
+        surest, grown = min(self.surest, variance), variance - self.surest
+        unknown = self.unknown + MOST_OF_SCAN / 2 if grown > UNKNOWN else 0.0
+        largest = max(self.largest, unknown)
+        return self._replace(largest=largest, surest=surest, unknown=unknown)
+
+    def with_readings(
+        self, strange: int, explained: int, before: UnexplainedDensity
+    ) -> LostEvidence:
+        """Count a scan with readings that fit nothing, and with others."""
+        more = (1 - FEWER) * self.explained / before.scans
+        ratio = strange * math.log(1 + more / before.per_scan) - more
+        ratio += explained * math.log(FEWER)
+        unexplained = max(0.0, self.unexplained + min(ratio, MOST_OF_SCAN / 2))
+        changed = unexplained, MEMORY * self.explained + explained
+        largest = max(self.largest, unexplained)
+        return LostEvidence(self.present, largest, *self[2:5], *changed)
 
 
 class Detections(NamedTuple):
@@ -393,8 +421,8 @@ class Candidates:
             waiting.setdefault(landmark_id, []).append(scan)
         missed = {int(i): left for i, left in saved["missed"].tolist()}
         shown = dict(saved["shown"].tolist())
-        lost, most_lost, first_new, surest, unknown = saved["lost"].tolist()
-        evidence = LostEvidence(lost, most_lost, int(first_new), surest, int(unknown))
+        lost, most_lost, first_new, surest, *sums = saved["lost"].tolist()
+        evidence = LostEvidence(lost, most_lost, int(first_new), surest, *sums)
         density, C = saved["density"], saved["covariances"]
         likely = saved_states.is_semidefinite((C + C.transpose(0, 2, 1)) / 2)
         seen, expected = saved["detected"], saved["expected"]
@@ -435,7 +463,7 @@ CANDIDATES: saved_states.Table = {
     "expected": (saved_states.NUMBERS, SECTORS, RINGS),
     "missed": (saved_states.NUMBERS, -1, 2),
     "shown": (saved_states.WHOLE, -1, 2),
-    "lost": (saved_states.NUMBERS, 5),
+    "lost": (saved_states.NUMBERS, 7),
 }
 
 #: Weights of a Gaussian at 0, +2 σ and −2 σ, which keep its variance.

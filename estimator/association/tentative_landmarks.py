@@ -76,13 +76,8 @@ class TentativeLandmarks(NamedTuple):
     @classmethod
     def none(cls) -> "TentativeLandmarks":
         """Return no tentative landmarks."""
-        return cls(
-            np.empty((0, 2)),
-            np.empty((0, 2, 2)),
-            np.empty(0, np.uint64),
-            np.empty(0, np.int64),
-            np.empty(0),
-        )
+        lists = np.empty(0, np.uint64), np.empty(0, np.int64), np.empty(0)
+        return cls(np.empty((0, 2)), np.empty((0, 2, 2)), *lists)
 
     @property
     def sightings(self) -> IntArray:
@@ -137,15 +132,13 @@ class TentativeLandmarks(NamedTuple):
         S = H @ C @ H.T + np.diag(noise.variances(reading[1:])[0])
         gain = np.linalg.solve(S, H @ C).T
         corrected = C - gain @ H @ C
-        places, spread = self.places.copy(), self.covariances.copy()
-        seen = self.seen.copy()
-        places[which] += gain @ nu
-        spread[which] = (corrected + corrected.T) / 2
-        seen[which] |= np.uint64(1)
-        odds = self.odds.copy()
         unlikelihood = nu @ np.linalg.solve(S, nu) + np.log(np.linalg.det(S))
-        odds[which] -= unlikelihood / 2 + np.log(2 * np.pi * density)
-        return self._replace(places=places, covariances=spread, seen=seen, odds=odds)
+        after = TentativeLandmarks._make(part.copy() for part in self)
+        after.places[which] += gain @ nu
+        after.covariances[which] = (corrected + corrected.T) / 2
+        after.seen[which] |= np.uint64(1)
+        after.odds[which] -= unlikelihood / 2 + np.log(2 * np.pi * density)
+        return after
 
     def with_new(
         self, readings: Array, noise: Noise, labels: IntArray, share: float
@@ -161,13 +154,10 @@ class TentativeLandmarks(NamedTuple):
             places.append(direction @ (distance, 0.0))
             local = np.diag([along, across * distance**2])
             spread.append(direction @ local @ direction.T)
-        return TentativeLandmarks(
-            np.concatenate([self.places, places]),
-            np.concatenate([self.covariances, spread]),
-            np.concatenate([self.seen, np.ones(len(readings), np.uint64)]),
-            np.concatenate([self.labels, labels]),
-            np.append(self.odds, np.full(len(readings), np.log(share / (1 - share)))),
-        )
+        odds = np.full(len(readings), np.log(share / (1 - share)))
+        new = places, spread, np.ones(len(readings), np.uint64), labels, odds
+        pairs = zip(self, new, strict=True)
+        return TentativeLandmarks(*(np.concatenate(pair) for pair in pairs))
 
     def chosen(self, which: BoolArray) -> "TentativeLandmarks":
         """Return some of them."""

@@ -6,6 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 from plain_association import predicted_readings
+from scipy.stats import poisson
 
 from slamgym.estimator import make_estimator
 from slamgym.estimator.association.scan_assignments import missing_costs
@@ -23,6 +24,7 @@ from slamgym.estimator.association.scan_association import (
     Detections,
     LostEvidence,
 )
+from slamgym.estimator.association.tentative_landmarks import MEMORY, UnexplainedDensity
 from slamgym.estimator.interface import MapView
 from slamgym.estimator.map_management.hypotheses import Hypothesis
 
@@ -326,12 +328,11 @@ def test_the_alarm_stays_once_the_map_is_seen_again():
     assert detections.evidence.largest == max(scores)
 
 
-def with_headings(stds, ids=(7,)):
+def with_headings(stds):
     """Return the evidence after scans that leave these deviations of the heading."""
     evidence = LostEvidence()
     for std in stds:
-        view = MapView(np.zeros(5), std**2 * np.eye(5), ids)
-        evidence = evidence.with_heading(view)
+        evidence = evidence.with_heading(std**2)
     return evidence
 
 
@@ -346,8 +347,65 @@ def test_a_heading_that_is_unknown_from_the_start_is_no_evidence(std):
     assert with_headings([std, std, std + 1, std + 1, std + 1]).largest == 0
 
 
-def test_a_heading_is_no_evidence_before_there_is_a_map():
-    assert with_headings([0.1, 2.0, 2.0, 2.0, 2.0], ids=()).largest == 0
+def scans_with_strange_readings(scans):
+    """Yield the evidence after each scan (strange readings, others)."""
+    evidence, density = LostEvidence(), UnexplainedDensity()
+    for strange, explained in scans:
+        evidence = evidence.with_readings(strange, explained, density)
+        density = density.after(np.ones((strange, 2)), range(strange))
+        yield evidence
+
+
+def after_strange_readings(scans):
+    return list(scans_with_strange_readings(scans))[-1]
+
+
+def test_strange_readings_are_weighed_by_their_likelihoods():
+    scans = np.random.default_rng(5).poisson([0.4, 3], (300, 2)).tolist()
+    found = list(scans_with_strange_readings(scans))
+    expected = 0.0
+    for k, (strange, explained) in enumerate(scans):
+        weights = MEMORY ** np.arange(k, -1, -1)
+        mean, others = weights @ [(1, 0), *scans[:k]] / (weights.sum() + weights[0])
+        likelihoods = poisson.logpmf(strange, [mean, mean + (1 - FEWER) * others])
+        ratio = np.diff(likelihoods)[0] + explained * np.log(FEWER)
+        expected = max(0, expected + min(ratio, MOST_OF_SCAN / 2))
+        assert found[k].unexplained == pytest.approx(expected, abs=1e-9)
+    assert found[-1].largest == max(one.unexplained for one in found) > 0
+
+
+def test_readings_that_stay_strange_are_evidence_of_a_lost_run():
+    map_made = [(3, 0)] + [(0, 3)] * 20
+    assert after_strange_readings(map_made).largest == 0
+    two = [(2, 0)] * 2
+    assert after_strange_readings(map_made + two).largest <= LOST_SCORE
+    assert after_strange_readings([*map_made, *two, (2, 0)]).largest > LOST_SCORE
+
+
+@pytest.mark.parametrize(
+    "later",
+    [[(6, 0), (0, 6), (4, 2), (0, 6)], [(4, 4), (3, 4), (5, 4)] * 30, [(1, 0)] * 30],
+    ids=["new landmarks", "clutter", "clutter far from the map"],
+)
+def test_new_landmarks_and_usual_clutter_are_no_evidence(later):
+    scans = [(3, 0), *[(0, 3), (3, 3)] * 20, *later]
+    assert after_strange_readings(scans).largest <= LOST_SCORE / 2
+
+
+@pytest.mark.parametrize("association", ["nearest", "joint", "hypotheses"])
+def test_a_robot_moved_where_it_expects_no_landmark_is_probably_lost(association):
+    """It drives away from its map; what it sees then moves, though it stands still."""
+    slam, kept = of_a_circle(association), of_a_circle(association)
+    for _ in range(30):
+        slam.update(scan_at(np.zeros(3)))
+        slam.predict((0.0, 0.0))
+    slam.predict((40.0, 0.0))
+    for x in np.arange(0.0, 4.0, 0.5):
+        slam.update([(bearing, 5.0 - x) for bearing in (-0.5, 0.0, 0.5)])
+        slam.predict((0.0, 0.0))
+    assert slam.lost_score > LOST_SCORE
+    kept.load_state_dict(slam.state_dict())
+    assert kept.lost_score == slam.lost_score
 
 
 @pytest.mark.parametrize("association", ["joint", "hypotheses"])
@@ -381,11 +439,13 @@ def test_a_robot_that_turns_blindly_is_probably_lost(association):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("lost", (-1, 2, 0, 0.1, 0)),
-        ("lost", (3, 2, 0, 0.1, 0)),
-        ("lost", (0, 2, -1, 0.1, 0)),
-        ("lost", (0, 2, 0, -0.1, 0)),
-        ("lost", (0, 2, 0, 0.1, -1)),
+        ("lost", (-1, 2, 0, 0.1, 0, 0, 0)),
+        ("lost", (3, 2, 0, 0.1, 0, 0, 0)),
+        ("lost", (0, 2, -1, 0.1, 0, 0, 0)),
+        ("lost", (0, 2, 0, -0.1, 0, 0, 0)),
+        ("lost", (0, 2, 0, 0.1, -1, 0, 0)),
+        ("lost", (0, 2, 0, 0.1, 0, -1, 0)),
+        ("lost", (0, 2, 0, 0.1, 0, 0, -1)),
         ("density", (1, 2, 0, 1)),
         ("unexplained", np.full((SECTORS, RINGS), -1)),
         ("detected", np.full((SECTORS, RINGS), -1)),
