@@ -402,7 +402,7 @@ class Candidates:
             **vars(self),
             **self.tentative._asdict(),
             "waiting": waiting,
-            "density": self.density[:4],
+            "density": self.density[:5],
             "unexplained": self.density.cells,
             "detected": seen,
             "expected": expected,
@@ -428,7 +428,8 @@ class Candidates:
         seen, expected = saved["detected"], saved["expected"]
         for name, wanted, is_so in (
             ("covariances", "positive semidefinite", likely),
-            ("density", "> 0", density.min() > 0),
+            ("density", "> 0", density[:4].min() > 0),
+            ("density", ">= 0", density[4] >= 0),
             ("unexplained", ">= 0", saved["unexplained"].min() >= 0),
             (
                 "detected",
@@ -457,7 +458,7 @@ CANDIDATES: saved_states.Table = {
     "waiting": (saved_states.WHOLE, -1, 2),
     "next_id": (saved_states.COUNTS,),
     "scan": (saved_states.COUNTS,),
-    "density": (saved_states.NUMBERS, 4),
+    "density": (saved_states.NUMBERS, 5),
     "unexplained": (saved_states.NUMBERS, SECTORS, RINGS),
     "detected": (saved_states.NUMBERS, SECTORS, RINGS),
     "expected": (saved_states.NUMBERS, SECTORS, RINGS),

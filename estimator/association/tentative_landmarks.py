@@ -44,6 +44,9 @@ NO_COUNTS = np.zeros((SECTORS, RINGS))
 #: Weight of a scan relative to the one after it, in running averages.
 MEMORY = 0.98
 
+#: A range counts up to this many times the longest one of a landmark seen again.
+BEYOND = 4.0
+
 #: Least prior probability of being a landmark: the robot may enter a new region.
 LEAST_SHARE = 0.01
 
@@ -184,9 +187,11 @@ class UnexplainedDensity(NamedTuple):
     readings: float = 1.0
     scans: float = 2.0
     #: Longest range read so far [m].
-    longest: float = 1.0
+    farthest: float = 1.0
     #: How many landmarks were confirmed.
     landmarks: float = 1.0
+    #: Longest range read of a landmark that was seen before; 0: none yet [m].
+    known: float = 0.0
     #: How many readings each sector and ring has shown, shape (SECTORS, RINGS).
     cells: Array = NO_COUNTS
 
@@ -207,6 +212,15 @@ class UnexplainedDensity(NamedTuple):
         return density
 
     @property
+    def longest(self) -> float:
+        """Longest range that the sensor reads, as far as the scans show [m].
+
+        A single wrong reading must not stretch all cells.  One that is more than
+        `BEYOND` times as long as any of a landmark seen again does not count.
+        """
+        return _longest_of(self.farthest, self.known)
+
+    @property
     def per_scan(self) -> float:
         """Readings per scan; at least half a reading within the memory."""
         return max(self.readings, 0.5) / self.scans
@@ -222,13 +236,24 @@ class UnexplainedDensity(NamedTuple):
         """Count one more scan (m, 2), its rows of no landmark, and those confirmed."""
         rows = np.array(new, dtype=np.int64)
         cells = self.cells.copy() if new else self.cells
+        lengths = self.farthest, self.known
+        farthest, known = _count_readings(cells, readings, rows, lengths)
         return UnexplainedDensity(
             MEMORY * self.readings + len(new),
             MEMORY * self.scans + 1,
-            _count_readings(cells, readings, rows, self.longest),
+            farthest,
             MEMORY * self.landmarks + landmarks,
+            known,
             cells,
         )
+
+
+def _longest_of(farthest: float, known: float) -> float:
+    """Return the longest range, unless it is far beyond those of known landmarks."""
+    return known if known > 0.0 and BEYOND * known < farthest else farthest
+
+
+_longest_jit = njit_internal(_longest_of)
 
 
 @njit_internal
@@ -253,17 +278,24 @@ def _fill_density(
 
 @jit
 def _count_readings(
-    cells: Array, readings: Array, new: IntArray, longest: float
-) -> float:
-    """Count some readings in their cells; return the longest range read so far [m]."""
-    for bearing, distance in readings:
+    cells: Array, readings: Array, new: IntArray, lengths: tuple[float, float]
+) -> tuple[float, float]:
+    """Count new readings in their cells; return the longest ranges of all scans [m]."""
+    farthest, known = lengths
+    is_new = np.zeros(len(readings), np.bool_)
+    is_new[new] = True
+    for k in range(len(readings)):
+        bearing, distance = readings[k, 0], readings[k, 1]
         if np.isfinite(bearing) and np.isfinite(distance):
-            longest = max(longest, distance)
+            farthest = max(farthest, distance)
+            if not is_new[k]:
+                known = max(known, distance)
+    longest = _longest_jit(farthest, known)
     for k in new:
         bearing, distance = readings[k, 0], readings[k, 1]
         if np.isfinite(bearing) and np.isfinite(distance):
             cells[_cell(bearing, distance, longest)] += 1.0
-    return longest
+    return farthest, known
 
 
 def _masks(name: str, value: Any, shape: tuple[int, ...]) -> Masks:

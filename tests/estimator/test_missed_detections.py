@@ -446,7 +446,8 @@ def test_a_robot_that_turns_blindly_is_probably_lost(association):
         ("lost", (0, 2, 0, 0.1, -1, 0, 0)),
         ("lost", (0, 2, 0, 0.1, 0, -1, 0)),
         ("lost", (0, 2, 0, 0.1, 0, 0, -1)),
-        ("density", (1, 2, 0, 1)),
+        ("density", (1, 2, 0, 1, 8)),
+        ("density", (1, 2, 8, 1, -1)),
         ("unexplained", np.full((SECTORS, RINGS), -1)),
         ("detected", np.full((SECTORS, RINGS), -1)),
         ("detected", np.full((SECTORS, RINGS), 100)),
@@ -459,3 +460,37 @@ def test_a_saved_state_with_impossible_detections_is_refused(name, value):
     state = slam.state_dict() | {f"tentative.{name}": np.array(value, float)}
     with pytest.raises(ValueError, match=rf"tentative\.{name}'\] must be"):
         slam.load_state_dict(state)
+
+
+@pytest.mark.parametrize("scan", [0, 30])
+@pytest.mark.parametrize("wrong", [60.0, 1e12])
+def test_a_single_wrong_range_does_not_stretch_the_cells(scan, wrong):
+    rng = np.random.default_rng(11)
+    landmarks = np.column_stack([np.arange(2.0, 62.0, 4.0), rng.uniform(-5, 5, 15)])
+
+    def drive(is_wrong):
+        slam = make_estimator(
+            "ekf",
+            motion_std=(0.01, 0.01, 0.002),
+            measurement_std=(0.02, 0.05),
+            management={"association": "nearest"},
+        )
+        for k in range(120):
+            dx, dy = (landmarks - (0.5 * k, 0.0)).T
+            readings = np.column_stack([np.arctan2(dy, dx), np.hypot(dx, dy)])
+            readings = readings[readings[:, 1] < LONGEST]
+            if is_wrong and k == scan:
+                readings = np.append(readings, [[0.3, wrong]], axis=0)
+            slam.update(readings)
+            slam.predict((0.5, 0.0))
+        return slam
+
+    clean, other = drive(False), drive(True)
+    assert other.landmark_ids == clean.landmark_ids
+    np.testing.assert_array_equal(other.belief().mean, clean.belief().mean)
+    shares = [
+        detections.seen.sum(axis=0) / detections.expected.sum(axis=0)
+        for detections in (s.candidates.detections for s in (clean, other))
+    ]
+    np.testing.assert_allclose(*shares, atol=0.05)
+    assert not other.probably_lost
