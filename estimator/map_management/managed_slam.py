@@ -177,8 +177,10 @@ class ManagedSlam:
         if type(dt) is not float or dt != 1.0:
             argument_checks.duration(dt)
         candidates, noise = self.candidates, self._motion_noise
-        if len(candidates.tentative.seen):
+        displacement = reading[0], 0.0, reading[1]
+        if noise.motion is not UNICYCLE:
             displacement = noise.motion.moved(reading)
+        if len(candidates.tentative.seen):
             variance = noise.over(displacement, dt)
             moved = candidates.tentative.moved(displacement, variance)
             candidates = replace(candidates, tentative=moved)

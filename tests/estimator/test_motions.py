@@ -3,10 +3,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from comparison import digest
 from numeric_jacobian import numeric_jacobian
 
-from slamgym.estimator import list_estimators, make_batch, make_estimator
+from slamgym.estimator import EkfSlam, list_estimators, make_batch, make_estimator
+from slamgym.estimator.filters.gaussian_map import move_pose
 from slamgym.estimator.filters.imagine import imagine
+from slamgym.estimator.map_management.hypotheses import manage
 from slamgym.estimator.models import motions
 from slamgym.estimator.models.bearing_range import wrap_angle
 from slamgym.estimator.models.motions import (
@@ -180,6 +183,32 @@ def test_a_reading_without_a_finite_displacement_is_refused():
     with pytest.raises(ValueError, match="finite displacement"):
         blows_up.moved((1.0, 0.0))
     assert motions.UNICYCLE.moved((1.0, 0.2)) == (1.0, 0.0, 0.2)
+
+
+class Trusting(EkfSlam):
+    """A filter that checks nothing."""
+
+    def predict(self, odometry, dt=1.0):
+        moved = self.motion.displacement(*odometry)
+        move_pose(self.map.block, *map(float, moved), dt)
+
+
+@pytest.mark.parametrize("association", ["joint", "hypotheses"])
+@pytest.mark.parametrize("confirm", [(1, 1), (2, 2)])
+def test_a_managed_filter_refuses_a_displacement_that_its_filter_would_take(
+    association, confirm
+):
+    blows_up = Motion("blows_up", ("a", "b"), ("", ""), lambda a, b: (a, b, 1e300 * a))
+    slam = manage(Trusting, {"association": association, "confirm": confirm})(
+        motion_std=(0.1, 0.1, 0.1), measurement_std=(0.1, 0.1), motion=blows_up
+    )
+    slam.update([(0.5, 2.0)])
+    before = digest(slam)
+    with pytest.raises(ValueError, match="finite displacement with motion 'blows_up'"):
+        slam.predict((1.0, 0.0))
+    assert digest(slam) == before
+    slam.predict((0.0, 0.5))
+    assert digest(slam) != before
 
 
 def car_drive(steps=25):
