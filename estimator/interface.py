@@ -242,8 +242,7 @@ class Belief:
         frame : {"additive", "invariant"}
             Coordinates in which the filter takes its error to be Gaussian.
         """
-        firsts = [3 + 2 * slots[i] for i in landmark_ids]
-        columns = [0, 1, 2, *(first + axis for first in firsts for axis in (0, 1))]
+        columns = columns_of(slots, landmark_ids)
         P = covariance[np.ix_(columns, columns)]
         return cls(mean[columns], P, tuple(landmark_ids), frame)
 
@@ -314,6 +313,12 @@ class Belief:
         if chosen not in ("additive", "invariant"):
             raise ValueError(f"frame must be 'additive' or 'invariant', got {chosen!r}")
         return chosen
+
+
+def columns_of(slots: Mapping[int, int], landmark_ids: Sequence[int]) -> list[int]:
+    """Return where the pose and some landmarks stand in a state."""
+    firsts = [3 + 2 * slots[i] for i in landmark_ids]
+    return [0, 1, 2, *(first + axis for first in firsts for axis in (0, 1))]
 
 
 class MapView(NamedTuple):

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
-from ..interface import Belief, MapView, UpdateReport
+from ..interface import Belief, MapView, UpdateReport, columns_of
 from ..kernels import kalman_gain as gain
 from ..kernels.kalman_gain import BeliefArrays, Rules, Workspace, new_workspace
 from ..kernels.scan_update import DONE, update_lower_half
@@ -239,17 +239,7 @@ class GaussianMap:
         self.hold(self.used, self.slots, block=self.blank(room, more, readings))
 
     def take_in(self, update: UpdateKernel, readings: Array, ids: IntArray) -> int:
-        """Update the map with a scan; return the status.
-
-        Parameters
-        ----------
-        update : callable
-            The kernel.
-        readings : ndarray, shape (m, 2)
-            Rows (β, r) [rad, m].
-        ids : ndarray of int64, shape (m,)
-            The landmark of each reading.
-        """
+        """Update the map with a scan, as `update_map`; return the status."""
         self._detach_report()
         status = update(self.block, readings, ids)
         if status == NO_ROOM:
@@ -307,10 +297,14 @@ class GaussianMap:
         self, frame: ErrorFrame = "additive", ids: Sequence[int] | None = None
     ) -> Belief:
         """Return a snapshot of the whole map, or of the pose and some landmarks."""
-        if ids is not None:
+        if ids is None:
+            P = self.covariance[: self.size, : self.size]
+            return Belief(self.mean[: self.size], P, tuple(self.slots), frame)
+        if not self.parts.numbers[LOWER] or 8 * len(ids) >= len(self.slots):
             return Belief.marginal(self.mean, self.covariance, self.slots, ids, frame)
-        n = self.size
-        return Belief(self.mean[:n], self.covariance[:n, :n], tuple(self.slots), frame)
+        columns = np.array(columns_of(self.slots, ids))  # in the lower half of P
+        at = np.maximum.outer(columns, columns), np.minimum.outer(columns, columns)
+        return Belief(self.mean[columns], self.parts.covariance[at], tuple(ids), frame)
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the used part of the arrays."""

@@ -7,7 +7,7 @@ from weakref import ref
 
 import numpy as np
 import pytest
-from comparison import digest
+from comparison import assert_same_bits, digest, part_of
 
 from slamgym.estimator import EkfSlam, UpdateReport, make_estimator
 from slamgym.estimator.filters.gaussian_map import LOWER
@@ -121,6 +121,20 @@ def test_a_large_covariance_is_completed_when_it_is_read(name, options):
     assert slam.map.size > LARGE
     np.testing.assert_array_equal(slam.map.mean, read.map.mean)
     np.testing.assert_array_equal(slam.map.covariance, read.map.covariance)
+
+
+@pytest.mark.parametrize("seen", [[], [120, 3, 77], list(range(140, 20, -1))])
+def test_a_part_of_a_large_belief_is_read_from_the_lower_half(seen):
+    slam = make_estimator("invariant", **NOISE)
+    for k, (u, z, ids) in enumerate(scans(0, list(range(150)), steps=12, most=150)):
+        few = len(ids) if k < 9 else 30
+        slam.predict(u)
+        slam.update(z[:few], ids[:few])
+    assert slam.map.parts.numbers[LOWER]
+    part = slam.belief(seen)
+    is_whole = 8 * len(seen) >= len(slam.landmark_ids)
+    assert slam.map.parts.numbers[LOWER] == (not is_whole)
+    assert_same_bits(part, part_of(slam.belief(), seen))
 
 
 def test_the_parts_of_a_memory_are_apart():
