@@ -300,7 +300,10 @@ def extended(places: TwoPlaces, match: Match) -> Match:
     every = Match(np.append(match.local, i), np.append(match.older, p))
     r, S = _offsets(places, every, phi)
     k = 2 * len(match.local)
-    gain = np.linalg.solve(S[:k, :k], S[:k, k:]).T
+    try:
+        gain = np.linalg.solve(S[:k, :k], S[:k, k:]).T
+    except np.linalg.LinAlgError:  # `misfit` refuses the match
+        return match
     r_left, own = (r[k:] - gain @ r[:k]).reshape(-1, 2, 1), np.arange(len(i))
     S_left = _blocks(S[k:, k:] - gain @ S[:k, k:])[own, own]
     sound = np.flatnonzero(np.linalg.det(S_left) > 0)

@@ -259,6 +259,21 @@ def test_bad_rules_are_refused_by_name(field, value):
         Constellations(**{field: value})
 
 
+@pytest.mark.parametrize("others", [0, 1])
+def test_a_covariance_without_rank_recognises_no_place(others):
+    a = np.vstack([shifted(GROUP, 2.0), np.full((others, 2), 40.0)])
+    b = np.vstack([GROUP, np.full((others, 2), -30.0)])
+    places = two_places(a, b)
+    k = len(GROUP)
+    may = np.eye(len(a), dtype=bool) & (np.arange(len(a)) < k)
+    rules = Constellations(least=5)
+    assert len(match_constellations(places, may, rules).local) == k
+    certain = places._replace(covariance=np.zeros_like(places.covariance))
+    same = Match(np.arange(k), np.arange(k))
+    assert constellations.misfit(certain, same) == (np.inf, np.inf)
+    assert match_constellations(certain, may, rules) is None
+
+
 @pytest.mark.parametrize("crowded", [None, "local", "older"])
 def test_a_place_is_filled_where_neither_map_has_many_landmarks_more(crowded):
     square = np.array([[2.0, 2.0], [-2.0, 2.0], [-2.0, -2.0], [2.0, -2.0]])
