@@ -109,16 +109,17 @@ class Drive:
             raise ValueError(
                 f"measurement_std must be > 0 to smooth, got ({std[0]:g}, {std[1]:g})"
             )
-        self.initial_pose = argument_checks.finite_vector(
-            "initial_pose", initial_pose, 3
-        )
-        self.initial_pose_std = argument_checks.standard_deviations(
-            "initial_pose_std", initial_pose_std, 3
-        )
+        self.start_at(initial_pose, initial_pose_std)
         self._motions: list[Motion] = [Motion((), np.zeros(3), np.zeros((3, 3)))]
         self._sightings: list[list[Sightings]] = [[]]
         self._pending: list[tuple[float, float, float]] = []
         self._observed: dict[int, list[PoseReading]] = {}  # by the pose
+
+    def start_at(self, pose: ArrayLike, std: ArrayLike) -> None:
+        """Set mean and standard deviation (3,) of the first pose [m, m, rad]."""
+        checked = argument_checks.standard_deviations("initial_pose_std", std, 3)
+        self.initial_pose = argument_checks.finite_vector("initial_pose", pose, 3)
+        self.initial_pose_std = checked
 
     @property
     def poses(self) -> int:

@@ -84,9 +84,7 @@ class RecordedSlam:
         with undone_on_error(self.bookmark()):
             self._slam.reset(pose, pose_std)
             first, std = np.array(pose, dtype=float), np.array(pose_std, dtype=float)
-            start = {"initial_pose": first, "initial_pose_std": std}
-            self._noise = self._noise | start
-            self._last = None
+            self._last = Event(None, "start_at", (first, std))
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad]; dt multiplies the noise variance."""
@@ -177,7 +175,11 @@ class RecordedSlam:
         return interface.mapped_ids(self._slam)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the filter's state, and the events until now as one object."""
+        """Return the filter's state, and the events until now as one object.
+
+        The object is of this process, so that a state takes no time that grows with the
+        drive; `numpy.load` refuses it.
+        """
         history = np.empty((), dtype=object)
         history[()] = self._last
         return self._slam.state_dict() | {HISTORY: history}

@@ -516,6 +516,11 @@ def test_a_filter_that_goes_back_takes_its_drive_back():
     slam.reset((1.0, 0, 0), (0, 0, 0))
     slam.update([(0.1, 2.0)], [0])
     assert slam.smoothed().poses.tolist() == [[1.0, 0.0, 0.0]]
+    other = SmoothingSlam(**NOISE)
+    other.load_state_dict(slam.state_dict())
+    assert other.smoothed().poses.tolist() == [[1.0, 0.0, 0.0]]
+    slam.load_state_dict(before)
+    assert repr(slam.smoothed()) == repr(expected)
 
 
 def test_recording_does_not_change_the_filter():
