@@ -310,9 +310,10 @@ class HypothesisSlam:
                 raise errors[0]
             return self._take_over(distinct(kept, self._policy.hypotheses))
 
-        report = self._carry_out(slams, take, then)
-        self._keep(self.hypotheses, [*before, *slams])
-        return report
+        try:
+            return self._carry_out(slams, take, then)
+        finally:
+            self._keep(self.hypotheses, [*before, *slams])
 
     def _take_over(self, hypotheses: list[Hypothesis]) -> UpdateReport:
         """Continue with hypotheses, the best first; return the report of this one."""

@@ -358,6 +358,30 @@ def test_a_sighting_of_clutter_does_not_drag_a_new_landmark_along():
     ]
 
 
+def test_an_interrupted_update_loses_no_filter(slippery_drive, monkeypatch):
+    world, scans = slippery_drive
+    slam = make(world, association="hypotheses")
+    pool, made, take_over = filters_of(slam), [], HypothesisSlam._take_over
+    make_one = pool._make
+    pool._make = lambda: made.append(0) or make_one()
+
+    def interrupted(self, hypotheses):
+        monkeypatch.undo()
+        if len(made) > 1:
+            raise KeyboardInterrupt
+        return take_over(self, hypotheses)
+
+    def go_on():
+        for odometry, readings, _ in scans:
+            slam.predict(odometry)
+            monkeypatch.setattr(HypothesisSlam, "_take_over", interrupted)
+            slam.update(readings)
+
+    with pytest.raises(KeyboardInterrupt):
+        go_on()
+    assert len(slam.hypotheses) + len(pool) == 1 + len(made)
+
+
 class WithoutInnovations(EkfSlam):
     """Reports which landmarks it used, and nothing about them."""
 
