@@ -18,7 +18,6 @@ from .filters import ekf
 from .filters.batch import BatchSlam
 from .filters.ideal import IdealEkfSlam
 from .filters.robocentric import RobocentricEkfSlam
-from .filters.unscented import UnscentedSlam
 from .interface import SlamEstimator
 from .models.sensors import NUMBERS, sensor_in
 from .peers.catalogue import PEERS
@@ -300,7 +299,7 @@ _factories |= {
     "first_estimates": ekf.FirstEstimatesEkfSlam,
     "observability_constrained": ekf.ObservabilityConstrainedEkfSlam,
     "iterated": ekf.IteratedEkfSlam,
-    "unscented": UnscentedSlam,
+    "unscented": f"{__package__}.filters.unscented:UnscentedSlam",
     "robocentric": RobocentricEkfSlam,
     "ideal": IdealEkfSlam,
     "compressed": f"{_LARGE}.compressed.compressed_slam:CompressedEkfSlam",

@@ -403,11 +403,9 @@ class BatchSlam(BatchOfBeliefs):
 
 def can_batch(estimator: object) -> bool:
     """Whether a filter consists of the shared kernels only, and can run in batches."""
-    return (
-        isinstance(estimator, EkfSlam)
-        and type(estimator).predict is EkfSlam.predict
-        and type(estimator).update is EkfSlam.update
-        and type(estimator).belief is EkfSlam.belief
+    shared = ("predict", "update", "belief", "_move_pose", "_update_map")
+    return isinstance(estimator, EkfSlam) and all(
+        getattr(type(estimator), name) is getattr(EkfSlam, name) for name in shared
     )
 
 

@@ -8,7 +8,7 @@ in their error frame: `InvariantEkfSlam`, `FirstEstimatesEkfSlam`,
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import inf, log1p
 from statistics import NormalDist
 from typing import Any, ClassVar, NoReturn
@@ -300,8 +300,9 @@ class EkfSlam(MapFilter):
     _linearisation: ClassVar[int] = AT_ESTIMATE
     _frame: ClassVar[int] = ADDITIVE
 
-    #: The kernel: screen, correct, add new landmarks.
+    #: The kernels of both steps.
     _update_map: ClassVar[UpdateKernel] = staticmethod(update_map)
+    _move_pose: ClassVar[Callable[..., None]] = staticmethod(move_pose)
 
     @former_noise
     def __init__(
@@ -354,7 +355,7 @@ class EkfSlam(MapFilter):
             forward, sideways, turn = noise.motion.moved(odometry)
         if not (type(dt) is float and dt == 1.0 and noise.at_rest):
             weight = noise.weight((forward, sideways, turn), dt)
-        move_pose(self.map.block, forward, sideways, turn, weight)
+        self._move_pose(self.map.block, forward, sideways, turn, weight)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None

@@ -2,31 +2,247 @@
 
 from __future__ import annotations
 
-from itertools import compress
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ...arrays import Array, BoolArray, IntArray
-from ..interface import UpdateReport
-from ..kernels.kalman_gain import BeliefArrays
-from ..models.bearing_range import read_distance_jit
-from ..models.rigid_motion import composed
-from ..models.sensors import Sensor, for_sensor
-from ..support import argument_checks
-from ..support.argument_checks import LandmarkIds
-from ..support.undo import undone_on_error
-from .ekf import EkfSlam, reading_variances
-from .gaussian_map import FIRST_LANDMARKS
+from ...arrays import Array, IntArray
+from ...jit import njit_internal, specialised
+from ..kernels.kalman_gain import (
+    COLUMN,
+    CORRECTION,
+    FIRST,
+    GATED,
+    INNOVATION,
+    JACOBIAN,
+    LANDMARK_X,
+    OUTCOME,
+    READING,
+    ROOT,
+    SINGULAR,
+    USED,
+    VARIANCE,
+    WHITE,
+    BeliefArrays,
+    Rules,
+    Workspace,
+    begin_correction,
+    downdate,
+    restore_upper,
+)
+from ..kernels.scan_update import (
+    DONE,
+    add_landmarks,
+    as_rules,
+    screen,
+    squared_norm,
+    squared_ratio,
+    update_lower_half,
+    variances,
+)
+from ..models.bearing_range import difference_jit, expected_reading_jit
+from ..models.rigid_motion import composed_jit, predict
+from .ekf import EkfSlam
+from .gaussian_map import move_pose, update_map
+
+
+@njit_internal
+def symmetric_root(covariance: Array, size: int, points: int) -> Array:
+    """Return √points times the symmetric root of P, read from its lower half."""
+    values, vectors = np.linalg.eigh(covariance[:size, :size])
+    root: Array = vectors * np.sqrt(points * np.maximum(values, 0.0)) @ vectors.T
+    return root
+
+
+@njit_internal
+def predict_through_points(
+    mean: Array,
+    covariance: Array,
+    reference: Array,
+    size: int,
+    forward: float,
+    sideways: float,
+    turn: float,
+    motion_variance: Array,
+    linearisation: int,
+) -> None:
+    """Move a belief as :func:`.rigid_motion.predict` does, without Jacobians."""
+    points = size + 3  # and as many opposite ones
+    root = symmetric_root(covariance, size, points)
+    deviations = np.zeros((6, points))  # of the pose, and of its motion
+    deviations[:3, :size] = root[:3]
+    for i in range(3):
+        deviations[3 + i, size + i] = np.sqrt(points * motion_variance[i])
+    poses = np.empty((3, 2 * points))
+    for k in range(2 * points):
+        sign, e = 1.0 if k < points else -1.0, deviations[:, k % points]
+        poses[0, k], poses[1, k], poses[2, k], _, _ = composed_jit(
+            mean[0] + sign * e[0],
+            mean[1] + sign * e[1],
+            mean[2] + sign * e[2],
+            forward + sign * e[3],
+            sideways + sign * e[4],
+            turn + sign * e[5],
+        )
+    for i in range(3):
+        mean[i] = poses[i].mean()
+        poses[i] -= mean[i]
+    cross = (poses[:, :size] - poses[:, points : points + size]) @ root
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] = (poses[i] * poses[j]).mean()
+        for j in range(3, size):
+            covariance[i, j] = covariance[j, i] = cross[i, j] / (2 * points)
+
+
+@njit_internal
+def update_through_points(
+    arrays: tuple[Array, Array, Array],
+    size: int,
+    readings: Array,
+    count: int,
+    ledger: IntArray,
+    work_arrays: tuple[Array, Array],
+    rule_values: Array,
+) -> tuple[int, int, float]:
+    """Update one belief as `update_lower_half` does, without Jacobians."""
+    belief, workspace = BeliefArrays(*arrays), Workspace(*work_arrays)
+    rows, rules = workspace.rows, as_rules(rule_values)
+    used = screen(belief, readings, count, rules, np.inf, rows, ledger)
+    if used < 0:
+        return used, 0, 0.0
+    if used > 0:
+        root = symmetric_root(belief.covariance, size, size)
+        spread, used = look_from_points(belief.mean, root, rules, rows, ledger, count)
+        failed = condition(belief, root, spread[: 2 * used], rows, ledger[COLUMN])
+        if failed >= 0:
+            return failed // 2, used, 0.0
+    add_landmarks(belief, size, readings, count, rules, ledger)
+    return DONE, used, squared_norm(rows, used)
+
+
+@njit_internal
+def look_from_points(
+    mean: Array, root: Array, rules: Rules, rows: Array, ledger: IntArray, count: int
+) -> tuple[Array, int]:
+    """Return what each point reads, less the average of all points, (2m, 2n), and m.
+
+    The system receives ν and the diagonal of Q, at the mean distance of the points, of
+    the m readings within the gate.
+    """
+    size, system, read, used = len(root), rows[FIRST:], 0, 0
+    spread = np.empty((2 * count, 2 * size))
+    for k in range(count):
+        if ledger[OUTCOME, k] != USED:
+            continue
+        row, c, meta = 2 * used, ledger[COLUMN, read], system[2 * read : 2 * read + 2]
+        z0, z1 = meta[0, READING], meta[1, READING]
+        v0, v1 = meta[0, VARIANCE], meta[1, VARIANCE]
+        read, distance, first, second = read + 1, 0.0, spread[row], spread[row + 1]
+        dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
+        e0, e1 = expected_reading_jit(dx, dy, mean[2])
+        for i in range(2 * size):
+            sign, e = 1.0 if i < size else -1.0, root[i % size]
+            to_x, to_y = dx + sign * (e[c] - e[0]), dy + sign * (e[c + 1] - e[1])
+            r0, r1 = expected_reading_jit(to_x, to_y, mean[2] + sign * e[2])
+            first[i], second[i] = difference_jit(r0, r1, e0, e1)
+            distance += np.sqrt(to_x * to_x + to_y * to_y)
+        if not rules.noise_as_read:
+            v0, v1 = variances(rules, distance / (2 * size))
+        a0, a1 = first.mean(), second.mean()
+        first -= a0
+        second -= a1
+        n0, n1 = difference_jit(z0, z1, e0 + a0, e1 + a1)
+        if rules.gate < np.inf:
+            s00, s10 = (first * first).mean() + v0, (first * second).mean()
+            s11 = (second * second).mean() + v1
+            if not squared_ratio(n0, n1, s00, s10, s11) <= rules.gate:
+                ledger[OUTCOME, k] = GATED
+                continue
+        system[row, INNOVATION], system[row + 1, INNOVATION] = n0, n1
+        system[row, VARIANCE], system[row + 1, VARIANCE] = v0, v1
+        ledger[COLUMN, used] = c
+        used += 1
+    return spread, used
+
+
+@njit_internal
+def condition(
+    belief: BeliefArrays, root: Array, spread: Array, rows: Array, columns: IntArray
+) -> int:
+    """Condition a belief on the readings whose spread Δ the points have.
+
+    ::
+
+        S = Δ Δᵀ / 2n + Q = L Lᵀ,   A = L⁻¹ Δ Dᵀ / 2n,   w = L⁻¹ ν
+        x ← x + Aᵀ w,   P ← P − Aᵀ A
+
+    with the deviations D of the points.  Returns -1, or the row at which S is not
+    positive definite; the belief is then as before.
+    """
+    (bottom, points), size, system = spread.shape, len(root), rows[FIRST:]
+    begin_correction(size, rows, system, bottom)
+    delta, A = rows[CORRECTION], (spread[:, :size] - spread[:, size:]) @ root
+    L = spread @ spread.T
+    for i in range(bottom):
+        row, w = system[i], system[i, INNOVATION]
+        row[: len(belief.mean)] = 0.0
+        for j in range(size):
+            row[j] = A[i, j] / points
+        own = L[i, i] / points + row[VARIANCE]
+        rest = own
+        for k in range(i):
+            factor = L[i, k] / points
+            for j in range(k):
+                factor -= L[i, j] * L[k, j]
+            L[i, k] = factor = factor / L[k, k]
+            rest -= factor * factor
+            w -= factor * system[k, WHITE]
+            for j in range(size):
+                row[j] -= factor * system[k, j]
+        if not rest > SINGULAR * own:
+            return i
+        L[i, i] = root_of_rest = np.sqrt(rest)
+        row[WHITE] = w / root_of_rest
+        for j in range(size):
+            row[j] /= root_of_rest
+            delta[j] += row[WHITE] * row[j]
+    for j in range(size):
+        belief.mean[j] += delta[j]
+    downdate(belief.covariance, size, system, 0, bottom)
+    restore_upper(belief.covariance, size)
+    record(L, system, columns)
+    return -1
+
+
+@njit_internal
+def record(L: Array, system: Array, columns: IntArray) -> None:
+    """Leave L where a report looks for H Aᵀ, with H that selects a column."""
+    for i in range(len(L)):
+        c = columns[i // 2] + i % 2
+        system[i, ROOT], system[i, ROOT + 1] = L[i, i & -2], L[i, i | 1] * (i % 2)
+        system[i, JACOBIAN : JACOBIAN + 5] = 0.0
+        system[i, LANDMARK_X + i % 2] = 1.0
+        system[: len(L), c] = L[i]
+
+
+INSTEAD: dict[Callable[..., Any], Callable[..., Any]] = {
+    predict: predict_through_points,
+    update_lower_half: update_through_points,
+}
+move_by_points = specialised(move_pose, INSTEAD, "unscented")
+update_by_points = specialised(update_map, INSTEAD, "unscented")
 
 
 class UnscentedSlam(EkfSlam):
     """Unscented filter with cubature points and wrapped angles; dense, O(n³) per step.
 
     The models transform the 2N points mean ± √N Lᵢ, L Lᵀ = P, each of weight 1/2N [1]_
-    [2]_.  To predict, the state is extended by the motion noise.  New landmarks are
-    initialised by linearisation, as in ``ekf``.  The filter needs no Jacobians, but is
-    as overconfident about its heading as the EKF: use it for comparison only.
+    [2]_.  L is symmetric.  To predict, the state is extended by the motion noise.  New
+    landmarks are initialised by linearisation, as in ``ekf``.  The filter needs no
+    Jacobians, but is as overconfident about its heading as the EKF: use it for
+    comparison only.
 
     Parameters are those of :class:`EkfSlam`.
 
@@ -37,164 +253,5 @@ class UnscentedSlam(EkfSlam):
     .. [2] I. Arasaratnam, S. Haykin, Cubature Kalman filters, IEEE TAC 54(6), 2009.
     """
 
-    _report = UpdateReport()
-
-    def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
-        """Move by odometry (d, α) [m, rad], through the cubature points."""
-        forward, sideways, turn = moved = self.motion.moved(odometry)
-        variance = self._motion_noise.over(moved, dt)
-        mean, P, reference = (array.copy() for array in self.map.used)
-        n = len(mean)
-        root = np.zeros((n + 3, n + 3))
-        root[:n, :n] = _square_root(P)
-        root[n:, n:] = np.diag(np.sqrt(variance))
-        deviations = np.sqrt(n + 3) * np.concatenate([root, -root], axis=1)
-        x, y, heading = mean[:3, None] + deviations[:3]
-        along, across, turned = deviations[n:]
-        moves = forward + along, sideways + across, turn
-        x, y, heading, _, _ = composed(x, y, heading, *moves)
-        poses = np.stack([x, y, heading + turned])
-        mean[:3] = poses.mean(axis=1)
-        spread = poses - mean[:3, None]
-        share = deviations.shape[1]
-        P[:3, :3] = spread @ spread.T / share
-        P[:3, 3:] = spread @ deviations[3:n].T / share
-        P[3:, :3] = P[:3, 3:].T
-        self.map.hold(BeliefArrays(mean, P, reference), self.map.slots, steps=1)
-
-    def update(
-        self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
-    ) -> UpdateReport:
-        """Correct the belief with one scan, then add its new landmarks to the map."""
-        readings = argument_checks.scan(measurements, self.sensor.columns)
-        ids = argument_checks.given_identities(landmark_ids, len(readings), self)
-        argument_checks.refuse_unusable(readings, ids)
-        slots, least = self.map.slots, self.rules.min_range
-        mapped = np.array([i in slots for i in ids], dtype=bool)
-        usable = self._read_distances(readings) >= least
-        expected, near = self._expected_ranges(
-            [slots[i] for i in compress(ids, mapped)]
-        )
-        usable[mapped] &= expected >= least
-        known, skipped = mapped & usable, mapped & ~usable
-        corrected, others = UpdateReport(), list(compress(ids, ~mapped))
-        needed = max(FIRST_LANDMARKS, len(slots) + len(others))
-        with undone_on_error(self.bookmark()):  # what follows changes a copy
-            block = self.map.blank(needed, readings=len(others))
-            self.map.hold(self.map.used, slots, block=block)
-            if known.any():
-                near = near[usable[mapped]]
-                corrected = self._correct(
-                    readings[known], [*compress(ids, known)], near
-                )
-            added = super().update(readings[~mapped], others)
-            self._report = corrected.replace(
-                added_ids=added.added_ids,
-                skipped_ids=(*compress(ids, skipped), *added.skipped_ids),
-            )
-        return self._report
-
-    def report(self) -> UpdateReport:
-        """Return the report of the last update once more."""
-        return self._report
-
-    def _read_distances(self, readings: Array) -> Array:
-        """Return the distances of landmarks by readings (m, 2) [m], inf if unknown."""
-        read = for_sensor(read_distance_jit, self.sensor)
-        return np.array([read(first, second) for first, second in readings])
-
-    def _expected_ranges(self, slots: list[int]) -> tuple[Array, BoolArray]:
-        """Return the expected ranges of landmarks (m,) [m], and which are near.
-
-        Near are those within 10 σ of the robot.  σ is the largest standard deviation
-        of the error e_l − e_p − J δ e_θ of the offset δ from the robot to a landmark.
-        """
-        own = np.zeros((len(slots), 5), dtype=np.int64)
-        own[:, 1:] = 1, 2, 3, 4
-        own[:, 3:] += 2 * np.array(slots, dtype=np.int64)[:, None]
-        offsets = self.map.mean[own[:, 3:]] - self.map.mean[:2]
-        H = np.zeros((len(slots), 2, 5))
-        H[:, (0, 1), (0, 1)], H[:, (0, 1), (3, 4)] = -1.0, 1.0
-        H[:, 0, 2], H[:, 1, 2] = offsets[:, 1], -offsets[:, 0]
-        P = self.map.covariance[own[:, :, None], own[:, None]]
-        largest = np.linalg.eigvalsh(H @ P @ H.transpose(0, 2, 1))[:, -1]
-        expected = np.hypot(*offsets.T)
-        return expected, expected < 10 * np.sqrt(np.maximum(largest, 0.0))
-
-    def _correct(
-        self, readings: Array, ids: list[int], near: BoolArray
-    ) -> UpdateReport:
-        n = self.map.size
-        columns = 3 + 2 * np.array([self.map.slots[i] for i in ids])
-        root = _square_root(self.map.covariance[:n, :n])
-        deviations = np.sqrt(n) * np.concatenate([root, -root], axis=1)
-        mean, sensor = self.map.mean[:n], self.sensor
-        expected, spread, distances = _through_sensor(sensor, mean, deviations, columns)
-        innovation = sensor.difference(readings, expected)
-        if self.rules.noise_as_read:
-            distances = self._read_distances(readings)
-        noise = reading_variances(self.rules, distances, sensor)
-        kept = self._within_gate(innovation, spread, noise)
-        rows = np.repeat(kept, 2)
-        spread, nu = spread[rows], innovation.ravel()[rows]
-        S = spread @ spread.T / spread.shape[1] + np.diag(noise.ravel()[rows])
-        factor = _factor(S, list(compress(ids, kept)))
-        cross = spread @ deviations.T / spread.shape[1]
-        gains = np.linalg.solve(factor, cross)
-        white = np.linalg.solve(factor, nu)
-        self.map.mean[:n] += gains.T @ white
-        self.map.covariance[:n, :n] -= gains.T @ gains
-        return UpdateReport(
-            nis=float(white @ white),
-            degrees_of_freedom=len(nu) * sensor.size // 2,
-            associated_ids=tuple(compress(ids, kept)),
-            rejected_ids=tuple(compress(ids, ~kept)),
-            near_ids=tuple(compress(ids, kept & near)),
-            innovation=innovation[kept],
-            factor=factor,
-        )
-
-    def _within_gate(self, innovation: Array, spread: Array, noise: Array) -> BoolArray:
-        if not np.isfinite(self.rules.gate):
-            return np.ones(len(innovation), dtype=bool)
-        pairs = spread.reshape(len(innovation), 2, -1)
-        own = pairs @ pairs.transpose(0, 2, 1) / pairs.shape[2]
-        own += noise[:, :, None] * np.eye(2)
-        weighted = np.linalg.solve(own, innovation[..., None])[..., 0]
-        return np.asarray((innovation * weighted).sum(axis=1) <= self.rules.gate)
-
-
-def _through_sensor(
-    sensor: Sensor, mean: Array, deviations: Array, columns: IntArray
-) -> tuple[Array, Array, Array]:
-    """Predict the readings of points (n, N): mean (m, 2) and deviations (2m, N).
-
-    The mean distance of the landmarks, (m,), follows.
-    """
-    points = np.concatenate([mean[:, None], mean[:, None] + deviations], axis=1)
-    dx, dy = points[columns] - points[0], points[columns + 1] - points[1]
-    cos, sin = np.cos(points[2]), np.sin(points[2])
-    read = sensor.read(cos * dx + sin * dy, cos * dy - sin * dx)
-    apart = sensor.difference(read[:, 1:], read[:, :1])
-    average = apart.mean(axis=1)
-    spread = (apart - average[:, None]).transpose(0, 2, 1)
-    distances = np.hypot(dx, dy)[:, 1:].mean(axis=1)
-    return read[:, 0] + average, spread.reshape(2 * len(columns), -1), distances
-
-
-def _factor(S: Array, ids: list[int]) -> Array:
-    """Return the Cholesky factor of S; an error names the reading that spoils it."""
-    try:
-        return np.asarray(np.linalg.cholesky(S))
-    except np.linalg.LinAlgError:
-        smallest = [
-            np.linalg.eigvalsh(S[: 2 * k, : 2 * k])[0] for k in range(1, len(ids))
-        ]
-        at = next((k for k, value in enumerate(smallest) if value <= 0), len(ids) - 1)
-        raise argument_checks.not_positive_definite(ids[at]) from None
-
-
-def _square_root(covariance: Array) -> Array:
-    """Return the symmetric square root of a positive semidefinite matrix."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+    _update_map = staticmethod(update_by_points)
+    _move_pose = staticmethod(move_by_points)

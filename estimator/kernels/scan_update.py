@@ -130,18 +130,23 @@ def update_lower_half(
     """
     belief, workspace = BeliefArrays(*arrays), Workspace(*work_arrays)
     rows, rules = workspace.rows, as_rules(rule_values)
-    for k in range(count):
-        if not (usable(readings[k, 0]) and usable(readings[k, 1])):
-            return NOT_USABLE, 0, 0.0
-    used = screen(belief, readings, count, rules, rows, ledger)
+    used = screen(belief, readings, count, rules, rules.gate, rows, ledger)
+    if used < 0:
+        return used, 0, 0.0
     failed = correct(belief, size, ledger, rules, workspace, used)
     if failed >= 0:
         return failed // 2, used, 0.0
-    nis = 0.0  # of the readings in use, linearised at the prior
+    add_landmarks(belief, size, readings, count, rules, ledger)
+    return DONE, used, squared_norm(rows, used)
+
+
+@njit_inlined
+def squared_norm(rows: Array, used: int) -> float:
+    """Return the NIS of the readings in use, linearised at the prior."""
+    nis = 0.0
     for row in range(FIRST, FIRST + 2 * used):
         nis += rows[row, WHITE] * rows[row, WHITE]
-    add_landmarks(belief, size, readings, count, rules, ledger)
-    return DONE, used, nis
+    return nis
 
 
 @njit_inlined
@@ -200,13 +205,17 @@ def screen(
     readings: Array,
     count: int,
     rules: Rules,
+    gate: float,
     rows: Array,
     ledger: IntArray,
 ) -> int:
     """Decide the outcome of every reading and collect those to use.
 
-    The belief stays as it is.  Returns how many readings are in use.
+    The belief stays as it is.  Returns how many readings are in use, or NOT_USABLE.
     """
+    for k in range(count):
+        if not (usable(readings[k, 0]) and usable(readings[k, 1])):
+            return NOT_USABLE
     mean, system, used = belief.mean, rows[FIRST:], 0
     for k in range(count):
         z0, z1 = readings[k, 0], readings[k, 1]
@@ -231,11 +240,9 @@ def screen(
         at = distance if rules.noise_as_read else expected
         system[row, VARIANCE], system[row + 1, VARIANCE] = variances(rules, at)
         ledger[NEAR, k] = is_near(mean, belief.covariance, column)
-        if rules.gate < np.inf:
+        if gate < np.inf:
             linearise(mean, belief.reference, rules.linearisation, system, row, column)
-            if not squared_innovation(belief.covariance, system, row, column) <= (
-                rules.gate
-            ):
+            if not squared_innovation(belief.covariance, system, row, column) <= gate:
                 ledger[OUTCOME, k] = GATED
                 continue
         used += 1
@@ -271,9 +278,14 @@ def squared_innovation(covariance: Array, system: Array, row: int, c: int) -> fl
     """Return the NIS of one reading by itself, νᵀ S⁻¹ ν, for the gate."""
     s00, s10, s11 = own_covariance(covariance, system, row, c)
     n0, n1 = system[row, INNOVATION], system[row + 1, INNOVATION]
+    return squared_ratio(n0, n1, s00, s10, s11)
+
+
+@njit_inlined
+def squared_ratio(n0: float, n1: float, s00: float, s10: float, s11: float) -> float:
+    """Return νᵀ S⁻¹ ν of one reading."""
     weighted = n0 * n0 * s11 - 2 * n0 * n1 * s10 + n1 * n1 * s00
-    nis: float = weighted / (s00 * s11 - s10 * s10)
-    return nis
+    return weighted / (s00 * s11 - s10 * s10)
 
 
 @njit_internal

@@ -389,7 +389,7 @@ def test_a_landmark_is_near_within_ten_standard_deviations(seed, share):
 
 
 def test_a_reading_is_screened_at_the_expected_distance(monkeypatch):
-    for name in ("is_near", "variances"):
+    for name in ("usable", "is_near", "variances"):
         monkeypatch.setattr(screening, name, plain(getattr(screening, name)))
     rules = Rules(first_std=0.1, second_std=0.2, std_per_metre=0.1, std_metres=0.3)
     mean = np.array([1.0, 2.0, 0.5, 9.0, 9.0, 4.0, 6.0])  # 5 m from the second landmark
@@ -398,7 +398,9 @@ def test_a_reading_is_screened_at_the_expected_distance(monkeypatch):
     ledger = np.full((LEDGER_HEIGHT, 2), 7)
     ledger[SLOT] = 1, -1
     readings = np.array([(0.2, 4.0), (0.1, 3.0)])
-    assert plain(screening.screen)(belief, readings, 2, rules, rows, ledger) == 1
+    assert (
+        plain(screening.screen)(belief, readings, 2, rules, np.inf, rows, ledger) == 1
+    )
     found = rows[FIRST : FIRST + 2, VARIANCE]
     np.testing.assert_allclose(found, ((0.1 + 0.3 / 5) ** 2, (0.2 + 0.1 * 5) ** 2))
     assert ledger[OUTCOME].tolist() == [USED, ADDED]

@@ -421,6 +421,36 @@ def test_gate_rejects_an_outlier_in_every_filter(case):
     assert slam.update(wrong, IDS).rejected_ids == (3,)
 
 
+def test_the_unscented_filter_gates_and_reports_as_its_slow_dense_twin():
+    landmarks = np.random.default_rng(8).uniform(-12, 12, (13, 2))
+    rng, rejected, counts = np.random.default_rng(3), 0, set()
+    twin = FAMILY["unscented"](MOTION_STD, MEASUREMENT_STD, START_STD)
+    twin.gate = -2 * np.log(1 - 0.8)
+    fast = make("unscented", initial_pose_std=START_STD, gate_probability=0.8)
+    for odometry, readings, _ in drive(2, 40, landmarks=landmarks):
+        seen = rng.permutation(13)[: rng.integers(6)]
+        mapped = [k for k, i in enumerate(seen) if i in twin.ids]
+        for each in (fast, twin):
+            each.predict(odometry)
+        report, nis = (
+            fast.update(readings[seen], seen),
+            twin.update(readings[seen], seen.tolist()),
+        )
+        counts.add(len(mapped))
+        if mapped:
+            assert report.rejected_ids == twin.rejected
+            found = report.innovation.ravel(), report.innovation_covariance
+            np.testing.assert_allclose(found[0], twin.nu, rtol=0, atol=1e-9)
+            np.testing.assert_allclose(found[1], twin.S, rtol=0, atol=1e-9)
+            assert report.nis == pytest.approx(nis, rel=1e-6, abs=1e-9)
+        rejected += len(report.rejected_ids)
+    assert rejected > 5
+    assert counts >= {0, 1, 2, 3}
+    mean, covariance = belief_of(twin)
+    np.testing.assert_allclose(fast.belief().mean, mean, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(fast.belief().covariance, covariance, rtol=0, atol=1e-10)
+
+
 @pytest.mark.parametrize("value", [0, 1.5, -2])
 def test_iterations_must_be_a_positive_whole_number(value):
     with pytest.raises(ValueError, match="iterations must be a whole number >= 1"):

@@ -98,6 +98,7 @@ def test_a_report_keeps_its_results_while_the_filter_goes_on(name):
 @pytest.mark.parametrize(
     ("name", "options"),
     [(name, {}) for name in ("ekf", "invariant", "iterated", "robocentric")]
+    + [("unscented", {}), ("unscented", {"gate_probability": 0.99})]
     + [(name, {}) for name in ("first_estimates", "observability_constrained")]
     + [("ekf", {"gate_probability": 0.99}), ("invariant", {"iterations": 1})],
 )

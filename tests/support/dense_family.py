@@ -269,6 +269,8 @@ class DenseIdeal(DenseFirstEstimates):
 class DenseUnscented(DenseEkf):
     """Cubature points one by one."""
 
+    gate = np.inf  # largest NIS of one reading by itself
+
     def points(self, P):
         root = np.real(sqrtm(P)) if P.any() else np.zeros_like(P)
         n = len(P)
@@ -306,6 +308,12 @@ class DenseUnscented(DenseEkf):
         nu = self.difference(readings, expected)[:, : len(self.Q)].ravel()
         S = spread.T @ spread / len(seen) + np.kron(np.eye(len(ids)), self.Q)
         C = offsets.T @ spread / len(seen)
+        own = [slice(k, k + len(self.Q)) for k in range(0, len(nu), len(self.Q))]
+        alone = [nu[k] @ np.linalg.solve(S[k, k], nu[k]) <= self.gate for k in own]
+        self.rejected = tuple(i for i, kept in zip(ids, alone, strict=True) if not kept)
+        rows = np.repeat(alone, len(self.Q))
+        self.nu, self.S = nu, S = nu[rows], S[np.ix_(rows, rows)]
+        C = C[:, rows]
         self.mean = self.mean + C @ np.linalg.solve(S, nu)
         self.P = self.P - C @ np.linalg.solve(S, C.T)
         self.P = (self.P + self.P.T) / 2
