@@ -227,9 +227,10 @@ class ScanAssociation:
 # strange as so far, μ in a scan, or if 1 − ρ of those that fitted so far, e in a scan,
 # are strange, too::
 #
-#     w ← max(0, w + min(c / 2, n ln (1 + δ / μ) − δ + m ln ρ)),    δ = (1 − ρ) e
+#     w ← max(0, w + min(c / 2, n ln (1 + δ / μ) − δ + m ln ρ) / 2),    δ = (1 − ρ) e
 #
-# A new landmark is strange in its first scan only, which counts c / 2 at most.
+# A new landmark is strange in its first scan only, which counts c / 4 at most.  The
+# half allows for clutter that comes in bursts.
 #
 # A lost run whose landmarks all stay in view misses none, either.  Many of these have
 # lost the heading: linearised equations do not hold where its standard deviation is a
@@ -296,7 +297,7 @@ class LostEvidence(NamedTuple):
         more = (1 - FEWER) * self.explained / before.scans
         ratio = strange * math.log(1 + more / before.per_scan) - more
         ratio += explained * math.log(FEWER)
-        unexplained = max(0.0, self.unexplained + min(ratio, MOST_OF_SCAN / 2))
+        unexplained = max(0.0, self.unexplained + min(ratio, MOST_OF_SCAN / 2) / 2)
         changed = unexplained, MEMORY * self.explained + explained
         largest = max(self.largest, unexplained)
         return LostEvidence(self.present, largest, *self[2:5], *changed)

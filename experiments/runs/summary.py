@@ -322,7 +322,7 @@ MOST_ABANDONED = 0.25
 #: Of a filter that is probably lost.
 LOST = (
     "The run is probably lost: the scans showed far fewer landmarks than the map "
-    "promised, or the heading became unknown."
+    "promised, readings fitted nothing, or the heading became unknown."
 )
 
 

@@ -369,7 +369,7 @@ def test_strange_readings_are_weighed_by_their_likelihoods():
         mean, others = weights @ [(1, 0), *scans[:k]] / (weights.sum() + weights[0])
         likelihoods = poisson.logpmf(strange, [mean, mean + (1 - FEWER) * others])
         ratio = np.diff(likelihoods)[0] + explained * np.log(FEWER)
-        expected = max(0, expected + min(ratio, MOST_OF_SCAN / 2))
+        expected = max(0, expected + min(ratio, MOST_OF_SCAN / 2) / 2)
         assert found[k].unexplained == pytest.approx(expected, abs=1e-9)
     assert found[-1].largest == max(one.unexplained for one in found) > 0
 
@@ -377,9 +377,9 @@ def test_strange_readings_are_weighed_by_their_likelihoods():
 def test_readings_that_stay_strange_are_evidence_of_a_lost_run():
     map_made = [(3, 0)] + [(0, 3)] * 20
     assert after_strange_readings(map_made).largest == 0
-    two = [(2, 0)] * 2
-    assert after_strange_readings(map_made + two).largest <= LOST_SCORE
-    assert after_strange_readings([*map_made, *two, (2, 0)]).largest > LOST_SCORE
+    four = [(2, 0)] * 4
+    assert after_strange_readings(map_made + four).largest <= LOST_SCORE
+    assert after_strange_readings([*map_made, *four, (2, 0)]).largest > LOST_SCORE
 
 
 @pytest.mark.parametrize(
@@ -389,7 +389,13 @@ def test_readings_that_stay_strange_are_evidence_of_a_lost_run():
 )
 def test_new_landmarks_and_usual_clutter_are_no_evidence(later):
     scans = [(3, 0), *[(0, 3), (3, 3)] * 20, *later]
-    assert after_strange_readings(scans).largest <= LOST_SCORE / 2
+    assert after_strange_readings(scans).largest <= LOST_SCORE / 4
+
+
+def test_a_burst_of_clutter_is_little_evidence():
+    burst = [(1, 0), (1, 0), (1, 1), (1, 1)]
+    scans = [(3, 0), *[(0, 3)] * 100, *burst, *[(0, 3)] * 10]
+    assert 2 < after_strange_readings(scans).largest < LOST_SCORE
 
 
 @pytest.mark.parametrize("association", ["nearest", "joint", "hypotheses"])
