@@ -20,8 +20,8 @@ The k readings still open add at least the following, since C ⪯ k blockdiag(C�
     Σᵢ min(λᵢ, minⱼ νᵀ (k Cⱼⱼ + Q)⁻¹ ν + ln det Q)
 
 `best_assignments` decides at depth d of the search tree the reading ``order[d]``.
-The expected readings given the pairs so far stand at ``level[d]`` of ``shifts`` and
-``joints``. `search_clique` finds the largest set of landmark pairs that agree.
+The expected readings given the pairs so far stand at ``level[d]`` of ``h``, as shifts,
+and ``C``. `search_clique` finds the largest set of landmark pairs that agree.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
-from ...jit import jit, njit_internal
+from ...jit import jit, njit_apart, njit_inlined, njit_internal
 from ..models.bearing_range import (
     expected_reading_jit,
     reading_slopes_jit,
@@ -166,28 +166,22 @@ def best_assignments(
        compatibility test, IEEE Transactions on Robotics and Automation 17, 2001.
     """
     problem = Problem(*of_scan)
-    missing, gate, limits, pairs_first = (
-        problem.missing,
-        problem.gate,
-        problem.limits,
-        problem.pairs_first,
-    )
+    _, joint, _, _, missing, gate, limits, pairs_first = problem
     rows, landmarks = problem.feasible.shape
     costs, marks = np.full(most, np.inf), np.full((most, rows), UNPAIRED)
     order = _decision_order(problem.feasible, problem.innovations)
     names, counts = _needed(problem.feasible, order)
-    innovations = problem.innovations[:, names]
-    variances = problem.variances[:, names]
+    nu, Q = problem.innovations[:, names], problem.variances[:, names]
     listed, options = _candidates(problem.feasible[:, names])
-    shifts = np.zeros((rows + 1, landmarks, 2))
-    joints = np.empty((rows + 1, 2 * landmarks, 2 * landmarks))
+    h = np.zeros((rows + 1, landmarks, 2))
+    C = np.empty((rows + 1, 2 * landmarks, 2 * landmarks))
     for a in range(landmarks):
         for b in range(landmarks):
             for i in range(2):
                 for k in range(2):
-                    value = problem.joint[2 * names[a] + i, 2 * names[b] + k]
-                    joints[0, 2 * a + i, 2 * b + k] = value
-    least_base = np.log(variances[:, :, 0] * variances[:, :, 1])
+                    value = joint[2 * names[a] + i, 2 * names[b] + k]
+                    C[0, 2 * a + i, 2 * b + k] = value
+    least_base = np.log(Q[:, :, 0] * Q[:, :, 1])
     if pairs_first:
         least_base[:] = -PAIR_BONUS
     level = np.zeros(rows + 1, np.int64)
@@ -195,6 +189,7 @@ def best_assignments(
     pairs = np.zeros(rows + 1, np.int64)
     choice = np.full(rows, UNPAIRED)
     taken = np.zeros(landmarks, np.bool_)
+    gains = np.empty((4, 2 * landmarks))
     child = np.empty((rows, landmarks + 1), np.int64)
     child_cost = np.empty((rows, landmarks + 1))
     child_squared = np.empty((rows, landmarks + 1))
@@ -212,11 +207,16 @@ def best_assignments(
                 child_squared[depth, 0] = 0.0
                 count = 1
                 left = limits[pairs[depth] + 1] - squared[depth]
-                for j in listed[row, : options[row]]:
+                for k in range(options[row]):
+                    j = listed[row, k]
                     if taken[j]:
                         continue
-                    z, q = innovations[row], variances[row]
-                    x, determinant = fit(z, q, shifts[here], joints[here], j, 1.0)
+                    a, b = 2 * j, 2 * j + 1
+                    n0 = nu[row, j, 0] - h[here, j, 0]
+                    n1 = nu[row, j, 1] - h[here, j, 1]
+                    s00 = C[here, a, a] + Q[row, j, 0]
+                    s11 = C[here, b, b] + Q[row, j, 1]
+                    x, determinant = fit(n0, n1, s00, C[here, b, a], s11)
                     if x <= gate and x <= left:
                         base = -PAIR_BONUS if pairs_first else np.log(determinant)
                         child[depth, count] = j
@@ -245,36 +245,27 @@ def best_assignments(
             taken[j] = True
             pairs[depth + 1] += 1
             level[depth + 1] = depth + 1
-            condition(
-                innovations[row],
-                variances[row],
-                j,
-                counts[depth + 1],
-                shifts,
-                joints,
-                here,
-                depth + 1,
-            )
+            n = counts[depth + 1]
+            condition(nu, Q, row, j, n, h, C, here, depth + 1, gains)
         if found > 0:
-            bound, here = cost[depth + 1], level[depth + 1]
+            bound, here, open_ = cost[depth + 1], level[depth + 1], rows - depth - 1.0
             for k in range(depth + 1, rows):  # a lower bound on the open readings
                 i = order[k]
                 least = missing[i]
-                for a in listed[i, : options[i]]:
-                    if not taken[a]:
-                        x, _ = fit(
-                            innovations[i],
-                            variances[i],
-                            shifts[here],
-                            joints[here],
-                            a,
-                            float(rows - depth - 1),
-                        )
-                        least = min(least, least_base[i, a] + x)
+                for a in range(options[i]):
+                    j = listed[i, a]
+                    if not taken[j]:
+                        c, d = 2 * j, 2 * j + 1
+                        n0 = nu[i, j, 0] - h[here, j, 0]
+                        n1 = nu[i, j, 1] - h[here, j, 1]
+                        s00 = open_ * C[here, c, c] + Q[i, j, 0]
+                        s11 = open_ * C[here, d, d] + Q[i, j, 1]
+                        x, _ = fit(n0, n1, s00, open_ * C[here, d, c], s11)
+                        least = min(least, least_base[i, j] + x)
                 bound += least
             if not bound < min(costs[-1], costs[0] + spread, ceiling):
-                if j != UNPAIRED:
-                    taken[j] = False
+                if choice[row] != UNPAIRED:
+                    taken[choice[row]] = False
                 is_new = False
                 continue
         depth += 1
@@ -381,55 +372,68 @@ def reading_covariance(
     return bb + P[2, 2] - 2 * (ax * gx + ay * gy), br, rr
 
 
+# Numba counts the references to each view of an array, and to each array that it passes
+# to a function.  In the search this took a third of the time, so its inner loops index
+# whole arrays and pass numbers.
+
+
 @njit_internal
 def fit(
-    innovation: Array, variance: Array, shift: Array, C: Array, j: int, inflation: float
+    n0: float, n1: float, s00: float, s10: float, s11: float
 ) -> tuple[float, float]:
-    """Return νᵀ S⁻¹ ν and det S of a reading at landmark j, with C times inflation."""
-    s00 = inflation * C[2 * j, 2 * j] + variance[j, 0]
-    s10 = inflation * C[2 * j + 1, 2 * j]
-    s11 = inflation * C[2 * j + 1, 2 * j + 1] + variance[j, 1]
-    n0, n1 = innovation[j, 0] - shift[j, 0], innovation[j, 1] - shift[j, 1]
+    """Return νᵀ S⁻¹ ν and det S, from ν and the lower half of S."""
     determinant = s00 * s11 - s10 * s10
     squared = n0 * n0 * s11 - 2 * n0 * n1 * s10 + n1 * n1 * s00
     return squared / determinant, determinant
 
 
-@njit_internal
+@njit_inlined
 def condition(
-    innovation: Array,
-    variance: Array,
+    nu: Array,
+    Q: Array,
+    i: int,
     j: int,
     count: int,
-    shifts: Array,
-    joints: Array,
+    h: Array,
+    C: Array,
     here: int,
     to: int,
+    gains: Array,
 ) -> None:
     """Condition the expected readings of the first ``count`` landmarks on one pair.
 
     ::
 
         h ← h + K (z − h),  C ← C − K C
+
+    ``gains``, shape (4, 2J), is room for the rows of C of landmark j, and for K.
     """
-    C, shift, after, moved = joints[here], shifts[here], joints[to], shifts[to]
-    s00 = C[2 * j, 2 * j] + variance[j, 0]
-    s10 = C[2 * j + 1, 2 * j]
-    s11 = C[2 * j + 1, 2 * j + 1] + variance[j, 1]
-    n0, n1 = innovation[j, 0] - shift[j, 0], innovation[j, 1] - shift[j, 1]
+    s00 = C[here, 2 * j, 2 * j] + Q[i, j, 0]
+    s10 = C[here, 2 * j + 1, 2 * j]
+    s11 = C[here, 2 * j + 1, 2 * j + 1] + Q[i, j, 1]
+    n0 = nu[i, j, 0] - h[here, j, 0]
+    n1 = nu[i, j, 1] - h[here, j, 1]
     determinant = s00 * s11 - s10 * s10
-    cross = np.empty((2, 2 * count))
-    for k in range(2):
-        b = 2 * j + k
-        for a in range(2 * count):
-            cross[k, a] = C[max(a, b), min(a, b)]
     for a in range(2 * count):
-        k0 = (cross[0, a] * s11 - cross[1, a] * s10) / determinant
-        k1 = (cross[1, a] * s00 - cross[0, a] * s10) / determinant
-        moved[a // 2, a % 2] = shift[a // 2, a % 2] + k0 * n0 + k1 * n1
-        row, old = after[a], C[a]
-        for b in range(a + 1):
-            row[b] = old[b] - k0 * cross[0, b] - k1 * cross[1, b]
+        for k in range(2):
+            b = 2 * j + k
+            gains[k, a] = C[here, max(a, b), min(a, b)]
+        gains[2, a] = (gains[0, a] * s11 - gains[1, a] * s10) / determinant
+        gains[3, a] = (gains[1, a] * s00 - gains[0, a] * s10) / determinant
+        moved = h[here, a // 2, a % 2] + gains[2, a] * n0 + gains[3, a] * n1
+        h[to, a // 2, a % 2] = moved
+    _subtract(C[here], gains, count, C[to])
+
+
+@njit_apart
+def _subtract(C: Array, gains: Array, count: int, after: Array) -> None:
+    """Fill C − K C, its lower half and what the diagonal blocks have above it."""
+    for a in range(0, 2 * count, 2):
+        k0, k1 = gains[2, a], gains[3, a]
+        m0, m1 = gains[2, a + 1], gains[3, a + 1]
+        for b in range(a + 2):  # two rows in one loop, which is faster
+            after[a, b] = C[a, b] - k0 * gains[0, b] - k1 * gains[1, b]
+            after[a + 1, b] = C[a + 1, b] - m0 * gains[0, b] - m1 * gains[1, b]
 
 
 @njit_internal
@@ -446,14 +450,16 @@ def condition_on_all(
     shifts, joints : ndarray, shapes (2, J, 2) and (2, 2J, 2J)
         Overwritten.
     """
+    nu, Q = problem.innovations, problem.variances
     here, landmarks = 0, problem.feasible.shape[1]
     shifts[0] = 0.0
     joints[0] = problem.joint
+    gains = np.empty((4, 2 * landmarks))
     for i in range(len(marks)):
         if marks[i] != UNPAIRED:
-            z, q = problem.innovations[i], problem.variances[i]
-            condition(z, q, marks[i], landmarks, shifts, joints, here, 1 - here)
-            here = 1 - here
+            j, to = marks[i], 1 - here
+            condition(nu, Q, i, j, landmarks, shifts, joints, here, to, gains)
+            here = to
     return here
 
 
@@ -492,10 +498,11 @@ def least_distances(problem: Problem, marks: IntArray) -> Array:
             for j in range(landmarks):
                 if taken[j] or marks[s, i] != UNPAIRED:
                     continue
-                x, determinant = fit(
-                    innovations[i], variances[i], shifts[here], joints[here], j, 1.0
-                )
-                q = variances[i, j]
+                q, C = variances[i, j], joints[here]
+                s00, s11 = C[2 * j, 2 * j] + q[0], C[2 * j + 1, 2 * j + 1] + q[1]
+                n0 = innovations[i, j, 0] - shifts[here, j, 0]
+                n1 = innovations[i, j, 1] - shifts[here, j, 1]
+                x, determinant = fit(n0, n1, s00, C[2 * j + 1, 2 * j], s11)
                 if determinant <= SURE * q[0] * q[1]:
                     distances[s, i] = min(distances[s, i], x)
     return distances
@@ -525,6 +532,7 @@ def largest_change(of_scan: tuple[Any, ...], marks: IntArray, fewer: IntArray) -
         Infinite unless ``fewer`` is ``marks`` without some pairs.
     """
     problem = Problem(*of_scan)
+    nu, Q = problem.innovations, problem.variances
     for i in range(len(marks)):
         if fewer[i] != marks[i] and fewer[i] != UNPAIRED:
             return np.inf
@@ -532,23 +540,24 @@ def largest_change(of_scan: tuple[Any, ...], marks: IntArray, fewer: IntArray) -
     shifts = np.empty((2, landmarks, 2))
     joints = np.empty((2, 2 * landmarks, 2 * landmarks))
     here = condition_on_all(problem, fewer, shifts, joints)
+    gains = np.empty((4, 2 * landmarks))
     shift, variance = 0.0, 1.0  # in the σ after all pairs
     for i in range(len(marks)):
         j = marks[i]
         if fewer[i] == j:
             continue
-        z, C = problem.innovations[i], joints[here]
-        x, determinant = fit(z, problem.variances[i], shifts[here], C, j, 1.0)
-        q = problem.variances[i, j]
+        C, q, to = joints[here], Q[i, j], 1 - here
         s00, s11 = C[2 * j, 2 * j] + q[0], C[2 * j + 1, 2 * j + 1] + q[1]
+        n0 = nu[i, j, 0] - shifts[here, j, 0]
+        n1 = nu[i, j, 1] - shifts[here, j, 1]
+        x, determinant = fit(n0, n1, s00, C[2 * j + 1, 2 * j], s11)
         half = (s11 * q[0] + s00 * q[1]) / (2 * determinant)
         root = np.sqrt(max(half * half - q[0] * q[1] / determinant, 0.0))
         left = half - root  # 1 − λ
         shift = (shift + np.sqrt(x * (1 - left))) / np.sqrt(left)
         variance /= left
-        variances = problem.variances[i]
-        condition(z, variances, j, landmarks, shifts, joints, here, 1 - here)
-        here = 1 - here
+        condition(nu, Q, i, j, landmarks, shifts, joints, here, to, gains)
+        here = to
     return float(np.sqrt(shift * shift + variance - 1))
 
 
