@@ -593,8 +593,8 @@ class ScanRecord(NamedTuple):
         x = H[every, 3, None] * rows[:, columns].T
         y = H[every, 4, None] * rows[:, columns + 1].T
         factor: Array = np.tril(pose + x + y)
-        for k in range(0, count, 2):
-            factor[k : k + 2, k : k + 2] = rows[k : k + 2, gain.ROOT : gain.ROOT + 2]
+        pair = (every - every % 2)[:, None] + (0, 1)
+        factor[every[:, None], pair] = rows[:, gain.ROOT : gain.ROOT + 2]
         return factor
 
 

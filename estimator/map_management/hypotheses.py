@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from math import log
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array, BoolArray
+from ...arrays import Array
 from ..association.scan_assignments import SAME
 from ..association.scan_association import ScanAssociation
 from ..filters.conditioning import PoseReading
@@ -83,36 +84,37 @@ def distinct(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
     if len(hypotheses) == 1:
         return [*hypotheses]
     views = [h.slam.map_view() for h in hypotheses]
-    labels = [h.slam.candidates.tentative.labels for h in hypotheses]
-    near, chosen = _overlaps(views), list[int]()
+    poses = [
+        [*v.mean[:3].tolist(), *v.covariance.diagonal()[:3].tolist()] for v in views
+    ]
+    labels = [h.slam.candidates.tentative.labels.tobytes() for h in hypotheses]
+    chosen: list[int] = []
     for k, view in enumerate(views):
         if (
             len(chosen) < most
-            and near[k, chosen].sum() < PER_BASIN
+            and sum(_overlap(poses[n], poses[k]) for n in chosen) < PER_BASIN
             and not any(
-                np.array_equal(labels[n], labels[k]) and is_near(views[n], view, SAME)
-                for n in chosen
+                labels[n] == labels[k] and is_near(views[n], view, SAME) for n in chosen
             )
         ):
             chosen.append(k)
     return [hypotheses[k] for k in chosen]
 
 
-def _overlaps(views: Sequence[MapView]) -> BoolArray:
-    """Return which of n poses overlap, shape (n, n).
+def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
+    """Return whether two poses overlap, each three means, then three variances.
 
     The Bhattacharyya distance of two Gaussians is, in one coordinate, ::
 
         (μ₂ − μ₁)² / 4 (σ₁² + σ₂²) + ½ ln ((σ₁² + σ₂²) / 2 σ₁σ₂)
     """
-    poses = np.array([view.mean[:3] for view in views])
-    variance = np.array([np.diagonal(view.covariance)[:3] for view in views]) + NIL
-    both = variance[:, None] + variance[None]
-    gap = poses[:, None] - poses[None]
-    gap[..., 2] = wrap_angle(gap[..., 2])
-    apart = gap**2 / (4 * both)
-    apart += np.log(both**2 / (4 * variance[:, None] * variance[None])) / 4
-    return np.asarray((apart <= OVERLAP).all(axis=2))
+    for k in range(3):
+        gap, variance, v = other[k] - one[k], one[k + 3] + NIL, other[k + 3] + NIL
+        apart = (wrap_angle(gap) if k == 2 else gap) ** 2 / (4 * (variance + v))
+        apart += log((variance + v) ** 2 / (4 * variance * v)) / 4
+        if not apart <= OVERLAP:
+            return False
+    return True
 
 
 def cost_of(report: UpdateReport) -> float:
@@ -500,5 +502,5 @@ class FilterPool:
         """Take filters back."""
         for slam in slams:
             if slam not in self._spare:
-                slam.reset(np.zeros(3), np.zeros(3))  # frees its scans
+                slam.forget_scans()
                 self._spare = [*self._spare, slam]

@@ -377,6 +377,10 @@ class ManagedSlam:
             self._editor.expire()
             self.candidates = candidates
 
+    def forget_scans(self) -> None:
+        """Free the memory of the last scans, of a filter that nobody uses."""
+        self._recent.forget()
+
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
         parts = self._recent.bookmark(), self._editor.bookmark()

@@ -155,5 +155,5 @@ def is_near(one: MapView, other: MapView, tolerance: float) -> bool:
     size = 3 + 2 * len(one.ids)
     gap = other.mean[:size] - one.mean[:size]
     gap[2] = wrap_angle(float(gap[2]))
-    variances, others = (np.diagonal(m.covariance)[:size] for m in (one, other))
+    variances, others = (m.covariance.diagonal()[:size] for m in (one, other))
     return bool((gap**2 + others <= (1 + tolerance**2) * variances).all())

@@ -323,6 +323,15 @@ def test_no_more_filters_are_made_than_hypotheses_are_allowed(slippery_drive):
     assert len(filters_of(slam)) + len(slam.hypotheses) <= allowed + 1
 
 
+def test_a_discarded_hypothesis_keeps_no_scans(slippery_drive):
+    world, scans = slippery_drive
+    slam = make(world, association="hypotheses")
+    follow(slam, scans[:60])
+    pool = filters_of(slam)
+    assert len(pool) > 0
+    assert all(not pool.fresh().decisions for _ in range(len(pool)))
+
+
 def test_alternatives_that_are_skipped_would_not_have_been_kept(
     slippery_drive, monkeypatch
 ):
