@@ -5,7 +5,7 @@ A `Drive` is the input of the smoother, and `DriveArrays` is its form for kernel
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from copy import copy
 from itertools import chain
 from typing import NamedTuple
@@ -40,6 +40,19 @@ class Sightings(NamedTuple):
 
     measurements: Array  # rows (β, r), shape (m, 2) [rad, m]
     ids: IntArray  # landmark of each, shape (m,)
+
+    def distinct(self) -> Iterator[Sightings]:
+        """Yield them in scans that show no landmark twice.
+
+        Landmarks repeat where there is no motion between two scans, and where two
+        landmarks of a scan were merged.
+        """
+        turns, last = np.zeros(len(self.ids), dtype=np.int64), dict[int, int]()
+        for k, i in enumerate(self.ids.tolist()):
+            turns[k] = last[i] = last.get(i, -1) + 1
+        for turn in range(max(last.values(), default=-1) + 1):
+            chosen = turns == turn
+            yield Sightings(self.measurements[chosen], self.ids[chosen])
 
 
 class Drive:

@@ -413,10 +413,10 @@ def filter_drive(
     for k, motion in enumerate(drive.motions):
         for distance, turn, dt in motion.steps:
             slam.predict((distance, turn), dt)
-        readings, ids = drive.sightings(k)
         for given in drive.pose_readings(k):
             slam.observe_pose(*given)
-        slam.update(readings, ids)
+        for readings, ids in drive.sightings(k).distinct():
+            slam.update(readings, ids)
         poses[k] = slam.map.mean[:3]
     return poses, slam.belief()
 

@@ -13,7 +13,7 @@ I      Σ g_s g_sᵀ, the outer product of scores, which estimates the informati
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -270,17 +270,8 @@ def _events(log: SlamLog, drive: Drive) -> Iterator[OdometryRow | Scan]:
     for pose, (steps, t) in enumerate(zip(motions, times.tolist(), strict=True)):
         for distance, turn, dt in steps:
             yield OdometryRow(t, distance, turn, dt)
-        for readings, ids in _distinct(drive.sightings(pose)):
+        for readings, ids in drive.sightings(pose).distinct():
             yield Scan(t, readings, ids)
-
-
-def _distinct(sightings: Sightings) -> Iterable[Sightings]:
-    """Split the readings of one pose so that no landmark repeats."""
-    _, which = np.unique(sightings.ids, return_inverse=True)
-    turn = np.array([(which[:k] == j).sum() for k, j in enumerate(which)], dtype=int)
-    for part in range(turn.max(initial=-1) + 1):
-        chosen = turn == part
-        yield Sightings(sightings.measurements[chosen], sightings.ids[chosen])
 
 
 def _times_after(log: SlamLog, counts: IntArray) -> Array:

@@ -108,6 +108,36 @@ def test_other_sensors_are_smoothed_as_by_dense_least_squares(sensor, std):
         reassociate(slam.recorded())
 
 
+def test_scans_without_a_motion_between_them_are_those_of_one_pose():
+    rng, slam = np.random.default_rng(8), SmoothingSlam(**NOISE)
+    slam.reset((0.0, 0.0, 0.0), START_STD)
+    moves, scans = [], [(np.empty((0, 2)), np.empty(0, dtype=int))]
+    slam.update(*scans[0])
+    for odometry, readings, _ in drive(3, 12):
+        slam.predict(odometry)
+        again = readings + 0.01 * rng.standard_normal(readings.shape)
+        slam.update(readings, range(6))
+        slam.update(again, range(6))
+        moves.append(odometry)
+        scans.append((np.vstack([readings, again]), np.tile(np.arange(6), 2)))
+    made = slam.smoothed()
+    twin, state, order = dense_twin(made, moves, scans)
+    found, expected = twin.solve(state + 0.01 * rng.standard_normal(len(state)))
+    assert found == pytest.approx(state, abs=1e-7)
+    assert made.cost == pytest.approx((twin.residual(state) ** 2).sum() / 2)
+    joint = made.covariance(range(len(made.poses)), order)
+    assert joint == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+def test_landmarks_of_one_scan_that_were_merged_are_smoothed():
+    slam = SmoothingSlam(**NOISE)
+    for _ in range(3):
+        slam.update([(0.1, 2.0), (0.12, 2.05), (1.0, 4.0)], [0, 1, 2])
+        slam.predict((0.0, 0.0))
+    slam.merge(0, 1)
+    assert slam.smoothed().landmark_ids == (0, 2)
+
+
 def test_readings_of_poses_are_those_of_dense_least_squares():
     """Compass and GPS, one of them turned by 2π, and several at one pose."""
     result, fixes = Drive(**NOISE, initial_pose_std=START_STD), []
