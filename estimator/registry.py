@@ -353,7 +353,7 @@ def read_label(label: str) -> FilterLabel:
     >>> read_label("invariant[iterations=3, landmark_init=full]")
     FilterLabel(name='invariant', options={'iterations': 3, 'landmark_init': 'full'})
     """
-    match = _LABEL.fullmatch(label.strip())
+    match = _LABEL.fullmatch(label.strip()) if isinstance(label, str) else None
     if match is None:
         raise ValueError(
             f"an estimator must be like ekf or invariant[iterations=3], got '{label}'"

@@ -19,7 +19,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
 from ...arrays import AnyArray, Array, BoolArray, ImageArray
-from ...restorable import Restorable, State, copied, put_back
+from ...restorable import Restorable, State, copied, put_back, refuse_other_state
 from ...sim_configs import Scenario, load_scenario
 from ..landmark_world import LandmarkWorldEnv
 from ..rendering.episode_renderer import EpisodeRenderer
@@ -194,11 +194,11 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
 
     def restore(self, state: State) -> None:
         """Return to a state of these worlds, which stays usable for further calls."""
-        *rest, own = state
-        super().restore(tuple(rest))
-        for part, value in zip(
-            (*self._generators(), *self._renderers), own, strict=True
-        ):
+        own = *self._generators(), *self._renderers
+        given: Any = state[-1] if isinstance(state, tuple) and state else None
+        refuse_other_state(self, given, len(own))
+        super().restore(state[:-1])
+        for part, value in zip(own, given, strict=True):
             put_back(part, value)
 
     def render(self) -> tuple[ImageArray, ...] | None:

@@ -489,7 +489,9 @@ def _toml_value(text: str) -> Any:
 def _refuse_log(name: str) -> None:
     """Refuse a file or folder that is no scenario, and name the command for logs."""
     path = Path(name)
-    if name in list_presets() or path.suffix == ".toml" or not path.exists():
+    if not name or name in list_presets():
+        return
+    if path.suffix == ".toml" or not path.exists():
         return
     raise BadInputError(
         f"{name} is no scenario (a preset or a .toml file); to filter a log: slamgym "

@@ -65,7 +65,8 @@ number, got 'east'
     def to_id(self, field: str) -> int:
         """Read a whole number >= 0; raise LogError for anything else."""
         if not (field.isascii() and field.isdigit() and len(field) <= MAX_ID_DIGITS):
-            raise self.error("an id (a whole number >= 0)", shown(field))
+            wanted = f"an id (a whole number >= 0 of at most {MAX_ID_DIGITS} digits)"
+            raise self.error(wanted, shown(field))
         return int(field)
 
     def check_count(

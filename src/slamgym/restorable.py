@@ -27,13 +27,29 @@ class Restorable:
         return (*changing, *(getattr(self, name) for name in self.replaced))
 
     def restore(self, state: State) -> None:
-        """Return to a state of this object, which stays usable for further calls."""
+        """Return to a state of this object, which stays usable for further calls.
+
+        Raises
+        ------
+        ValueError
+            If this is no state of such an object.
+        """
+        refuse_other_state(self, state, len(self.changing) + len(self.replaced))
         attributes, values = vars(self), iter(state)
         # The names end first: zip then has taken no value too many.
         for name, value in zip(self.changing, values, strict=False):
             if not put_back(attributes[name], value):
                 attributes[name] = copied(value)
         attributes.update(zip(self.replaced, values, strict=True))
+
+
+def refuse_other_state(owner: object, state: object, parts: int) -> None:
+    """Refuse what is no state of so many parts."""
+    if not isinstance(state, tuple) or len(state) != parts:
+        raise ValueError(
+            f"state must be what state() of the same {type(owner).__name__} returned, "
+            f"got {type(state).__name__} of other contents"
+        )
 
 
 def copied(value: Any) -> Any:

@@ -125,3 +125,21 @@ def test_there_is_no_state_before_the_first_episode():
     for env in (LandmarkWorldEnv(), LandmarkWorldVectorEnv(2), ActiveSlamEnv()):
         with pytest.raises(gymnasium.error.ResetNeeded):
             env.state()
+
+
+def test_what_is_no_state_of_these_worlds_is_refused_and_changes_nothing():
+    single, worlds = LandmarkWorldEnv("loop"), LandmarkWorldVectorEnv(3, "loop")
+    others = LandmarkWorldVectorEnv(2, "loop")
+    for each in (single, worlds, others):
+        each.reset(seed=0)
+    wrong = [None, "x", (), 3, others.state()]
+    for each, given in [(single, worlds.state()), (worlds, single.state())]:
+        before, step = each.state(), (0.5, 0.1) if each is single else [(0.5, 0.1)] * 3
+        expected = each.step(step)
+        each.restore(before)
+        for state in [*wrong, given]:
+            with pytest.raises(
+                ValueError, match=r"what state\(\) of the same Landmark"
+            ):
+                each.restore(state)
+        assert data_equivalence(each.step(step), expected)

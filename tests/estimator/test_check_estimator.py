@@ -611,6 +611,9 @@ def test_every_frequent_mistake_differs_from_the_equations():
 def test_unknown_estimator_is_refused_with_a_suggestion():
     with pytest.raises(ValueError, match="unknown estimator 'efk'; did you mean 'ekf'"):
         make_estimator("efk", **NOISE)
+    for name in (None, 3, ""):
+        with pytest.raises(ValueError, match=f"must be like ekf or .* got '{name}'"):
+            make_estimator(name, **NOISE)
 
 
 def test_an_estimator_is_found_by_its_import_path():

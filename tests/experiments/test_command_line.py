@@ -656,6 +656,10 @@ def test_a_wrong_command_is_refused(command, log):
     assert WRONG[command].format(option) in refused(*words)
 
 
+def test_an_empty_name_of_a_scenario_is_quoted(here):
+    assert "or a .toml file, got ''" in refused("run", "")
+
+
 def test_several_mistakes_of_a_scenario_stand_in_one_line(here):
     (here / "mine.toml").write_text("name = 'mine'\ndt = 0\nsteps = 1\n")
     message = refused("run", "mine.toml")
