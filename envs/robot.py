@@ -353,6 +353,7 @@ class UnicycleBodies(Restorable):
         self._drive = drive
         self._contacts = WallContacts(radius, walls)
         self._all, self._near = np.ones(count, np.bool_), np.zeros(count, np.int64)
+        self._no_path = np.empty((0, 2))
         self.frame: Array = np.zeros((5, count))
         self._arrive(self.frame)
 
@@ -386,7 +387,7 @@ class UnicycleBodies(Restorable):
             Shares of the displacements, in [0, 1], that the walls allowed, 1 for bodies
             that do not move; None without walls.
         """
-        path = commands[:0]
+        path = self._no_path
         if self._drive is not None:
             path = np.column_stack(self._drive.path(*commands.T))
         frame, after = self.frame, np.empty(self.frame.shape)
@@ -394,13 +395,14 @@ class UnicycleBodies(Restorable):
         bodies = frame, self._all if moving is None else moving, commands, path, slip
         walls, reach = contacts.ends, contacts.reach
         count = _move(*bodies, walls, reach, after, near)
-        share = np.ones(len(commands))
-        for k in near[:count].tolist():
-            way = *frame[:2, k].tolist(), *after[:2, k].tolist()
-            share[k] = contacts.free_share(*way)
-            after[:2, k] = share[k] * after[:2, k] + frame[:2, k]
+        share = np.ones(len(commands)) if len(walls) else None
+        if share is not None:
+            for k in near[:count].tolist():
+                way = *frame[:2, k].tolist(), *after[:2, k].tolist()
+                share[k] = contacts.free_share(*way)
+                after[:2, k] = share[k] * after[:2, k] + frame[:2, k]
         self._arrive(after)
-        return share if len(walls) else None
+        return share
 
     def _arrive(self, frame: Array) -> None:
         """Adopt a frame with new rows x, y and θ, and compute its other rows."""

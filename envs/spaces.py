@@ -10,7 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 
-from ..arrays import AnyArray, Array, BoolArray
+from ..arrays import AnyArray, Array, BoolArray, IntArray
+from ..jit import jit
 from ..sim_configs import Scenario
 from ..sim_configs.landmarks_and_controls import possible_positions
 from ..sim_configs.scenario_files import widest_scenario
@@ -146,47 +147,69 @@ def clipped_action(action: ArrayLike, limits: Sequence[float]) -> tuple[float, f
     return speed, turn_rate
 
 
-def clipped_actions(
-    actions: ArrayLike, limits: Array, moving: BoolArray | None = None
+def commands_of(
+    actions: ArrayLike, limits: Array, dt: float, moving: BoolArray, steps: IntArray
 ) -> Array:
-    """Clip B actions (v, ω) to ± limits [m/s, rad/s].
+    """Return the commands (d, α) of B actions (v, ω), clipped to ± limits, in dt.
 
     Parameters
     ----------
     actions : array_like, shape (B, 2)
         Rows (v, ω) [m/s, rad/s].
-    limits : ndarray, shape (B, 2)
-        Largest |v| and |ω| of each robot.
-    moving : bool ndarray, shape (B,), optional
-        Worlds whose actions count (None: all); those of the others become zeros.
+    limits : ndarray, shape (2,)
+        Largest |v| and |ω|.
+    dt : float
+        Duration of a step [s].
+    moving : bool ndarray, shape (B,)
+        Worlds whose actions count; the commands of the others are zeros.
+    steps : int64 ndarray, shape (B,)
+        Steps of the worlds so far; those that move receive one more.
 
     Raises
     ------
     ValueError
         If `actions` is not B rows of two real numbers. If a number is not finite, the
-        message names the first such world.
+        message names the first such world. No step is counted.
 
     Examples
     --------
-    >>> clipped_actions([[1, 0], [2, float("nan")]], limits=np.ones((2, 2)))
+    >>> both = np.ones(2, dtype=bool), np.zeros(2, dtype=np.int64)
+    >>> commands_of([[1, 0], [2, float("nan")]], np.ones(2), 0.1, *both)
     Traceback (most recent call last):
         ...
     ValueError: every action must be 2 finite numbers (v [m/s], ω [rad/s]), got [2.0, nan] for world 1
     """  # noqa: E501 (an error of one line)
-    refusal = partial(_refusal_of_many, len(limits))
-    array = _real_numbers(actions, limits.shape, refusal).astype(np.float64)
-    if moving is not None:
-        array[~moving] = 0.0
-    if np.count_nonzero(np.abs(array) <= limits) == array.size:
-        return array
-    finite = np.isfinite(array)
-    if np.count_nonzero(finite) < finite.size:
-        world = int(np.flatnonzero(~finite.all(axis=1))[0])
+    refusal = partial(_refusal_of_many, len(moving))
+    array = _real_numbers(actions, (len(moving), 2), refusal).astype(np.float64)
+    world = _begin_step(array, limits, dt, moving, steps)
+    if world >= 0:
         raise ValueError(
             "every action must be 2 finite numbers (v [m/s], ω [rad/s]), "
             f"got {array[world].tolist()} for world {world}"
         )
-    return np.minimum(np.maximum(array, -limits), limits)
+    return array
+
+
+@jit
+def _begin_step(
+    actions: Array, limits: Array, dt: float, moving: BoolArray, steps: IntArray
+) -> int:
+    """Turn actions into commands, and count steps; see `commands_of`.
+
+    Returns -1, or the first world whose action is not finite; nothing has changed then.
+    """
+    for b in range(len(actions)):
+        v, w = actions[b]
+        if moving[b] and not (math.isfinite(v) and math.isfinite(w)):
+            return b
+    for b in range(len(actions)):
+        for i in range(2):
+            value = actions[b, i]
+            if abs(value) > limits[i]:
+                value = math.copysign(limits[i], value)
+            actions[b, i] = value * dt if moving[b] else 0.0
+        steps[b] += moving[b]
+    return -1
 
 
 def _real_numbers(

@@ -133,7 +133,10 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
         mask = checked_reset_mask(options, self.num_envs)
         seeds = world_seeds(seed, self.num_envs)
         self._begin(np.ones(self.num_envs, np.bool_) if mask is None else mask, seeds)
-        return self._observations(), with_masks(self._infos(), mask, self.num_envs)
+        infos = self._infos()
+        if mask is None:
+            return self._observations(), with_masks(infos, self._all)
+        return self._observations(), of_worlds(infos, mask)
 
     def step(
         self, actions: ArrayLike
@@ -171,7 +174,7 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
         if self.autoreset_mode == AutoresetMode.SAME_STEP and np.count_nonzero(ended):
             final = final_infos(self._observations(), self._infos(), ended)
             self._begin(ended)
-        infos = {**final, **with_masks(self._infos(), None, self.num_envs)}
+        infos = final | with_masks(self._infos(), self._all)
         return self._observations(), rewards, terminated, truncated, infos
 
     def state(self) -> State:
@@ -401,27 +404,26 @@ def checked_reset_mask(options: dict[str, Any] | None, count: int) -> BoolArray 
     return mask
 
 
-def with_masks(infos: Infos, worlds: BoolArray | None, count: int) -> Infos:
-    """Add to each key the mask ``_key`` of the worlds that have the info (None: all).
-
-    The values of the other worlds are zeros, as in Gymnasium's own vector environments.
+def with_masks(infos: Infos, worlds: BoolArray) -> Infos:
+    """Add to each key the mask ``_key`` of the worlds that have the info, a copy.
 
     Examples
     --------
-    >>> with_masks({"collision": np.array([True, True])}, np.array([True, False]), 2)
-    {'collision': array([ True, False]), '_collision': array([ True, False])}
+    >>> with_masks({"collision": np.array([True, False])}, np.array([True, True]))
+    {'collision': array([ True, False]), '_collision': array([ True,  True])}
     """
-    masked = {}
-    masks = np.empty((len(infos), count), dtype=np.bool_)
-    masks.fill(True)
-    for row, (key, value) in enumerate(infos.items()):
-        if worlds is None:
-            masked[key], masked[f"_{key}"] = value, masks[row]
-        else:
-            chosen = np.zeros_like(value)
-            chosen[worlds] = value[worlds]
-            masked[key], masked[f"_{key}"] = chosen, worlds.copy()
-    return masked
+    return infos | {f"_{key}": worlds.copy() for key in infos}
+
+
+def of_worlds(infos: Infos, worlds: BoolArray) -> Infos:
+    """Return the infos of some worlds, with their masks.
+
+    The values of the other worlds are zeros, as in Gymnasium's own vector environments.
+    """
+    chosen = {key: np.zeros_like(value) for key, value in infos.items()}
+    for key, value in infos.items():
+        chosen[key][worlds] = value[worlds]
+    return with_masks(chosen, worlds)
 
 
 def final_infos(observations: Infos, infos: Infos, ended: BoolArray) -> Infos:
@@ -445,7 +447,7 @@ def final_infos(observations: Infos, infos: Infos, ended: BoolArray) -> Infos:
     return {
         "final_obs": last,
         "_final_obs": ended.copy(),
-        "final_info": with_masks(infos, ended, count),
+        "final_info": of_worlds(infos, ended),
         "_final_info": ended.copy(),
     }
 

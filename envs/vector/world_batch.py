@@ -29,14 +29,13 @@ from ..bearing_range import BearingRangeSensor, hide_identities
 from ..drives import drive_of
 from ..noise_streams import PoseSensors, SensorSettings, WorldNoise
 from ..robot import UnicycleBodies, VectorOdometrySensor
-from ..spaces import clipped_actions, count_rows
+from ..spaces import commands_of, count_rows
 from ..streams import EpisodeStarts, drawn_scenarios, episode_keys
 
 Generators = Sequence[np.random.Generator]
 Scan = tuple[Array, BoolArray, IntArray | None]
 
 _READINGS_AT_ONCE = 8192
-_ONE = np.array(1)  # adding a Python integer to an array takes 2 µs longer
 
 
 class WorldBatch(Restorable):
@@ -121,8 +120,8 @@ class WorldBatch(Restorable):
         self._bodies = UnicycleBodies(
             count, robot.radius, scenario.walls, self._robot_drive
         )
-        limits = robot.max_speed, robot.max_turn_rate
-        self._limits = np.tile(limits, (count, 1))  # tiled: numpy runs one loop
+        self._limits = np.array([robot.max_speed, robot.max_turn_rate])
+        self._all = np.ones(count, np.bool_)
         self._hides_identities = not scenario.sensor.identities
         self.begun, rows = False, count_rows(scenario)
         self.measurements = np.zeros((count, rows, 2))
@@ -251,9 +250,10 @@ class WorldBatch(Restorable):
                 moving = None
         if generators is not None:
             self._check_number(generators)
-        clipped = clipped_actions(actions, self._limits, moving)
-        self.steps += _ONE if moving is None else moving
-        commands = clipped * self.scenario.dt
+        commands = commands_of(
+            *(actions, self._limits, self.scenario.dt),
+            *(self._all if moving is None else moving, self.steps),
+        )
         if self._robot_drive is not None:
             commands = np.column_stack(self._robot_drive.feasible(*commands.T))
         self._drive(commands, moving)
