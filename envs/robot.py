@@ -398,9 +398,9 @@ class UnicycleBodies(Restorable):
         share = np.ones(len(commands)) if len(walls) else None
         if share is not None:
             for k in near[:count].tolist():
-                way = *frame[:2, k].tolist(), *after[:2, k].tolist()
-                share[k] = contacts.free_share(*way)
-                after[:2, k] = share[k] * after[:2, k] + frame[:2, k]
+                (x, y), (dx, dy) = frame[:2, k].tolist(), after[:2, k].tolist()
+                share[k] = free = contacts.free_share(x, y, dx, dy)
+                after[0, k], after[1, k] = free * dx + x, free * dy + y
         self._arrive(after)
         return share
 

@@ -186,6 +186,7 @@ class WorldBatch(Restorable):
             If a world that has never been reset is not chosen.
         """
         chosen = self._chosen(worlds)
+        self.odometry, self.collisions = self.odometry.copy(), self.collisions.copy()
         self._begin(chosen, generators)
         self._measure_some(chosen)
         self._read_poses()
@@ -197,16 +198,18 @@ class WorldBatch(Restorable):
             self.pose_readings = self.pose_sensors.read(*at)
 
     def _begin(self, chosen: IndexArray, generators: Generators) -> None:
-        """Start an episode in some worlds, without a scan."""
+        """Start an episode in some worlds, without a scan.
+
+        Writes into the odometry and the collisions.
+        """
         self._check_number(generators)
         keys = episode_keys([generators[world] for world in chosen.tolist()])
         poses, estimates = self._start(chosen, keys)
         self._keys[chosen], self.steps[chosen] = keys, 0  # a start has sensor noise
-        self._start_estimates = _replaced(self._start_estimates, chosen, estimates)
+        self._start_estimates[chosen] = estimates
         self._bodies.place(chosen, poses)
         self.poses = self._bodies.poses()
-        self.odometry = _replaced(self.odometry, chosen, 0.0)
-        self.collisions = _replaced(self.collisions, chosen, False)
+        self.odometry[chosen], self.collisions[chosen] = 0.0, False
         self.begun = True
 
     def _start(self, chosen: IndexArray, keys: WordArray) -> tuple[Array, Array]:
@@ -256,9 +259,13 @@ class WorldBatch(Restorable):
         )
         if self._robot_drive is not None:
             commands = np.column_stack(self._robot_drive.feasible(*commands.T))
+        before = self.odometry, self.collisions
         self._drive(commands, moving)
         if moving is not None and generators is not None:
             self._begin(np.flatnonzero(~moving), generators)
+        elif moving is not None:
+            self.odometry = np.where(moving[:, None], self.odometry, before[0])
+            self.collisions = np.where(moving, self.collisions, before[1])
         self.measurements, self.mask, self.landmark_ids = self._scan_all()
         self._read_poses()
 
@@ -292,9 +299,6 @@ class WorldBatch(Restorable):
         share = self._bodies.drive(commands, slip, moving)
         odometry = self._odometer.read(commands, share, error)
         collisions = np.zeros(self.count, np.bool_) if share is None else share < 1.0
-        if moving is not None:
-            odometry = np.where(moving[:, None], odometry, self.odometry)
-            collisions = np.where(moving, collisions, self.collisions)
         self.odometry, self.collisions = odometry, collisions
         self.poses = self._bodies.poses()
 
