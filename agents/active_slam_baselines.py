@@ -210,11 +210,11 @@ def coverage_lanes(scenario: Scenario) -> Array:
 def nearest_goal(knowledge: AgentKnowledge) -> Array:
     """Return the nearest of `AgentKnowledge.goals`, (2,) [m].
 
-    Without goals, while landmarks are missing, every cell is a goal.
+    Without goals, every reachable cell is a goal, and every cell if none is reachable.
     """
-    points = knowledge.goals()
+    points, reachable = knowledge.goals(), knowledge.grid.routes.reachable
     if not len(points):
-        points = as_points(knowledge.grid.cells[knowledge.grid.routes.reachable])
+        points = as_points(knowledge.grid.cells[reachable | ~reachable.any()])
     return _nearest(knowledge, points)
 
 

@@ -140,7 +140,8 @@ def plan_values(
     scenario, size = knowledge.scenario, len(knowledge.known)
     slam: Any = knowledge.estimator
     points = as_points(knowledge.grid.cells)
-    counts = knowledge.missing * chance / chance.sum()
+    total = chance.sum()  # 0 where no landmark can be missing
+    counts = knowledge.missing * chance / (total if total > 0 else 1.0)
     kept = counts > 0.02 * counts.max() if knowledge.missing else counts > 0
     now = np.linalg.slogdet(knowledge.belief.covariance[3:, 3:])[1]
     steps = plans.shape[1]

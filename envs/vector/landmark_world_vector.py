@@ -101,7 +101,7 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
             ]
         self._steps = np.array(episode_steps(self.scenario, max_episode_steps))
         self._worlds = WorldBatch(self.scenario, num_envs)
-        self._rngs: list[np.random.Generator | None] = [None] * num_envs
+        self._rngs: list[Any] = [None] * num_envs  # generators, once they are needed
         self._seeds: list[int] = [-1] * num_envs
         self._ended = np.zeros(num_envs, dtype=np.bool_)
         self._all = ~self._ended
@@ -269,13 +269,11 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
 
     def _generators(self) -> list[np.random.Generator]:
         """Return the generators; the machine's entropy seeds missing ones."""
-        made = []
-        for world, rng in enumerate(self._rngs):
-            if rng is None:
-                rng, self._seeds[world] = seeding.np_random()  # noqa: PLW2901
-                self._rngs[world] = rng
-            made.append(rng)
-        return made
+        if None in self._rngs:
+            for world, rng in enumerate(self._rngs):
+                if rng is None:
+                    self._rngs[world], self._seeds[world] = seeding.np_random()
+        return self._rngs
 
     def _begin(self, worlds: BoolArray, seeds: Sequence[int | None] = ()) -> None:
         fresh = {

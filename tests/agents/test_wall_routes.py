@@ -120,15 +120,16 @@ def test_baselines_find_their_way_through_doors(name, rooms, steps):
     assert not episode.crashed
 
 
+@pytest.mark.parametrize("r", [0.7, 0.3])  # then no cell is reachable
 @pytest.mark.parametrize("name", BASELINES)
-def test_every_baseline_acts_where_walls_leave_no_room(name):
-    r = 0.7
+def test_every_baseline_acts_where_walls_leave_no_room(name, r):
     box = [[-r, -r, r, -r], [r, -r, r, r], [r, r, -r, r], [-r, r, -r, -r]]
     easy = load_scenario("active_easy")
     scenario = easy.with_changes(walls=[*easy.walls, *box])
     env = ActiveSlamEnv(scenario)
     env.reset(seed=1)
     action = make_baseline(name, scenario, np.random.default_rng(0)).act(env.knowledge)
+    assert env.knowledge.missing > 0
     assert env.action_space.contains(np.asarray(action, env.action_space.dtype))
 
 
