@@ -9,28 +9,8 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ...jit import njit_internal, specialised
-from ..kernels.kalman_gain import (
-    COLUMN,
-    CORRECTION,
-    FIRST,
-    GATED,
-    INNOVATION,
-    JACOBIAN,
-    LANDMARK_X,
-    OUTCOME,
-    READING,
-    ROOT,
-    SINGULAR,
-    USED,
-    VARIANCE,
-    WHITE,
-    BeliefArrays,
-    Rules,
-    Workspace,
-    begin_correction,
-    downdate,
-    restore_upper,
-)
+from ..kernels import kalman_gain as gain
+from ..kernels.kalman_gain import BeliefArrays, Rules, Workspace
 from ..kernels.scan_update import (
     DONE,
     add_landmarks,
@@ -115,7 +95,7 @@ def update_through_points(
     if used > 0:
         root = symmetric_root(belief.covariance, size, size)
         spread, used = look_from_points(belief.mean, root, rules, rows, ledger, count)
-        failed = condition(belief, root, spread[: 2 * used], rows, ledger[COLUMN])
+        failed = condition(belief, root, spread[: 2 * used], rows, ledger[gain.COLUMN])
         if failed >= 0:
             return failed // 2, used, 0.0
     add_landmarks(belief, size, readings, count, rules, ledger)
@@ -131,14 +111,18 @@ def look_from_points(
     The system receives ν and the diagonal of Q, at the mean distance of the points, of
     the m readings within the gate.
     """
-    size, system, read, used = len(root), rows[FIRST:], 0, 0
+    size, system, read, used = len(root), rows[gain.FIRST :], 0, 0
     spread = np.empty((2 * count, 2 * size))
     for k in range(count):
-        if ledger[OUTCOME, k] != USED:
+        if ledger[gain.OUTCOME, k] != gain.USED:
             continue
-        row, c, meta = 2 * used, ledger[COLUMN, read], system[2 * read : 2 * read + 2]
-        z0, z1 = meta[0, READING], meta[1, READING]
-        v0, v1 = meta[0, VARIANCE], meta[1, VARIANCE]
+        row, c, meta = (
+            2 * used,
+            ledger[gain.COLUMN, read],
+            system[2 * read : 2 * read + 2],
+        )
+        z0, z1 = meta[0, gain.READING], meta[1, gain.READING]
+        v0, v1 = meta[0, gain.VARIANCE], meta[1, gain.VARIANCE]
         read, distance, first, second = read + 1, 0.0, spread[row], spread[row + 1]
         dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
         e0, e1 = expected_reading_jit(dx, dy, mean[2])
@@ -158,11 +142,11 @@ def look_from_points(
             s00, s10 = (first * first).mean() + v0, (first * second).mean()
             s11 = (second * second).mean() + v1
             if not squared_ratio(n0, n1, s00, s10, s11) <= rules.gate:
-                ledger[OUTCOME, k] = GATED
+                ledger[gain.OUTCOME, k] = gain.GATED
                 continue
-        system[row, INNOVATION], system[row + 1, INNOVATION] = n0, n1
-        system[row, VARIANCE], system[row + 1, VARIANCE] = v0, v1
-        ledger[COLUMN, used] = c
+        system[row, gain.INNOVATION], system[row + 1, gain.INNOVATION] = n0, n1
+        system[row, gain.VARIANCE], system[row + 1, gain.VARIANCE] = v0, v1
+        ledger[gain.COLUMN, used] = c
         used += 1
     return spread, used
 
@@ -181,16 +165,16 @@ def condition(
     with the deviations D of the points.  Returns -1, or the row at which S is not
     positive definite; the belief is then as before.
     """
-    (bottom, points), size, system = spread.shape, len(root), rows[FIRST:]
-    begin_correction(size, rows, system, bottom)
-    delta, A = rows[CORRECTION], (spread[:, :size] - spread[:, size:]) @ root
+    (bottom, points), size, system = spread.shape, len(root), rows[gain.FIRST :]
+    gain.begin_correction(size, rows, system, bottom)
+    delta, A = rows[gain.CORRECTION], (spread[:, :size] - spread[:, size:]) @ root
     L = spread @ spread.T
     for i in range(bottom):
-        row, w = system[i], system[i, INNOVATION]
+        row, w = system[i], system[i, gain.INNOVATION]
         row[: len(belief.mean)] = 0.0
         for j in range(size):
             row[j] = A[i, j] / points
-        own = L[i, i] / points + row[VARIANCE]
+        own = L[i, i] / points + row[gain.VARIANCE]
         rest = own
         for k in range(i):
             factor = L[i, k] / points
@@ -198,20 +182,20 @@ def condition(
                 factor -= L[i, j] * L[k, j]
             L[i, k] = factor = factor / L[k, k]
             rest -= factor * factor
-            w -= factor * system[k, WHITE]
+            w -= factor * system[k, gain.WHITE]
             for j in range(size):
                 row[j] -= factor * system[k, j]
-        if not rest > SINGULAR * own:
+        if not rest > gain.SINGULAR * own:
             return i
         L[i, i] = root_of_rest = np.sqrt(rest)
-        row[WHITE] = w / root_of_rest
+        row[gain.WHITE] = w / root_of_rest
         for j in range(size):
             row[j] /= root_of_rest
-            delta[j] += row[WHITE] * row[j]
+            delta[j] += row[gain.WHITE] * row[j]
     for j in range(size):
         belief.mean[j] += delta[j]
-    downdate(belief.covariance, size, system, 0, bottom)
-    restore_upper(belief.covariance, size)
+    gain.downdate(belief.covariance, size, system, 0, bottom)
+    gain.restore_upper(belief.covariance, size)
     record(L, system, columns)
     return -1
 
@@ -221,9 +205,12 @@ def record(L: Array, system: Array, columns: IntArray) -> None:
     """Leave L where a report looks for H Aᵀ, with H that selects a column."""
     for i in range(len(L)):
         c = columns[i // 2] + i % 2
-        system[i, ROOT], system[i, ROOT + 1] = L[i, i & -2], L[i, i | 1] * (i % 2)
-        system[i, JACOBIAN : JACOBIAN + 5] = 0.0
-        system[i, LANDMARK_X + i % 2] = 1.0
+        system[i, gain.ROOT], system[i, gain.ROOT + 1] = (
+            L[i, i & -2],
+            L[i, i | 1] * (i % 2),
+        )
+        system[i, gain.JACOBIAN : gain.JACOBIAN + 5] = 0.0
+        system[i, gain.LANDMARK_X + i % 2] = 1.0
         system[: len(L), c] = L[i]
 
 
