@@ -6,7 +6,8 @@ landmarks out of local minima.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -27,7 +28,7 @@ from ..models.bearing_range import (
 from ..models.sensors import Sensor, for_sensor
 from ..support.argument_checks import refuse_beyond_memory
 from . import elimination
-from .drive import Drive, DriveArrays
+from .drive import Drive, DriveArrays, Sightings
 
 KINDS = {
     None: elimination.SQUARED,
@@ -395,30 +396,40 @@ def filter_drive(
     belief : Belief
         At the end.
     """
-    rules, noise = drive.rules, drive.motion_noise
-    slam = InvariantEkfSlam(
-        np.sqrt(noise.variance),
-        (rules.first_std, rules.second_std),
-        initial_pose=drive.initial_pose,
-        initial_pose_std=drive.initial_pose_std,
-        sensor=drive.sensor,
-        noise_at_rest=noise.at_rest,
-        min_range=rules.min_range,
-        motion=noise.motion,
-        iterations=iterations,
-    )
+    slam = InvariantEkfSlam(**filter_options(drive), iterations=iterations)
     if known is not None:
         _take_map(slam, drive, known)
     poses = np.empty((drive.poses, 3))
+    for k, seen in enumerate(moved_along(drive, slam)):
+        for readings, ids in seen.distinct():
+            slam.update(readings, ids)
+        poses[k] = slam.map.mean[:3]
+    return poses, slam.belief()
+
+
+def filter_options(drive: Drive) -> dict[str, Any]:
+    """Return the arguments of a filter with the noise and the start of a drive."""
+    rules, noise = drive.rules, drive.motion_noise
+    return {
+        "motion_std": np.sqrt(noise.variance),
+        "measurement_std": (rules.first_std, rules.second_std),
+        "initial_pose": drive.initial_pose,
+        "initial_pose_std": drive.initial_pose_std,
+        "sensor": drive.sensor,
+        "noise_at_rest": noise.at_rest,
+        "min_range": rules.min_range,
+        "motion": noise.motion,
+    }
+
+
+def moved_along(drive: Drive, slam: Any) -> Iterator[Sightings]:
+    """Move a filter along a drive, and yield what it is to see at each pose."""
     for k, motion in enumerate(drive.motions):
         for distance, turn, dt in motion.steps:
             slam.predict((distance, turn), dt)
         for given in drive.pose_readings(k):
             slam.observe_pose(*given)
-        for readings, ids in drive.sightings(k).distinct():
-            slam.update(readings, ids)
-        poses[k] = slam.map.mean[:3]
-    return poses, slam.belief()
+        yield drive.sightings(k)
 
 
 def start_of(

@@ -12,10 +12,11 @@ clutter.  v times a scan does not show a landmark that is well in view, between 
 first and its last reading; without this price d, two landmarks for one would lower the
 cost, each of them with the nearer half of the readings.
 
-Small changes keep the poses: readings go to the landmarks that they fit, landmarks that
-do not pay for themselves leave, and others enter.  Large changes
-take landmarks apart where they are seen again after a gap, and match the parts of the
-drive anew, by the largest cliques of pairs of landmarks with equal distances.
+The search begins with the associations given or, if these score lower, with those of
+the default filter.  Small changes keep the poses: readings go to the landmarks that
+they fit, landmarks that do not pay for themselves leave, and others enter.  Large
+changes take landmarks apart where they are seen again after a gap, and match the parts
+of the drive anew, by the largest cliques of pairs of landmarks with equal distances.
 
 References
 ----------
@@ -27,7 +28,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,8 +41,9 @@ from ..kernels.assignment_search import compare_pairs
 from ..kernels.scan_update import as_rules, variances
 from ..models.bearing_range import wrap_angle, wrap_angle_jit
 from ..models.sensors import only_bearing_range
+from ..registry import make_estimator
 from .drive import Drive, DriveArrays, Sightings, landmark_order
-from .optimiser import Estimate, Noise, Optimiser, start_of
+from .optimiser import Estimate, Noise, Optimiser, filter_options, moved_along, start_of
 
 NONE = -1  # the landmark of a reading that has none
 #: c: a reading costs no more; half of χ² with two degrees of freedom, 99.75 %.
@@ -118,12 +120,14 @@ def reassociate(
     search = _Search(drive)
     poses = start_of(drive)[0] if start is None else np.asarray(start, dtype=float)
     first = search.first(poses)
-    best = search.settled(first)
-    for done, parts in enumerate(PARTS, start=1):
+    other = search.followed()
+    best = search.settled(other if other and other.score < first.score else first)
+    progress(1, 1 + len(PARTS))
+    for done, parts in enumerate(PARTS, start=2):
         trial = search.rebuilt(best, parts)
         if trial is not None and trial.score < best.score:
             best = trial
-        progress(done, len(PARTS))
+        progress(done, 1 + len(PARTS))
     return search.result(best, first.score)
 
 
@@ -173,6 +177,18 @@ class _Search:
                 "the drive cannot be smoothed with its given association"
             )
         return min(states, key=lambda state: state.score)
+
+    def followed(self) -> _State | None:
+        """Smooth with the associations of the default filter; None if that fails."""
+        options = filter_options(self.drive)
+        slam: Any = make_estimator("invariant", management=True, **options)
+        try:
+            for readings, _ in moved_along(self.drive, slam):
+                slam.update(readings)
+        except np.linalg.LinAlgError:
+            return None
+        found = [i for scan in slam.decisions for i in scan.row_ids]
+        return self.begun(np.array([NONE if i is None else i for i in found]))
 
     def begun(self, labels: IntArray) -> _State | None:
         """Smooth with associations that are far from those before; None if it fails."""

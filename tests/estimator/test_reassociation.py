@@ -75,7 +75,12 @@ def outcome(ids, truth):
     return len(true) - right - unused, unused, len(labels)
 
 
-@pytest.mark.parametrize("spoil", [twice, swapped, dropped, as_one])
+def shuffled(k, ids):
+    """Give all landmarks other names in every scan: the run is wholly lost."""
+    return np.random.default_rng(k).permutation(len(WORLD))[ids]
+
+
+@pytest.mark.parametrize("spoil", [twice, swapped, dropped, as_one, shuffled])
 def test_a_spoilt_association_is_repaired(spoil):
     _, right = two_laps(1)
     wrong = renamed(right, spoil)
