@@ -241,7 +241,7 @@ def _same_shape(
 ) -> tuple[Array, Array, IntArray]:
     scores = argument_checks.as_floats("nees", nees)
     if scores.ndim != 2 or scores.shape[1] < 2:
-        raise ValueError(f"nees must be shape (runs, steps >= 2), got {scores.shape}")
+        raise ValueError(f"nees must have shape (runs, steps >= 2), got {scores.shape}")
     scans = argument_checks.shaped("nis", nis, scores.shape)
     freedom = np.asarray(nis_dof, dtype=np.int64)
     argument_checks.shaped("nis_dof", freedom, scores.shape)

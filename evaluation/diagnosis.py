@@ -226,7 +226,7 @@ def _checked_sums(noise: ArrayLike, runs: int) -> Array:
 def _checked(nees: ArrayLike, heading_nees: ArrayLike) -> tuple[Array, Array]:
     pose = argument_checks.as_floats("nees", nees)
     if pose.ndim != 2 or not pose.shape[1]:
-        raise ValueError(f"nees must be shape (runs, steps), got {pose.shape}")
+        raise ValueError(f"nees must have shape (runs, steps), got {pose.shape}")
     heading = argument_checks.shaped("heading_nees", heading_nees, pose.shape)
     known = np.isfinite(pose)
     first = int(known.all(axis=0).argmax())

@@ -291,7 +291,7 @@ def noise_sums(
     argument_checks.one_of("noise_in", noise_in, ("motion", "odometry"))
     poses = argument_checks.as_floats("true_poses", true_poses)
     if poses.ndim != 3 or poses.shape[-1] != 3:
-        raise ValueError(f"true_poses must be shape (B, T, 3), got {poses.shape}")
+        raise ValueError(f"true_poses must have shape (B, T, 3), got {poses.shape}")
     shape = poses.shape[:2]
     points = argument_checks.as_floats("landmarks", landmarks)
     seen = np.asarray(visible, dtype=np.bool_)
@@ -301,7 +301,7 @@ def noise_sums(
     moved = argument_checks.shaped("odometry", moved, (*shape, 3))
     if seen.shape != (*shape, points.shape[1]) or len(points) != len(poses):
         raise ValueError(
-            f"visible must be shape {(*shape, points.shape[1])}, got {seen.shape}"
+            f"visible must have shape {(*shape, points.shape[1])}, got {seen.shape}"
         )
     readings = argument_checks.shaped("measurements", measurements, (*seen.shape, 2))
     motion = argument_checks.standard_deviations("motion_std", motion_std, 3)

@@ -213,7 +213,7 @@ def landmark_covariances(covariance: ArrayLike) -> Array:
     P = as_floats("covariance", covariance)
     size = len(P) if P.ndim else 0
     if P.shape != (size, size) or size < 3 or size % 2 == 0:
-        raise ValueError(f"covariance must be shape (3 + 2n, 3 + 2n), got {P.shape}")
+        raise ValueError(f"covariance must have shape (3 + 2n, 3 + 2n), got {P.shape}")
     rows = np.arange(3, size).reshape(-1, 2)
     return np.asarray(P[rows[:, :, None], rows[:, None, :]])
 
@@ -255,7 +255,7 @@ def poses_at(times: ArrayLike, ground_truth: ArrayLike) -> Array:
     t = as_floats("times", times)
     path = as_floats("ground_truth", ground_truth)
     if path.ndim != 2 or path.shape[1] != 4:
-        raise ValueError(f"ground_truth must be shape (n, 4), got {path.shape}")
+        raise ValueError(f"ground_truth must have shape (n, 4), got {path.shape}")
     if not len(path):
         return np.full((len(t), 3), np.nan)
     columns = (path[:, 1], path[:, 2], _unwrapped(path[:, 3]))

@@ -30,7 +30,7 @@ from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import ErrorFrame
 from ..models.sensors import for_sensor, only_placing
 from ..support import argument_checks, saved_states
-from ..support.argument_checks import aligned_zeros, usable_cores
+from ..support.argument_checks import aligned_zeros, shaped, usable_cores
 from .conditioning import FRAMES, ObservedMap, PoseReading, gate_of
 from .ekf import EkfSlam
 from .gaussian_map import GaussianMap, workspace_for
@@ -431,15 +431,9 @@ def step_data(
     """
     (count, landmarks), u = shape, argument_checks.as_floats("odometry", odometry)
     steps = u.shape[1] if u.ndim == 3 else 0
-    z = argument_checks.as_floats("measurements", measurements)
-    seen = np.ascontiguousarray(visible, dtype=np.bool_)
-    for name, array, expected in (
-        ("odometry", u, (count, steps, 2)),
-        ("measurements", z, (count, steps, landmarks, 2)),
-        ("visible", seen, (count, steps, landmarks)),
-    ):
-        if array.shape != expected:
-            raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
+    u = shaped("odometry", u, (count, steps, 2))
+    z = shaped("measurements", measurements, (count, steps, landmarks, 2))
+    seen = _shaped_flags("visible", visible, (count, steps, landmarks))
     durations = argument_checks.as_floats("dt", dt)
     if durations.shape not in ((), (1,), (steps,)):
         raise ValueError(
@@ -463,23 +457,23 @@ def step_scans(
 
     ``shape`` is (B, L), the numbers of runs and landmarks.
     """
-    (count, landmarks), u = shape, argument_checks.as_floats("odometry", odometry)
-    z = argument_checks.as_floats("measurements", measurements)
-    seen = np.ascontiguousarray(visible, dtype=np.bool_)
-    durations = argument_checks.as_floats("dt", dt)
-    for name, array, expected in (
-        ("odometry", u, (count, 2)),
-        ("measurements", z, (count, landmarks, 2)),
-        ("visible", seen, (count, landmarks)),
-        ("dt", durations, (count,)),
-    ):
-        if array.shape != expected:
-            raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
+    u = shaped("odometry", odometry, (shape[0], 2))
+    z = shaped("measurements", measurements, (*shape, 2))
+    seen = _shaped_flags("visible", visible, shape)
+    durations = shaped("dt", dt, shape[:1])
     if not (durations.min() >= 0.0 and durations.max() <= LARGEST):
         raise ValueError(
             f"dt must be finite numbers >= 0 and at most {LARGEST:g}, got {dt!r}"
         )
     return _writeable(u), _writeable(z), _writeable(seen), _writeable(durations)
+
+
+def _shaped_flags(name: str, value: ArrayLike, shape: tuple[int, ...]) -> BoolArray:
+    """Return ``value`` as truth values of one shape, or refuse it."""
+    flags = np.ascontiguousarray(value, dtype=np.bool_)
+    if flags.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {flags.shape}")
+    return flags
 
 
 def _writeable(array: AnyArray) -> AnyArray:
@@ -528,27 +522,19 @@ def checked_beliefs(
 ) -> LoadedBeliefs:
     """Return beliefs of B runs over L landmarks, or refuse those of the chosen runs."""
     count, size = len(runs), 3 + 2 * landmarks
-    means = argument_checks.as_floats("beliefs.means", beliefs.means)
-    covariances = argument_checks.as_floats("beliefs.covariances", beliefs.covariances)
-    points = means
+    points = means = shaped("beliefs.means", beliefs.means, (count, size))
+    P = shaped("beliefs.covariances", beliefs.covariances, (count, size, size))
     if references is not None:
-        points = argument_checks.as_floats("references", references)
+        points = shaped("references", references, (count, size))
     mapped = np.asarray(beliefs.mapped)
-    for name, array, shape in (
-        ("beliefs.means", means, (count, size)),
-        ("beliefs.covariances", covariances, (count, size, size)),
-        ("beliefs.mapped", mapped, (count, landmarks)),
-        ("references", points, (count, size)),
-    ):
-        if array.shape != shape:
-            raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
     if mapped.dtype != np.bool_:
         raise ValueError(f"beliefs.mapped must be booleans, got {mapped.dtype}")
+    mapped = _shaped_flags("beliefs.mapped", mapped, (count, landmarks))
     for run in np.flatnonzero(runs).tolist():
-        problem = _problem(means[run], covariances[run], points[run])
+        problem = _problem(means[run], P[run], points[run])
         if problem:
             raise ValueError(f"{problem} in run {run}")
-    return LoadedBeliefs(means, covariances, points, mapped)
+    return LoadedBeliefs(means, P, points, mapped)
 
 
 def _problem(mean: Array, covariance: Array, reference: Array) -> str | None:

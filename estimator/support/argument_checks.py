@@ -78,7 +78,7 @@ def shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Return ``value`` as float64 of one shape, or refuse it."""
     array = as_floats(name, value)
     if array.shape != shape:
-        raise ValueError(f"{name} must be shape {shape}, got {array.shape}")
+        raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
     return array
 
 

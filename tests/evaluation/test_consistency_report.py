@@ -131,7 +131,7 @@ def test_unknown_frames_and_misfit_shapes_are_refused(scores):
     nees, nis, freedom = scores
     with pytest.raises(ValueError, match="frame must be"):
         report(*scores, frame="global")
-    with pytest.raises(ValueError, match="nis must be shape"):
+    with pytest.raises(ValueError, match="nis must have shape"):
         report(nees, nis[:-1], freedom)
 
 

@@ -378,7 +378,7 @@ def test_errors_that_known_identities_share_are_not_of_the_association():
     assert diagnose(**both | more).repeat > 0  # a tenth of them
     nees[[5, 7]] = 60.0
     assert diagnose(**both | {"nees": nees}).cause == "association"
-    with pytest.raises(ValueError, match="known_nees must be shape"):
+    with pytest.raises(ValueError, match="known_nees must have shape"):
         diagnose(**both | {"known_nees": known[:, 1:]})
 
 
@@ -431,11 +431,11 @@ def test_few_runs_decide_nothing():
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("noise", np.zeros((RUNS, 5, 6)), r"noise must be shape \(60, 5, 9\)"),
+        ("noise", np.zeros((RUNS, 5, 6)), r"noise must have shape \(60, 5, 9\)"),
         ("noise", np.full((RUNS, 5, 9), np.nan), "noise must be finite"),
-        ("nees", np.ones(RUNS), r"nees must be shape \(runs, steps\)"),
+        ("nees", np.ones(RUNS), r"nees must have shape \(runs, steps\)"),
         ("nees", np.full((RUNS, STEPS), np.nan), "nees must be finite"),
-        ("heading_nees", np.ones((RUNS, 2)), "heading_nees must be shape"),
+        ("heading_nees", np.ones((RUNS, 2)), "heading_nees must have shape"),
     ],
 )
 def test_bad_input_is_refused_by_name(name, value, message):
@@ -446,10 +446,10 @@ def test_bad_input_is_refused_by_name(name, value, message):
 @pytest.mark.parametrize(
     ("place", "message"),
     [
-        (0, r"true_poses must be shape \(B, T, 3\)"),
-        (2, "odometry must be shape"),
-        (3, "measurements must be shape"),
-        (4, "visible must be"),
+        (0, r"true_poses must have shape \(B, T, 3\)"),
+        (2, "odometry must have shape"),
+        (3, "measurements must have shape"),
+        (4, "visible must have"),
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(place, message):

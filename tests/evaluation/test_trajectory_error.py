@@ -141,7 +141,7 @@ def test_squared_mahalanobis_distance_of_true_deviates_averages_two():
         ([[1, 2]], [np.zeros((2, 2))], "covariances must be positive definite"),
         ([[1, 2]], [np.diag([1, -1])], "covariances must be positive definite"),
         ([[1, 2]], [np.ones((2, 2))], "covariances must be positive definite"),
-        (np.zeros((2, 2)), np.eye(2), r"covariances must be shape \(2, 2, 2\)"),
+        (np.zeros((2, 2)), np.eye(2), r"covariances must have shape \(2, 2, 2\)"),
         ([[math.inf, 0]], [np.eye(2)], "landmarks must be finite"),
     ],
 )
@@ -162,7 +162,7 @@ def test_landmark_covariances_are_the_blocks_behind_the_pose():
 
 @pytest.mark.parametrize("shape", [(4, 4), (5, 7), (2, 2), (5,), (1, 1)])
 def test_joint_covariance_of_the_wrong_shape_is_refused(shape):
-    with pytest.raises(ValueError, match=r"covariance must be shape \(3 \+ 2n"):
+    with pytest.raises(ValueError, match=r"covariance must have shape \(3 \+ 2n"):
         landmark_covariances(np.zeros(shape))
 
 
@@ -213,7 +213,7 @@ def test_positions_that_do_not_fit_are_refused(estimate, truth, message):
 
 @pytest.mark.parametrize("path", [[0.0, 1.0, 2.0, 3.0], [[0.0, 1.0, 2.0]]])
 def test_a_true_path_must_have_a_time_and_a_pose_in_each_row(path):
-    with pytest.raises(ValueError, match=r"ground_truth must be shape \(n, 4\), got"):
+    with pytest.raises(ValueError, match=r"ground_truth must have shape \(n, 4\), got"):
         poses_at([0.5], path)
 
 
