@@ -238,7 +238,7 @@ class _Search:
     def settled(self, state: _State) -> _State:
         """Make small changes until none lowers the score."""
         for _ in range(ROUNDS):
-            trials = (self.joined(state), self.rearranged(state))
+            trials = (move(state) for move in (self.joined, self.rearranged))
             better = (t for t in trials if t and t.score < state.score - SIGNIFICANT)
             new = next(better, None)
             if new is None:
@@ -296,6 +296,8 @@ class _Search:
         gains = np.maximum.reduceat(saved, self.starts, axis=0)
         best = int(gains.sum(axis=0).argmax())
         enough = (gains[:, best] > 0).sum() >= LEAST
+        own = np.where(saved[:, best] > 0, 0, NONE)
+        price += MISS * self.missed(poses, located[best, None], own)
         worth = gains[:, best].sum() > price
         return located[best] if enough and worth else None
 

@@ -133,6 +133,18 @@ def test_two_landmarks_for_one_do_not_lower_the_score():
     assert search.smoothed(labels, first.poses, places).score > first.score + 10
 
 
+def test_only_a_landmark_that_most_scans_show_is_born():
+    path, right = two_laps(1)
+    search = _Search(right)
+    state = search.first(path)
+    costs = search.costs(state.poses, state.places)
+    price = 1.0  # saved by few readings of any landmark
+    assert search.birth(state.poses, costs, price) is None
+    for k, place in enumerate(state.places):
+        born = search.birth(state.poses, np.delete(costs, k, 1), price)
+        np.testing.assert_allclose(born, place, atol=0.5)
+
+
 def test_progress_and_refusals():
     _, right = two_laps(5)
     seen = []
