@@ -195,10 +195,10 @@ def landmark_ids(name: str, value: Any, shape: tuple[int, ...] = (-1,)) -> list[
     return identities(ids, len(ids))
 
 
-def flag(name: str, value: Any, shape: tuple[int, ...] = ()) -> bool:
+def flag(name: str, value: Any) -> bool:
     """Return a truth value of a state, or refuse it."""
     given = np.asarray(value)
-    if given.shape != shape or given.dtype.kind not in "biuf" or given not in (0, 1):
+    if given.shape or given.dtype.kind not in "biuf" or given not in (0, 1):
         raise ValueError(f"state[{name!r}] must be True or False, got {value!r}")
     return bool(given)
 
@@ -216,7 +216,6 @@ COVARIANCE = Kind(np.float64, covariance)
 WHOLE = Kind(np.int64, whole_numbers)
 COUNTS = Kind(np.int64, partial(whole_numbers, least=0))
 IDS = Kind(np.int64, landmark_ids)
-FLAG = Kind(np.bool_, flag)
 
 
 # --------------------------------------------------------------------------------------
