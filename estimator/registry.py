@@ -46,7 +46,8 @@ def register_estimator(name: str, factory: EstimatorFactory) -> None:
     Parameters
     ----------
     name : str
-        Name to call it by; an earlier estimator of that name is replaced.
+        Name to call it by, without brackets and commas, which labels use; an earlier
+        estimator of that name is replaced.
     factory : callable
         Called with ``motion_std``, ``measurement_std``, ``initial_pose``,
         ``initial_pose_std`` and options as keywords; returns the estimator.  Its
@@ -62,6 +63,9 @@ def register_estimator(name: str, factory: EstimatorFactory) -> None:
     """
     if not callable(factory):
         raise TypeError(f"factory must be callable, got {factory!r}")
+    label = _LABEL.fullmatch(name) if isinstance(name, str) else None
+    if label is None or label["name"].strip() != name:
+        raise ValueError(f"name must have no brackets and no commas, got {name!r}")
     _factories[name] = factory
 
 

@@ -109,6 +109,8 @@ def replay(
     ValueError
         If the estimator refuses a reading, naming the time in the log; before the
         first step, if the log names more landmarks than a belief of it may hold.
+    TypeError
+        If the estimator is none, but its class or its name, for example.
     numpy.linalg.LinAlgError
         If its covariance degenerates, naming the time too.
     MemoryError
@@ -124,6 +126,10 @@ def replay(
     >>> replay(log, slam).readings
     ReadingCounts(associated=1, added=1, rejected=0, skipped=0, near=1, ...
     """
+    if isinstance(estimator, type) or not hasattr(estimator, "predict"):
+        raise TypeError(
+            f"estimator must be a filter, as make_estimator returns it, got {estimator}"
+        )
     refuse_large_map(log, estimator)
     steps = list(recording.steps_of(log))
     times = np.array([step.t for step in steps], dtype=np.float64)

@@ -640,3 +640,8 @@ def test_a_registered_estimator_is_made_by_name():
     assert isinstance(make_estimator("mine_for_this_test", **NOISE), Mine)
     with pytest.raises(TypeError, match="factory must be callable"):
         register_estimator("nothing", 3)
+    for name in ("", "mine[x]", "mine,yours", " mine", None):
+        with pytest.raises(
+            ValueError, match="must have no brackets and no comma"
+        ):
+            register_estimator(name, Mine)

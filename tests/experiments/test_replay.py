@@ -561,3 +561,9 @@ def test_a_truth_that_is_known_at_some_steps_only_gives_no_warning_of_numpy():
     done = replay(short_drive(ground_truth=truth), settings.make((0, 0, 0)))
     assert done.trace.frame == "invariant"
     assert np.isnan(pose_nees(done.trace)).any()
+
+
+@pytest.mark.parametrize("given", [None, "ekf", EkfSlam])
+def test_what_is_no_filter_is_refused_by_replay(given):
+    with pytest.raises(TypeError, match="estimator must be a filter, as make_estimat"):
+        replay(SlamLog("empty"), given)
