@@ -98,7 +98,8 @@ class ScanAssociation:
         density = self._density.after(self._readings, new, len(self.confirmed))
         strange = sum(label >= known for label in self.labels)
         numbers = strange, len(self.labels) - len(new)
-        evidence = self.detections.evidence.with_heading(view.covariance[2, 2])
+        heading = view.covariance[2, 2], len(view.mapped) > 0
+        evidence = self.detections.evidence.with_heading(*heading)
         evidence = evidence.with_readings(*numbers, self._density)
         detections = self.detections._replace(evidence=evidence)
         changed = self._tentative, self._waiting, self._next_id, self.scan + 1
@@ -236,7 +237,7 @@ class ScanAssociation:
 # lost the heading: linearised equations do not hold where its standard deviation is a
 # radian.  Scans in succession that leave the heading unknown count c / 2 each::
 #
-#     h ← h + c / 2  if min(σ²_θ, π²/3) > least + 0.8 rad²
+#     h ← h + c / 2  if min(σ²_θ, π²/3) > least + 0.8 rad² and there is a map
 #     h ← 0          otherwise
 #
 # π²/3 is the variance of a uniform heading: one that is unknown at the start is no
@@ -273,7 +274,7 @@ class LostEvidence(NamedTuple):
             first_new = max(first_new, 1 + max(mapped, default=-1))
         return LostEvidence(present, max(self.largest, present), first_new, *self[3:])
 
-    def with_heading(self, variance: float) -> LostEvidence:
+    def with_heading(self, variance: float, has_map: bool = True) -> LostEvidence:
         """Count a scan that leaves a variance of the heading [rad²].
 
         Examples
@@ -286,7 +287,8 @@ class LostEvidence(NamedTuple):
         """
         variance = min(float(variance), UNIFORM)
         surest, grown = min(self.surest, variance), variance - self.surest
-        unknown = self.unknown + MOST_OF_SCAN / 2 if grown > UNKNOWN else 0.0
+        is_unknown = has_map and grown > UNKNOWN
+        unknown = self.unknown + MOST_OF_SCAN / 2 if is_unknown else 0.0
         largest = max(self.largest, unknown)
         return self._replace(largest=largest, surest=surest, unknown=unknown)
 

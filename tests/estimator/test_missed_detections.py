@@ -328,11 +328,11 @@ def test_the_alarm_stays_once_the_map_is_seen_again():
     assert detections.evidence.largest == max(scores)
 
 
-def with_headings(stds):
+def with_headings(stds, has_map=True):
     """Return the evidence after scans that leave these deviations of the heading."""
     evidence = LostEvidence()
     for std in stds:
-        evidence = evidence.with_heading(std**2)
+        evidence = evidence.with_heading(std**2, has_map)
     return evidence
 
 
@@ -345,6 +345,10 @@ def test_a_heading_that_stays_unknown_is_evidence_of_a_lost_run():
 @pytest.mark.parametrize("std", [1.6, np.pi, 10.0])
 def test_a_heading_that_is_unknown_from_the_start_is_no_evidence(std):
     assert with_headings([std, std, std + 1, std + 1, std + 1]).largest == 0
+
+
+def test_a_heading_is_no_evidence_before_there_is_a_map():
+    assert with_headings([0.1, 2.0, 2.0, 2.0, 2.0], has_map=False).largest == 0
 
 
 def scans_with_strange_readings(scans):
