@@ -58,7 +58,7 @@ def _decision_order(feasible: BoolArray, innovations: Array) -> IntArray:
 
     Ties are broken by the readings themselves: the order of the scan has no effect.
     """
-    options = feasible.sum(axis=1)
+    _, options = _candidates(feasible)
     order = np.arange(len(options))
     if feasible.shape[1] == 0:  # there are no innovations to compare
         return order
@@ -89,15 +89,17 @@ def _needed(feasible: BoolArray, order: IntArray) -> tuple[IntArray, IntArray]:
         each depth on may belong to, shape (m + 1,).
     """
     rows, landmarks = feasible.shape
-    last = np.full(landmarks, -1)
-    for depth in range(rows):
+    names, counts = np.empty(landmarks, np.int64), np.zeros(rows + 1, np.int64)
+    is_listed, found = np.zeros(landmarks, np.bool_), 0
+    for depth in range(rows - 1, -1, -1):
         for j in range(landmarks):
-            if feasible[order[depth], j]:
-                last[j] = depth
-    counts = np.zeros(rows + 1, np.int64)
-    for depth in range(rows):
-        counts[depth] = (last >= depth).sum()
-    return np.argsort(-last, kind="mergesort"), counts
+            if feasible[order[depth], j] and not is_listed[j]:
+                is_listed[j], names[found], found = True, j, found + 1
+        counts[depth] = found
+    for j in range(landmarks):
+        if not is_listed[j]:
+            names[found], found = j, found + 1
+    return names, counts
 
 
 @njit_internal
