@@ -18,13 +18,9 @@ from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
 from ..interface import MapView
 from ..kernels.assignment_search import (
-    SURE,
     UNPAIRED,
-    Problem,
     best_assignments,
-    condition_on_all,
     fill_expected,
-    fit,
     largest_change,
     reading_covariance,
 )
@@ -40,10 +36,6 @@ TWO_LN_2PI = float(2 * np.log(2 * np.pi))
 
 #: Beliefs with the same landmarks are one if no coordinate changes by more σ.
 SAME = 1.0
-
-#: Where one assignment is followed, a pair with a landmark whose place in the scan is
-#: uncertain is used up to this νᵀ S⁻¹ ν, given the other pairs; χ² of 2 dof, 95 %.
-DOUBTFUL = 5.99
 
 
 class Assignment(NamedTuple):
@@ -102,12 +94,10 @@ def assign_scan(
         return Assignments([Assignment(0.0, slots)], explained)
     pairs_first, count = policy.association == "compatibility", len(readings)
     missing = np.zeros(count) if pairs_first else missing_costs(density)
-    is_final = most is None and policy.association in ("auto", "joint")
     if most is None:
         most = policy.branches if policy.association == "hypotheses" else 1
     scan = readings, missing, _limits(policy.pair_gate if pairs_first else inf, count)
-    doubtful = DOUBTFUL if is_final else inf
-    gates = float(policy.new_gate), float(policy.pair_gate), doubtful, float(ceiling)
+    gates = float(policy.new_gate), float(policy.pair_gate), float(ceiling)
     search = pairs_first, policy.search_nodes
     slots = np.empty((most, count), dtype=np.int64)
     found = costs, _, explained = np.empty(most), slots, np.arange(len(view.ids))
@@ -123,7 +113,7 @@ def assign_jointly(
     belief: tuple[Array, Array],
     scan: tuple[Array, Array, Array],
     of_sensor: tuple[float, ...],
-    gates: tuple[float, float, float, float],
+    gates: tuple[float, float, float],
     search: tuple[bool, int],
     result: tuple[Array, IntArray, IntArray],
 ) -> tuple[int, int]:
@@ -138,16 +128,15 @@ def assign_jointly(
     of_sensor : tuple
         The fields of a :class:`Noise`.
     gates : tuple
-        Largest νᵀ S⁻¹ ν of a reading and an explained landmark, of a pair, and of a
-        pair with an uncertain landmark; cost beyond which only the first assignment
-        found is of interest.
+        Largest νᵀ S⁻¹ ν of a reading and an explained landmark, and of a pair; cost
+        beyond which only the first assignment found is of interest.
     search : tuple
         ``pairs_first`` of the :class:`Problem`, and the limit of nodes.
     result : tuple
         Overwritten: costs (M,), slots (M, m), explained landmarks (n,).
     """
     (mean, P), (readings, missing, limits) = belief, scan
-    (new_gate, pair_gate, doubtful, ceiling), (pairs_first, nodes) = gates, search
+    (new_gate, pair_gate, ceiling), (pairs_first, nodes) = gates, search
     costs, slots, explained = result
     noise, rows = Noise(*of_sensor), len(readings)
     squared = np.full((rows, len(explained)), np.inf)
@@ -180,7 +169,6 @@ def assign_jointly(
                 slots[kept, i] = explained[marks[s, i]]
         if not _is_superfluous(problem, marks[:kept], marks[s], slots[kept]):
             costs[kept], marks[kept] = found[0][s], marks[s]
-            _leave_out_doubtful(problem, marks[s], doubtful, slots[kept])
             kept += 1
     return kept, near
 
@@ -195,39 +183,6 @@ def _is_superfluous(
         if is_part and largest_change(of_scan, other, marks) < SAME:
             return True
     return False
-
-
-@njit_internal
-def _leave_out_doubtful(
-    of_scan: tuple[Any, ...], marks: IntArray, gate: float, slots: IntArray
-) -> None:
-    """Make the readings of doubtful pairs ambiguous.
-
-    A pair is doubtful if, given the other pairs, the place of its landmark in the scan
-    is not certain, det S > `SURE` det Q, and its νᵀ S⁻¹ ν is above the gate.
-    """
-    if gate == np.inf:
-        return
-    problem = Problem(*of_scan)
-    landmarks = problem.feasible.shape[1]
-    shifts, others = np.empty((2, landmarks, 2)), marks.copy()
-    joints = np.empty((2, 2 * landmarks, 2 * landmarks))
-    for i in range(len(marks)):
-        if marks[i] == UNPAIRED:
-            continue
-        a, b, C = 2 * marks[i], 2 * marks[i] + 1, problem.joint
-        nu, q = problem.innovations[i, marks[i]], problem.variances[i, marks[i]]
-        most = SURE * q[0] * q[1]
-        if fit(nu[0], nu[1], C[a, a] + q[0], C[b, a], C[b, b] + q[1])[1] <= most:
-            continue  # and others make it more certain
-        others[i] = UNPAIRED
-        here = condition_on_all(problem, others, shifts, joints)
-        others[i] = marks[i]
-        C, shift = joints[here], shifts[here, marks[i]]
-        n0, n1 = nu[0] - shift[0], nu[1] - shift[1]
-        x, determinant = fit(n0, n1, C[a, a] + q[0], C[b, a], C[b, b] + q[1])
-        if x > gate and determinant > most:
-            slots[i] = AMBIGUOUS
 
 
 @lru_cache(maxsize=64)

@@ -193,29 +193,6 @@ def test_a_scan_is_assigned_as_step_by_step_in_numpy(method):
     assert ambiguous > 10 or method == "compatibility"  # it pairs nearly all
 
 
-@pytest.mark.parametrize("method", ["joint", "auto"])
-def test_a_pair_that_would_move_a_drifted_belief_far_must_fit_well(method):
-    noise, density = Noise(0.01, 0.05), np.full(3, 0.02)
-    mean = np.array([0.0, 0.0, 0.0, 8.0, 0.0, 0.0, 8.0, -8.0, 0.0])
-
-    def slots_of(pose_std, bearings, method=method):
-        policy = LandmarkPolicy(association=method)
-        view = MapView(mean, np.diag([*pose_std, *np.zeros(6)]) ** 2, (7, 8, 9))
-        readings = np.column_stack([bearings, np.full(len(bearings), 8.0)])
-        found = assign_scan(policy, view, readings, noise, density[: len(bearings)])
-        return found.ranked[0].slots.tolist()
-
-    drifted, sure = (0.05, 0.5, 0.02), (0.01, 0.01, 0.005)
-    assert slots_of(drifted, [0.18]) == [AMBIGUOUS]  # d² = 7.3
-    assert slots_of(drifted, [0.18], "hypotheses") == [0]  # it can be taken back
-    assert slots_of(drifted, [0.12]) == [0]  # d² = 3.2
-    assert slots_of(sure, [0.03]) == [0]  # d² = 7.0, but it moves nothing far
-    turned = (0.05, 0.05, 0.1)
-    assert slots_of(turned, [0.26]) == [AMBIGUOUS]
-    all_turned = [0.26, np.pi / 2 + 0.26, 0.26 - np.pi]  # they confirm each other
-    assert slots_of(turned, all_turned) == [0, 1, 2]
-
-
 def test_unpaired_readings_are_compared_with_free_landmarks_given_the_pairs():
     rng = np.random.default_rng(3)
     for _ in range(50):

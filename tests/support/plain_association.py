@@ -8,7 +8,6 @@ from slamgym.arrays import Array, IntArray
 from slamgym.estimator.association.scan_assignments import (
     AMBIGUOUS,
     BRANCH_SPREAD,
-    DOUBTFUL,
     NEW,
     SAME,
     innovation_distances,
@@ -16,7 +15,6 @@ from slamgym.estimator.association.scan_assignments import (
     missing_costs,
 )
 from slamgym.estimator.kernels.assignment_search import (
-    SURE,
     UNPAIRED,
     Problem,
     best_assignments,
@@ -90,28 +88,5 @@ def assign_plainly(policy, view, readings, noise, density, *, limits, most):
             for other in chosen
         ):
             chosen.append(marks)
-            if policy.association == "joint":
-                slots[doubtful(problem, marks)] = AMBIGUOUS
             kept.append((cost, slots))
     return [cost for cost, _ in kept], [slots for _, slots in kept], explained
-
-
-def doubtful(problem, marks):
-    """Return the rows of pairs with uncertain landmarks that fit badly.
-
-    With J = S⁻¹ of all pairs, one of them given the others has the covariance Jᵢᵢ⁻¹ and
-    the innovation Jᵢᵢ⁻¹ (J ν)ᵢ.
-    """
-    rows = np.flatnonzero(marks != UNPAIRED)
-    at = np.ravel(2 * marks[rows, None] + np.arange(2))
-    Q = problem.variances[rows, marks[rows]]
-    information = np.linalg.inv(problem.joint[np.ix_(at, at)] + np.diag(Q.ravel()))
-    scaled = information @ problem.innovations[rows, marks[rows]].ravel()
-    found = []
-    for k, row in enumerate(rows):
-        own = slice(2 * k, 2 * k + 2)
-        S = np.linalg.inv(information[own, own])
-        squared = scaled[own] @ S @ scaled[own]
-        if squared > DOUBTFUL and np.linalg.det(S) > SURE * Q[k].prod():
-            found.append(row)
-    return found
