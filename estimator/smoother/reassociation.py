@@ -56,7 +56,7 @@ LEAST = 3
 SIGNIFICANT = 0.1
 ROUNDS, BIRTHS, SEEDS = 8, 10, 150  # of small changes
 GAP = 30  # scans without a landmark that end a visit
-PARTS = (8, 12, 16)  # into which the drive is taken apart
+PARTS = 8  # into which the drive is taken apart
 LARGEST_TURN = 1.5  # of the later part of a drive [rad]
 MATCHES, SMALLEST_CLIQUE, NODES = 2, 3, 20_000
 TOLERANCE, ITERATIONS = 0.03, 30  # of smoothing while searching
@@ -122,12 +122,12 @@ def reassociate(
     first = search.first(poses)
     other = search.followed()
     best = search.settled(other if other and other.score < first.score else first)
-    progress(1, 1 + len(PARTS))
-    for done, parts in enumerate(PARTS, start=2):
-        trial = search.rebuilt(best, parts)
-        if trial is not None and trial.score < best.score:
-            best = trial
-        progress(done, 1 + len(PARTS))
+    steps = 1 + PARTS
+    progress(1, steps)
+    trial = search.rebuilt(best, lambda done: progress(1 + done, steps))
+    if trial is not None and trial.score < best.score:
+        best = trial
+    progress(steps, steps)
     return search.result(best, first.score)
 
 
@@ -338,14 +338,16 @@ class _Search:
         shown[self.owners[used], labels[used]] = 1
         return np.asarray(shown.T @ shown > 0)
 
-    def rebuilt(self, state: _State, parts: int) -> _State | None:
+    def rebuilt(
+        self, state: _State, progress: Callable[[int], object]
+    ) -> _State | None:
         """Take all landmarks apart where they are seen again, and match them anew.
 
         The drive is taken in successive parts.  The landmarks that a part shows first
         are matched with those before it.
         """
         scans = self.count
-        labels, length = self.visits(state.labels), -(-scans // parts)
+        labels, length = self.visits(state.labels), -(-scans // PARTS)
         now = self.begun(labels)
         for cut in range(length, scans, length):
             if now is None:
@@ -365,6 +367,7 @@ class _Search:
             while (trial := self.joined(best)) and trial.score < best.score:
                 best = trial
             now = best
+            progress(cut // length)
         return None if now is None else self.settled(now)
 
     def visits(self, labels: IntArray) -> IntArray:
