@@ -180,7 +180,8 @@ def commands_of(
     ValueError: every action must be 2 finite numbers (v [m/s], ω [rad/s]), got [2.0, nan] for world 1
     """  # noqa: E501 (an error of one line)
     refusal = partial(_refusal_of_many, len(moving))
-    array = _real_numbers(actions, (len(moving), 2), refusal).astype(np.float64)
+    given = _real_numbers(actions, (len(moving), 2), refusal)
+    array = given.astype(np.float64, order="C")  # another order would compile anew
     world = _begin_step(array, limits, dt, moving, steps)
     if world >= 0:
         raise ValueError(

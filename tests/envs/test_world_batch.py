@@ -13,6 +13,7 @@ from worlds import RANDOM_MAP, WALLS
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.envs.drives import BicycleDrive
 from slamgym.envs.robot import UnicycleBodies, UnicycleBody
+from slamgym.envs.spaces import _begin_step
 from slamgym.envs.vector import WorldBatch
 from slamgym.sim_configs import load_scenario
 
@@ -278,6 +279,13 @@ def test_actions_of_another_shape_are_refused(wrong):
 def test_actions_of_another_kind_are_refused(dtype):
     with pytest.raises(ValueError, match=r"actions must be real numbers"):
         begun().step(np.zeros((WORLDS, 2), dtype=dtype))
+
+
+def test_the_layout_of_actions_compiles_no_further_kernel():
+    batch, actions = begun(), np.linspace(-1, 1, 2 * WORLDS).reshape(WORLDS, 2)
+    for given in (actions, np.asfortranarray(actions), actions.astype(np.float32)):
+        batch.step(given)
+    assert len(getattr(_begin_step, "signatures", [None])) == 1  # plain without JIT
 
 
 def test_worlds_that_have_not_begun_do_not_step():
