@@ -46,7 +46,7 @@ def register_estimator(name: str, factory: EstimatorFactory) -> None:
     Parameters
     ----------
     name : str
-        Name to call it by, without brackets and commas, which labels use; an earlier
+        Name to call it by, without the brackets and commas of labels; an earlier
         estimator of that name is replaced.
     factory : callable
         Called with ``motion_std``, ``measurement_std``, ``initial_pose``,
@@ -65,7 +65,10 @@ def register_estimator(name: str, factory: EstimatorFactory) -> None:
         raise TypeError(f"factory must be callable, got {factory!r}")
     label = _LABEL.fullmatch(name) if isinstance(name, str) else None
     if label is None or label["name"].strip() != name:
-        raise ValueError(f"name must have no brackets and no commas, got {name!r}")
+        raise ValueError(
+            "name must be a text without brackets, commas and outer spaces, "
+            f"got {name!r}"
+        )
     _factories[name] = factory
 
 

@@ -110,7 +110,7 @@ def replay(
         If the estimator refuses a reading, naming the time in the log; before the
         first step, if the log names more landmarks than a belief of it may hold.
     TypeError
-        If the estimator is none, but its class or its name, for example.
+        If the estimator is no filter, but a class or a name, for example.
     numpy.linalg.LinAlgError
         If its covariance degenerates, naming the time too.
     MemoryError

@@ -48,7 +48,7 @@ def refuse_other_state(owner: object, state: object, parts: int) -> None:
     if not isinstance(state, tuple) or len(state) != parts:
         raise ValueError(
             f"state must be what state() of the same {type(owner).__name__} returned, "
-            f"got {type(state).__name__} of other contents"
+            f"got another object ({type(state).__name__})"
         )
 
 
