@@ -86,7 +86,7 @@ def update_through_points(
     work_arrays: tuple[Array, Array],
     rule_values: Array,
 ) -> tuple[int, int, float]:
-    """Update one belief as `update_lower_half` does, without Jacobians."""
+    """Update a belief as `update_lower_half` does, without Jacobians."""
     belief, workspace = BeliefArrays(*arrays), Workspace(*work_arrays)
     rows, rules = workspace.rows, as_rules(rule_values)
     used = screen(belief, readings, count, rules, np.inf, rows, ledger)
@@ -108,8 +108,8 @@ def look_from_points(
 ) -> tuple[Array, int]:
     """Return what each point reads, less the average of all points, (2m, 2n), and m.
 
-    The system receives ν and the diagonal of Q, at the mean distance of the points, of
-    the m readings within the gate.
+    These are the m readings within the gate.  The function also writes their ν to the
+    system, and the diagonal of their Q at the mean distance of the points.
     """
     size, system, read, used = len(root), rows[gain.FIRST :], 0, 0
     spread = np.empty((2 * count, 2 * size))
@@ -155,7 +155,7 @@ def look_from_points(
 def condition(
     belief: BeliefArrays, root: Array, spread: Array, rows: Array, columns: IntArray
 ) -> int:
-    """Condition a belief on the readings whose spread Δ the points have.
+    """Condition a belief on readings with the spread Δ over the points.
 
     ::
 
