@@ -369,14 +369,14 @@ def test_a_reading_at_an_expected_range_below_the_minimum_is_skipped(case):
 @pytest.mark.parametrize(
     ("noise", "row", "least"),
     [
-        ({"range_std_per_metre": 0.5}, 1, {"expected": 4.0, "reading": 2.0}),
-        ({"bearing_std_metres": 3.0}, 0, {"expected": 0.2, "reading": 0.9}),
+        ({"range_std_per_metre": 0.5}, 1, {"expected": 12.0, "reading": 2.0}),
+        ({"bearing_std_metres": 3.0}, 0, {"expected": 0.35, "reading": 1.0}),
     ],
 )
 def test_noise_that_depends_on_the_range_reaches_every_filter(
     case, at, noise, row, least
 ):
-    variances = []
+    variances = []  # of the landmark and of the reading together
     for options in ({}, noise):
         slam = make(case, range_noise_at=at, **options)
         tell_truth(slam, np.zeros(3))
