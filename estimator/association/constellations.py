@@ -169,10 +169,9 @@ def _has_rival(
     k = len(match.local)
     floor = max(min(k - rules.margin, int(RIVAL_SHARE * k)), 2)
     clique = np.zeros(len(places.local) + 1, dtype=np.int64)
-    rest = agree[np.ix_(others, others)]
-    nodes = rules.search_nodes
-    size, visited = search_clique(pairs[others], rest, floor, nodes, clique)
-    return size > 0 or visited >= nodes
+    rest = pairs[others], agree[np.ix_(others, others)]
+    size, visited = search_clique(*rest, floor, rules.search_nodes, clique)
+    return size > 0 or visited >= rules.search_nodes
 
 
 def _blocks(covariance: Array) -> Array:
@@ -287,7 +286,6 @@ def extended(places: TwoPlaces, match: Match) -> Match:
 
     A pair is added if it passes the gate and each landmark is the other's nearest.
     """
-    phi = turn_between(places, match)
     m, n = len(places.local), len(places.older)
     left = np.setdiff1d(np.arange(m), match.local)
     free = np.setdiff1d(np.arange(n), match.older)
@@ -298,7 +296,7 @@ def extended(places: TwoPlaces, match: Match) -> Match:
     mutual = gaps.argmin(axis=0)[nearest] == np.arange(len(left))
     i, p = left[mutual], free[nearest[mutual]]
     every = Match(np.append(match.local, i), np.append(match.older, p))
-    r, S = _offsets(places, every, phi)
+    r, S = _offsets(places, every, turn_between(places, match))
     k = 2 * len(match.local)
     try:
         gain = np.linalg.solve(S[:k, :k], S[:k, k:]).T
@@ -315,13 +313,11 @@ def extended(places: TwoPlaces, match: Match) -> Match:
 
 def is_filled(places: TwoPlaces, match: Match) -> bool:
     """Return whether most landmarks between the matched ones have a partner."""
-    phi = turn_between(places, match)
     a, b = _matched(places, match)
-    moved = np.exp(1j * phi) * (_complex(places.local) - a.mean())
-    older = _complex(places.older) - b.mean()
+    local, older = _complex(places.local) - a.mean(), _complex(places.older) - b.mean()
     radius = np.abs(older[match.older]).max()
     k = len(match.local)
-    inside = max(int((np.abs(x) <= radius).sum()) for x in (moved, older))
+    inside = max(int((np.abs(x) <= radius).sum()) for x in (local, older))
     return k >= PARTNERS * inside
 
 

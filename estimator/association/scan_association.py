@@ -96,11 +96,11 @@ class ScanAssociation:
         known = self.scan << LABEL_BITS  # lower labels are those of earlier scans
         new = [k for k, (i, label) in rows if i is None and not 0 <= label < known]
         density = self._density.after(self._readings, new, len(self.confirmed))
-        strange = sum(label >= known for label in self.labels)
-        numbers = strange, len(self.labels) - len(new)
         heading = view.covariance[2, 2], len(view.mapped) > 0
         evidence = self.detections.evidence.with_heading(*heading)
-        evidence = evidence.with_readings(*numbers, self._density)
+        others = len(self.labels) - len(new)
+        strange = sum(label >= known for label in self.labels)
+        evidence = evidence.with_readings(strange, others, self._density)
         detections = self.detections._replace(evidence=evidence)
         changed = self._tentative, self._waiting, self._next_id, self.scan + 1
         return Candidates(*changed, density, detections)
@@ -231,7 +231,8 @@ class ScanAssociation:
 #     w ← max(0, w + min(c / 2, n ln (1 + δ / μ) − δ + m ln ρ) / 2),    δ = (1 − ρ) e
 #
 # A new landmark is strange in its first scan only, which counts c / 4 at most.  The
-# half allows for clutter that comes in bursts.
+# half allows for clutter that comes in bursts.  Where one scan confirms a landmark, no
+# reading is strange.
 #
 # A lost run whose landmarks all stay in view misses none, either.  Many of these have
 # lost the heading: linearised equations do not hold where its standard deviation is a
@@ -429,30 +430,24 @@ class Candidates:
         density, C = saved["density"], saved["covariances"]
         likely = saved_states.is_semidefinite((C + C.transpose(0, 2, 1)) / 2)
         seen, expected = saved["detected"], saved["expected"]
+        is_share = (seen >= 0) & (seen <= expected)
         for name, wanted, is_so in (
             ("covariances", "positive semidefinite", likely),
             ("density", "> 0", density[:4].min() > 0),
             ("density", ">= 0", density[4] >= 0),
             ("unexplained", ">= 0", saved["unexplained"].min() >= 0),
-            (
-                "detected",
-                ">= 0, and at most 'expected'",
-                (seen >= 0) & (seen <= expected),
-            ),
+            ("detected", ">= 0, and at most 'expected'", is_share),
             ("missed", "probabilities", [0 <= left <= 1 for left in missed.values()]),
             ("lost", ">= 0", min(evidence) >= 0),
-            ("lost", "at most the largest so far", lost <= most_lost),
+            ("lost", "at most the largest so far", max(lost, *sums[:2]) <= most_lost),
         ):
             if not np.all(is_so):
                 raise ValueError(f"state['tentative.{name}'] must be {wanted}")
-        return cls(
-            TentativeLandmarks(*(saved[key] for key in TENTATIVE)),
-            waiting,
-            int(saved["next_id"]),
-            int(saved["scan"]),
-            UnexplainedDensity(*density.tolist())._replace(cells=saved["unexplained"]),
-            Detections(seen, expected, missed, shown, evidence),
-        )
+        tentative = TentativeLandmarks(*(saved[key] for key in TENTATIVE))
+        counts = int(saved["next_id"]), int(saved["scan"])
+        new = UnexplainedDensity(*density.tolist())._replace(cells=saved["unexplained"])
+        detections = Detections(seen, expected, missed, shown, evidence)
+        return cls(tentative, waiting, *counts, new, detections)
 
 
 #: What a saved state holds about the landmarks that are not in the map yet.

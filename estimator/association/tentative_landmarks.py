@@ -238,14 +238,9 @@ class UnexplainedDensity(NamedTuple):
         cells = self.cells.copy() if new else self.cells
         lengths = self.farthest, self.known
         farthest, known = _count_readings(cells, readings, rows, lengths)
-        return UnexplainedDensity(
-            MEMORY * self.readings + len(new),
-            MEMORY * self.scans + 1,
-            farthest,
-            MEMORY * self.landmarks + landmarks,
-            known,
-            cells,
-        )
+        sums = MEMORY * self.readings + len(new), MEMORY * self.scans + 1
+        confirmed = MEMORY * self.landmarks + landmarks
+        return UnexplainedDensity(*sums, farthest, confirmed, known, cells)
 
 
 def _longest_of(farthest: float, known: float) -> float:
@@ -291,8 +286,7 @@ def _count_readings(
             if not is_new[k]:
                 known = max(known, distance)
     longest = _longest_jit(farthest, known)
-    for k in new:
-        bearing, distance = readings[k, 0], readings[k, 1]
+    for bearing, distance in readings[new]:
         if np.isfinite(bearing) and np.isfinite(distance):
             cells[_cell(bearing, distance, longest)] += 1.0
     return farthest, known

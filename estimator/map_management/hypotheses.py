@@ -84,19 +84,16 @@ def distinct(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
     if len(hypotheses) == 1:
         return [*hypotheses]
     views = [h.slam.map_view() for h in hypotheses]
-    poses = [
-        [*v.mean[:3].tolist(), *v.covariance.diagonal()[:3].tolist()] for v in views
-    ]
+    variances = np.maximum([v.covariance.diagonal()[:3] for v in views], 0.0) + NIL
+    poses = np.hstack([[v.mean[:3] for v in views], variances]).tolist()
     labels = [h.slam.candidates.tentative.labels.tobytes() for h in hypotheses]
     chosen: list[int] = []
     for k, view in enumerate(views):
-        if (
-            len(chosen) < most
-            and sum(_overlap(poses[n], poses[k]) for n in chosen) < PER_BASIN
-            and not any(
-                labels[n] == labels[k] and is_near(views[n], view, SAME) for n in chosen
-            )
-        ):
+        if len(chosen) == most:
+            break
+        overlapping = sum(_overlap(poses[n], poses[k]) for n in chosen)
+        alike = (views[n] for n in chosen if labels[n] == labels[k])
+        if overlapping < PER_BASIN and not any(is_near(v, view, SAME) for v in alike):
             chosen.append(k)
     return [hypotheses[k] for k in chosen]
 
@@ -109,7 +106,7 @@ def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
         (μ₂ − μ₁)² / 4 (σ₁² + σ₂²) + ½ ln ((σ₁² + σ₂²) / 2 σ₁σ₂)
     """
     for k in range(3):
-        gap, variance, v = other[k] - one[k], one[k + 3] + NIL, other[k + 3] + NIL
+        gap, variance, v = other[k] - one[k], one[k + 3], other[k + 3]
         apart = (wrap_angle(gap) if k == 2 else gap) ** 2 / (4 * (variance + v))
         apart += log((variance + v) ** 2 / (4 * variance * v)) / 4
         if not apart <= OVERLAP:
@@ -409,14 +406,12 @@ class HypothesisSlam:
     def resume(self, before: tuple[Any, ...]) -> None:
         """Return to a :meth:`snapshot` of a filter with the same settings."""
         kept, self.steps, self._report = before
-        slams = [h.slam for h in self.hypotheses]
+        slams = self._slams
         slams += [self._pool.fresh() for _ in kept[len(slams) :]]
-        hypotheses = []
-        for (cost, own), slam in zip(kept, slams, strict=False):
+        for (_, own), slam in zip(kept, slams, strict=False):
             slam.resume(own)
-            hypotheses.append(Hypothesis(cost, slam))
-        self._pool.free(slams[len(kept) :])
-        self.hypotheses = hypotheses
+        costs = [cost for cost, _ in kept]
+        self._keep([*map(Hypothesis, costs, slams)])
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""

@@ -146,8 +146,6 @@ def _recognised(
     feasible = _offsets(view, local, older)[0] <= OFFSET_GATE
     used = feasible.any(axis=0)
     older, feasible = older[used], feasible[:, used]
-    if len(older) < rules.least:
-        return []
     turn = TURN_STDS * float(np.sqrt(view.covariance[2, 2])) + SLACK
     places = TwoPlaces(
         view.landmarks[local],
@@ -213,8 +211,7 @@ def _invariant(view: MapView, slots: IntArray) -> Array:
     """Return the covariance of ξ_q = e_q − J (q − p) e_θ of landmarks."""
     columns = (3 + 2 * slots[:, None] + np.arange(2)).ravel()
     P = view.covariance
-    lever = (view.landmarks[slots] - view.mean[:2])[:, ::-1] * (-1.0, 1.0)
-    lever = lever.ravel()
+    lever = ((view.landmarks[slots] - view.mean[:2])[:, ::-1] * (-1.0, 1.0)).ravel()
     cross = np.outer(lever, P[2, columns])
     block = P[np.ix_(columns, columns)]
     return np.asarray(block - cross - cross.T + P[2, 2] * np.outer(lever, lever))

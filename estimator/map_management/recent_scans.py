@@ -140,14 +140,9 @@ class RecentScans(Restorable):
         if self._window:
             self.scans, self.motions = scans, ()
         self.decisions.append(_decided(plan, report))
-        if first is not None:
-            self._revise_decisions(scans[first:-1])
-
-    def _revise_decisions(self, scans: Sequence[RecentScan]) -> None:
-        """Note the landmarks that the readings of earlier scans belong to now."""
-        newest = self.scans[-1].number
-        for scan in scans:
-            place = len(self.decisions) - 1 - (newest - scan.number)
+        # The readings of scans that were repeated may belong to other landmarks now.
+        for scan in [] if first is None else scans[first:-1]:
+            place = len(self.decisions) - 1 - (plan.scan - scan.number)
             if place >= 0:
                 made = self.decisions[place]
                 pairs = zip(made.row_ids, scan.row_ids, scan.labels, strict=True)

@@ -507,6 +507,15 @@ def test_variants_of_one_pose_leave_room_for_another(gap, ratio):
     assert distinct([*first, other], most=2) == first[:2]
 
 
+def test_hypotheses_are_compared_where_rounding_makes_a_variance_negative():
+    slams = [standing(x, 0.2) for x in (*[0.0] * (PER_BASIN + 1), 1.0)]
+    for slam in slams:
+        slam.map_view().covariance[0, 0] = -1e-9
+    hypotheses = [Hypothesis(k, slam) for k, slam in enumerate(slams)]
+    kept = [*hypotheses[:PER_BASIN], hypotheses[-1]]
+    assert distinct(hypotheses, most=10) == kept
+
+
 def test_readings_that_a_hypothesis_does_not_explain_cost_their_poisson_probability():
     noise = (0.01, 0.01, 0.01), (0.02, 0.1)
     free, told = (

@@ -21,6 +21,7 @@ from slamgym.estimator.association.scan_association import (
     SECTORS,
     SUREST,
     WIDEST,
+    Candidates,
     Detections,
     LostEvidence,
 )
@@ -504,3 +505,13 @@ def test_a_single_wrong_range_does_not_stretch_the_cells(scan, wrong):
     ]
     np.testing.assert_allclose(*shares, atol=0.05)
     assert not other.probably_lost
+
+
+@pytest.mark.parametrize("place", [0, 4, 5])
+def test_a_saved_state_whose_evidence_exceeds_its_largest_is_refused(place):
+    state = Candidates().state_dict()
+    state["lost"][place] = 4.0
+    with pytest.raises(ValueError, match="at most the largest so far"):
+        Candidates.from_state_dict(state)
+    state["lost"][1] = 4.0
+    assert Candidates.from_state_dict(state).detections.evidence[place] == 4.0
