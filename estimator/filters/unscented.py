@@ -116,11 +116,8 @@ def look_from_points(
     for k in range(count):
         if ledger[gain.OUTCOME, k] != gain.USED:
             continue
-        row, c, meta = (
-            2 * used,
-            ledger[gain.COLUMN, read],
-            system[2 * read : 2 * read + 2],
-        )
+        row, c = 2 * used, ledger[gain.COLUMN, read]
+        meta = system[2 * read : 2 * read + 2]
         z0, z1 = meta[0, gain.READING], meta[1, gain.READING]
         v0, v1 = meta[0, gain.VARIANCE], meta[1, gain.VARIANCE]
         read, distance, first, second = read + 1, 0.0, spread[row], spread[row + 1]
@@ -205,10 +202,8 @@ def record(L: Array, system: Array, columns: IntArray) -> None:
     """Leave L where a report looks for H Aᵀ, with H that selects a column."""
     for i in range(len(L)):
         c = columns[i // 2] + i % 2
-        system[i, gain.ROOT], system[i, gain.ROOT + 1] = (
-            L[i, i & -2],
-            L[i, i | 1] * (i % 2),
-        )
+        system[i, gain.ROOT] = L[i, i & -2]
+        system[i, gain.ROOT + 1] = L[i, i] * (i % 2)
         system[i, gain.JACOBIAN : gain.JACOBIAN + 5] = 0.0
         system[i, gain.LANDMARK_X + i % 2] = 1.0
         system[: len(L), c] = L[i]
