@@ -21,6 +21,7 @@ from .covariance_checks import step_mistakes
 from .interface import Belief, SlamEstimator, UpdateReport
 from .models.bearing_range import predict_measurement, wrap_angle
 from .models.motions import predict_pose
+from .registry import find_estimator, read_label
 
 __all__ = ["EstimatorContractError", "Finding", "check_estimator"]
 __dir__ = __all__.copy
@@ -84,7 +85,7 @@ class CallError(Exception):
 Check = Callable[[Factory], Iterator[str | CallError]]
 
 
-def check_estimator(factory: Factory) -> tuple[Finding, ...]:
+def check_estimator(factory: Factory | str) -> tuple[Finding, ...]:
     """Check that an estimator works wherever slamgym uses one.
 
     Drives a small known world and reports all findings at once, by level: what the
@@ -93,9 +94,10 @@ def check_estimator(factory: Factory) -> tuple[Finding, ...]:
 
     Parameters
     ----------
-    factory : callable
+    factory : callable or str
         Makes the estimator from the keywords ``motion_std``, ``measurement_std``,
-        ``initial_pose``, ``initial_pose_std``; a class will do.
+        ``initial_pose``, ``initial_pose_std``; a class will do, or a name as of
+        `make_estimator`.
 
     Returns
     -------
@@ -107,6 +109,8 @@ def check_estimator(factory: Factory) -> tuple[Finding, ...]:
     EstimatorContractError
         If the estimator cannot run or computes wrong beliefs. The message lists all
         findings; the attribute ``findings`` holds them.
+    ValueError
+        If there is no estimator of that name.
 
     Examples
     --------
@@ -114,6 +118,9 @@ def check_estimator(factory: Factory) -> tuple[Finding, ...]:
     >>> check_estimator(EkfSlam)
     ()
     """
+    if isinstance(factory, str):
+        name, options = read_label(factory)
+        factory = partial(find_estimator(name), **options)
     findings = find_breaches(factory)
     if any(finding.level != "recommended" for finding in findings):
         raise EstimatorContractError(listed(factory, findings), findings)

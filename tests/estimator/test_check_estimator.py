@@ -38,7 +38,7 @@ NOISE = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
 
 @pytest.mark.parametrize("name", list_estimators())
 def test_every_registered_estimator_keeps_the_contract(name):
-    assert check_estimator(lambda **settings: make_estimator(name, **settings)) == ()
+    assert check_estimator(name) == ()
     assert isinstance(make_estimator(name, **NOISE), SlamEstimator)
 
 
@@ -606,6 +606,12 @@ def test_every_frequent_mistake_differs_from_the_equations():
     assert {text for text in same if not text.startswith(zeros)} == {
         "∂θ'/∂εα has the wrong sign"
     }
+
+
+def test_the_contract_of_an_estimator_is_checked_by_its_name():
+    assert check_estimator("invariant[iterations=3]") == ()
+    with pytest.raises(ValueError, match="unknown estimator 'invarant'"):
+        check_estimator("invarant")
 
 
 def test_unknown_estimator_is_refused_with_a_suggestion():
