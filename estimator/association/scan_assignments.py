@@ -6,12 +6,14 @@ neighbour, or the most likely joint assignment.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from math import exp, inf
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from ...arrays import Array, IntArray
@@ -25,6 +27,7 @@ from ..kernels.assignment_search import (
     reading_covariance,
 )
 from ..models.bearing_range import reading_slopes_jit, wrap_angle_jit
+from ..models.sensors import only_bearing_range, sensor_in
 from ..support import argument_checks
 
 #: Assignments of a scan e^8 times less likely than the best one are not considered.
@@ -313,6 +316,21 @@ class Noise(NamedTuple):
             std[:, 0] += self.bearing_std_metres / ranges
         std[:, 1] = self.range_std + self.range_std_per_metre * ranges
         return np.asarray(std**2)
+
+
+class Sensor(NamedTuple):
+    """The properties of the sensor that association uses."""
+
+    noise: Noise
+    #: Readings closer than this have no usable bearing [m].
+    min_range: float
+
+    @classmethod
+    def checked(cls, measurement_std: ArrayLike, options: Mapping[str, Any]) -> Sensor:
+        """Read a sensor from the arguments of a filter, which has checked them."""
+        sensor = only_bearing_range(sensor_in(options), "data association")
+        noise = Noise(*sensor.noise(measurement_std))
+        return cls(noise, options.get("min_range", 1e-3))
 
 
 @jit

@@ -14,7 +14,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
@@ -25,19 +24,18 @@ from ..models.bearing_range import (
     reading_slopes_jit,
     wrap_angle_jit,
 )
-from ..models.sensors import only_bearing_range, sensor_in
 from ..support import saved_states
 from .scan_assignments import (
     AMBIGUOUS,
     NEW,
     AssociationPolicy,
     Noise,
+    Sensor,
     assign_scan,
     innovation_distances,
 )
 from .tentative_landmarks import (
     MEMORY,
-    NO_COUNTS,
     RINGS,
     SECTORS,
     TENTATIVE,
@@ -220,7 +218,24 @@ class ScanAssociation:
 # since it entered the map, it may be clutter.  If a landmark is not assigned a reading
 # that may belong to it, the scan may show it.  If a landmark entered the map after the
 # last scan at which g was 0, a lost filter may have mapped it a second time.  P_D
-# learns the rates of a lost run, too, so g falls again: the largest g counts.
+# learns the rates of a lost run, too, so g falls again: the largest evidence counts.
+#
+# Misses in succession are independent in few real drives: a tree hides another one for
+# as long as the robot stands.  A landmark seen again after misses of q < ε, where
+# q = Π (1 − P_D) since its last sighting, shows that something had hidden it and that
+# the map was right.  If k of n sightings so far were such ones, a miss counts with the
+# probability that nothing hides the landmark::
+#
+#     q / (q + 5 k' / (n + 100)),    k' = max(0, √k − 3/2)²
+#
+# k' is a lower limit of what k tends to, since a few landmarks seem to be seen again in
+# lost runs, too.  The 5 allows for sightings that begin no absence, since nothing is
+# near, and for hidden landmarks that are never seen again.
+#
+# Something near may hide all landmarks for a few scans.  So the alarm follows g slowly,
+# until g falls::
+#
+#     s ← min(g, s + (g − s) / 5)
 #
 # A robot whose odometry fails where no landmark is in view for sure misses none.  Its
 # readings are strange instead: they fit neither the map nor those of earlier scans.  A
@@ -254,6 +269,8 @@ class LostEvidence(NamedTuple):
 
     #: g: a logarithm of a ratio of likelihoods.
     present: float = 0.0
+    #: s, which follows g.
+    lasting: float = 0.0
     #: The largest evidence so far.
     largest: float = 0.0
     #: Landmarks from this identity on are newer than the last scan at which g was 0.
@@ -273,7 +290,9 @@ class LostEvidence(NamedTuple):
         first_new = self.first_new
         if present == 0:
             first_new = max(first_new, 1 + max(mapped, default=-1))
-        return LostEvidence(present, max(self.largest, present), first_new, *self[3:])
+        lasting = min(present, self.lasting + (present - self.lasting) / SCANS)
+        changed = present, lasting, max(self.largest, lasting), first_new
+        return LostEvidence(*changed, *self[4:])
 
     def with_heading(self, variance: float, has_map: bool = True) -> LostEvidence:
         """Count a scan that leaves a variance of the heading [rad²].
@@ -287,10 +306,9 @@ class LostEvidence(NamedTuple):
         True
         """
         variance = min(float(variance), UNIFORM)
-        surest, grown = min(self.surest, variance), variance - self.surest
-        is_unknown = has_map and grown > UNKNOWN
+        is_unknown = has_map and variance - self.surest > UNKNOWN
         unknown = self.unknown + MOST_OF_SCAN / 2 if is_unknown else 0.0
-        largest = max(self.largest, unknown)
+        largest, surest = max(self.largest, unknown), min(self.surest, variance)
         return self._replace(largest=largest, surest=surest, unknown=unknown)
 
     def with_readings(
@@ -303,7 +321,7 @@ class LostEvidence(NamedTuple):
         unexplained = max(0.0, self.unexplained + min(ratio, MOST_OF_SCAN / 2) / 2)
         changed = unexplained, MEMORY * self.explained + explained
         largest = max(self.largest, unexplained)
-        return LostEvidence(self.present, largest, *self[2:5], *changed)
+        return LostEvidence(*self[:2], largest, *self[3:6], *changed)
 
 
 class Detections(NamedTuple):
@@ -321,10 +339,9 @@ class Detections(NamedTuple):
     True
     """
 
-    #: Shape (SECTORS, RINGS).
-    seen: Array
-    #: Shape (SECTORS, RINGS).
-    expected: Array
+    #: Landmarks seen, expected, and returned after misses of odds below ε: shape
+    #: (3, SECTORS, RINGS).
+    counts: Array
     #: For landmarks that may have been in view since they were last seen, the
     #: probability of missing them so often if nothing hides them.
     missed: Mapping[int, float]
@@ -336,7 +353,7 @@ class Detections(NamedTuple):
     @classmethod
     def none(cls) -> Detections:
         """Return the state before the first scan."""
-        return cls(NO_COUNTS, NO_COUNTS, {}, {}, LostEvidence())
+        return cls(np.zeros((3, SECTORS, RINGS)), {}, {}, LostEvidence())
 
     def after(
         self, view: MapView, slots: IntArray, explained: IntArray, longest: float
@@ -354,13 +371,12 @@ class Detections(NamedTuple):
         longest : float
             Longest range read so far [m].
         """
-        ids, first_new = view.ids, self.evidence.first_new
+        ids, counts, evidence = view.ids, self.counts.copy(), self.evidence
         times = [self.shown.get(i, 0) for i in ids]
         pairs = zip(ids, times, strict=True)
-        proven = [i < first_new and count >= PROVEN for i, count in pairs]
+        proven = [i < evidence.first_new and count >= PROVEN for i, count in pairs]
         is_telling, scan = np.array(proven, dtype=np.bool_), (slots, explained)
         missed = np.array([self.missed.get(i, 1.0) for i in ids])
-        counts = self.seen.copy(), self.expected.copy()
         cost, fewer = _count(view[:2], scan, is_telling, longest, counts, missed)
         left, chances = self.missed, missed.tolist()
         if left or min(chances, default=1.0) < 1:
@@ -369,14 +385,13 @@ class Detections(NamedTuple):
         seen = [slot for slot in slots.tolist() if slot >= 0]
         more = {ids[j]: times[j] + 1 for j in seen if times[j] < PROVEN}
         shown = {**self.shown, **more} if more else self.shown
-        evidence = self.evidence.after(fewer, view.mapped)
-        return cost, Detections(*counts, left, shown, evidence)
+        evidence = evidence.after(fewer, view.mapped)
+        return cost, Detections(counts, left, shown, evidence)
 
     def chance_to_miss(self, view: MapView, longest: float) -> Array:
         """Return the probability that a scan does not show a landmark, shape (n,)."""
-        count, none = len(view.ids), np.zeros(0, dtype=np.int64)
-        chance, is_telling = np.ones(count), np.zeros(count, dtype=np.bool_)
-        counts = self.seen.copy(), self.expected.copy()
+        none, chance = np.zeros(0, dtype=np.int64), np.ones(len(view.ids))
+        is_telling, counts = np.zeros(len(chance), dtype=np.bool_), self.counts.copy()
         _count(view[:2], (none, none), is_telling, longest, counts, chance)
         return chance
 
@@ -400,7 +415,7 @@ class Candidates:
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all, as arrays."""
-        seen, expected, missed, shown, evidence = self.detections
+        counts, missed, shown, evidence = self.detections
         waiting = [(i, scan) for i, scans in self.waiting.items() for scan in scans]
         found = {
             **vars(self),
@@ -408,8 +423,7 @@ class Candidates:
             "waiting": waiting,
             "density": self.density[:5],
             "unexplained": self.density.cells,
-            "detected": seen,
-            "expected": expected,
+            "detected": counts,
             "missed": list(missed.items()),
             "shown": list(shown.items()),
             "lost": evidence,
@@ -425,28 +439,29 @@ class Candidates:
             waiting.setdefault(landmark_id, []).append(scan)
         missed = {int(i): left for i, left in saved["missed"].tolist()}
         shown = dict(saved["shown"].tolist())
-        lost, most_lost, first_new, surest, *sums = saved["lost"].tolist()
-        evidence = LostEvidence(lost, most_lost, int(first_new), surest, *sums)
+        evidence = LostEvidence(*saved["lost"].tolist())
+        evidence = evidence._replace(first_new=int(evidence.first_new))
+        most_lost = max(evidence.lasting, evidence.unknown, evidence.unexplained)
         density, C = saved["density"], saved["covariances"]
         likely = saved_states.is_semidefinite((C + C.transpose(0, 2, 1)) / 2)
-        seen, expected = saved["detected"], saved["expected"]
-        is_share = (seen >= 0) & (seen <= expected)
+        seen, expected, returned = saved["detected"]
+        is_share = (returned >= 0) & (returned <= seen) & (seen <= expected)
         for name, wanted, is_so in (
             ("covariances", "positive semidefinite", likely),
             ("density", "> 0", density[:4].min() > 0),
             ("density", ">= 0", density[4] >= 0),
             ("unexplained", ">= 0", saved["unexplained"].min() >= 0),
-            ("detected", ">= 0, and at most 'expected'", is_share),
+            ("detected", ">= 0, each count at most the one it is part of", is_share),
             ("missed", "probabilities", [0 <= left <= 1 for left in missed.values()]),
             ("lost", ">= 0", min(evidence) >= 0),
-            ("lost", "at most the largest so far", max(lost, *sums[:2]) <= most_lost),
+            ("lost", "at most the largest so far", most_lost <= evidence.largest),
         ):
             if not np.all(is_so):
                 raise ValueError(f"state['tentative.{name}'] must be {wanted}")
         tentative = TentativeLandmarks(*(saved[key] for key in TENTATIVE))
         counts = int(saved["next_id"]), int(saved["scan"])
         new = UnexplainedDensity(*density.tolist())._replace(cells=saved["unexplained"])
-        detections = Detections(seen, expected, missed, shown, evidence)
+        detections = Detections(saved["detected"], missed, shown, evidence)
         return cls(tentative, waiting, *counts, new, detections)
 
 
@@ -458,11 +473,10 @@ CANDIDATES: saved_states.Table = {
     "scan": (saved_states.COUNTS,),
     "density": (saved_states.NUMBERS, 5),
     "unexplained": (saved_states.NUMBERS, SECTORS, RINGS),
-    "detected": (saved_states.NUMBERS, SECTORS, RINGS),
-    "expected": (saved_states.NUMBERS, SECTORS, RINGS),
+    "detected": (saved_states.NUMBERS, 3, SECTORS, RINGS),
     "missed": (saved_states.NUMBERS, -1, 2),
     "shown": (saved_states.WHOLE, -1, 2),
-    "lost": (saved_states.NUMBERS, 7),
+    "lost": (saved_states.NUMBERS, 8),
 }
 
 #: Weights of a Gaussian at 0, +2 σ and −2 σ, which keep its variance.
@@ -479,6 +493,15 @@ WIDEST = np.pi / 4
 
 #: ρ: detection rate of a lost run, relative to that of its map.
 FEWER = 0.5
+
+#: Landmarks hidden for each one seen again, and sightings that count as none of these.
+HIDDEN_EACH, NO_RETURNS = 5, 100
+
+#: The root of a count is at most this far from the root of its mean, for most counts.
+LIMIT = 1.5
+
+#: A change of the evidence counts in full after about so many scans.
+SCANS = 5
 
 #: P_D of a missed landmark is the least up to this many cells beyond two σ.
 MARGIN = 0.5
@@ -505,7 +528,7 @@ def _count(
     scan: tuple[IntArray, IntArray],
     is_telling: BoolArray,
     longest: float,
-    counts: tuple[Array, Array],
+    counts: Array,
     missed: Array,
 ) -> tuple[float, float]:
     """Count a scan; return its cost, and the evidence that the run is lost.
@@ -521,12 +544,13 @@ def _count(
         Whether each landmark can be evidence.  Overwritten.
     longest : float
         Longest range read so far [m].
-    counts : tuple
-        ``seen`` and ``expected`` of the :class:`Detections`.  The scan is added.
+    counts : ndarray, shape (3, SECTORS, RINGS)
+        As in :class:`Detections`.  The scan is added.
     missed : ndarray, shape (n,)
         Probability of missing each landmark so often.  Updated.
     """
-    (mean, P), (slots, explained), (seen, expected) = belief, scan, counts
+    (mean, P), (slots, explained) = belief, scan
+    seen, expected, returned = counts[0], counts[1], counts[2]
     is_seen = np.zeros(len(missed), np.bool_)
     is_seen[slots[slots >= 0]] = True
     is_telling[explained] &= is_seen[explained]
@@ -535,6 +559,8 @@ def _count(
     sector = (seen.sum(axis=1) + 1) / (expected.sum(axis=1) + 2)
     usual = np.minimum(sector.reshape(-1, 1), ring.reshape(1, -1))
     shares = np.minimum((seen + 2 * usual) / (expected + 2), SUREST)
+    returns = max(np.sqrt(returned.sum()) - LIMIT, 0.0) ** 2
+    hidden = HIDDEN_EACH * returns / (seen.sum() + NO_RETURNS)
     cost, fewer = 0.0, 0.0
     for j in range(len(is_seen)):
         place = _place_in_scan(mean, P, j)
@@ -547,6 +573,7 @@ def _count(
         if is_sure:
             seen[cell] += is_seen[j]
             expected[cell] += 1
+            returned[cell] += is_seen[j] and missed[j] < HIDDEN
         if is_seen[j]:
             cost -= 2 * np.log(shares[cell])
             missed[j] = 1.0
@@ -556,10 +583,11 @@ def _count(
             left = missed[j] * (1 - least) if is_sure else min(missed[j], 1 - likely)
             odds = HIDDEN + (1 - HIDDEN) * left
             cost -= 2 * np.log(odds / (HIDDEN + (1 - HIDDEN) * missed[j]))
-            missed[j] = left
             if is_sure and is_telling[j]:
                 least, _ = _shares_around(shares, place, longest, MARGIN)
-                fewer += np.log((1 - FEWER * least) / (1 - least))
+                telling = 1 / (1 + hidden / max(missed[j], 1e-99))
+                fewer += telling * np.log((1 - FEWER * least) / (1 - least))
+            missed[j] = left
     return cost, fewer
 
 
@@ -662,18 +690,3 @@ def _assumed_density(
     if policy.density is not None:
         return np.full(len(readings), policy.density)
     return learned.at(readings)
-
-
-class Sensor(NamedTuple):
-    """The properties of the sensor that association uses."""
-
-    noise: Noise
-    #: Readings closer than this have no usable bearing [m].
-    min_range: float
-
-    @classmethod
-    def checked(cls, measurement_std: ArrayLike, options: Mapping[str, Any]) -> Sensor:
-        """Read a sensor from the arguments of a filter, which has checked them."""
-        sensor = only_bearing_range(sensor_in(options), "data association")
-        noise = Noise(*sensor.noise(measurement_std))
-        return cls(noise, options.get("min_range", 1e-3))

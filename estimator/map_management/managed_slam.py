@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array
+from ..association.scan_assignments import Sensor
 from ..association.scan_association import (
     LOST_SCORE,
     Candidates,
     Option,
     ScanAssociation,
-    Sensor,
     associate,
 )
 from ..filters.conditioning import PoseReading

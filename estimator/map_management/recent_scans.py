@@ -10,7 +10,7 @@ of another landmark: they are dropped, and the scans are repeated once more.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import islice
+from itertools import chain, islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -370,13 +370,10 @@ def _groups(pairs: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:
     [[(0, 4), (1, 5)], [(0, 6)]]
     """
     groups: list[list[tuple[int, int]]] = []
-    used: set[int] = set()
     for pair in pairs:
-        if not groups or not used.isdisjoint(pair):
+        if not groups or not {*pair}.isdisjoint(chain(*groups[-1])):
             groups.append([])
-            used = set()
         groups[-1].append(pair)
-        used.update(pair)
     return groups
 
 

@@ -13,11 +13,15 @@ from slamgym.estimator.association.scan_assignments import missing_costs
 from slamgym.estimator.association.scan_association import (
     FEWER,
     HIDDEN,
+    HIDDEN_EACH,
+    LIMIT,
     LOST_SCORE,
     MARGIN,
     MOST_OF_SCAN,
+    NO_RETURNS,
     PROVEN,
     RINGS,
+    SCANS,
     SECTORS,
     SUREST,
     WIDEST,
@@ -58,23 +62,25 @@ def plain_count(view, slots, explained, detections):
     expected, joint = predicted_readings(
         view.mean, view.covariance, np.arange(len(view.ids))
     )
-    seen, tries = detections.seen, detections.expected
+    seen, tries, returned = detections.counts
     ring = (seen.sum(axis=0) + 1) / (tries.sum(axis=0) + 2)
     sector = (seen.sum(axis=1) + 1) / (tries.sum(axis=1) + 2)
     shares = (seen + 2 * np.minimum(sector[:, None], ring)) / (tries + 2)
     shares = np.minimum(shares, SUREST)
     cost, missed, fewer = 0.0, {}, 0.0
-    after = Detections(seen.copy(), tries.copy(), missed, {}, LostEvidence())
+    after = Detections(detections.counts.copy(), missed, {}, LostEvidence())
+    hidden = HIDDEN_EACH * max(returned.sum() ** 0.5 - LIMIT, 0.0) ** 2
+    hidden /= seen.sum() + NO_RETURNS
     for j, (bearing, distance) in enumerate(expected):
         std = np.sqrt(np.diagonal(joint)[2 * j : 2 * j + 2])
         middle = np.array([bearing + np.pi, distance])
         a, b = (middle // CELL).astype(int)
-        if j in slots:
-            cost -= 2 * np.log(shares[a % SECTORS, min(b, RINGS - 1)])
+        cost -= 2 * (j in slots) * np.log(shares[a % SECTORS, min(b, RINGS - 1)])
         is_sure = distance + 2 * std[1] < LONGEST and 2 * std[0] <= WIDEST
+        before = detections.missed.get(j, 1.0)
         if is_sure:
-            after.expected[a % SECTORS, b] += 1
-            after.seen[a % SECTORS, b] += j in slots
+            is_back = j in slots and before < HIDDEN
+            after.counts[:, a % SECTORS, b] += j in slots, 1, is_back
         is_telling = (
             detections.shown.get(j, 0) >= PROVEN and j < detections.evidence.first_new
         )
@@ -83,39 +89,50 @@ def plain_count(view, slots, explained, detections):
         if j in slots or distance - 2 * std[1] >= LONGEST:
             continue
         found = shares_around(shares, middle, 2 * std)
-        before = detections.missed.get(j, 1.0)
-        least = min(share for _, share in found)
-        left = before * (1 - least)
+        left = before * (1 - min(share for _, share in found))
         if is_sure and is_telling and j not in explained:
             wider = shares_around(shares, middle, 2 * std + MARGIN * CELL)
             least = min(share for _, share in wider)
-            fewer += np.log((1 - FEWER * least) / (1 - least))
+            ratio = np.log((1 - FEWER * least) / (1 - least))
+            fewer += ratio * before / (before + hidden)
         if not is_sure:
             left = min(before, 1 - sum(weight * share for weight, share in found))
         cost -= 2 * np.log(
             (HIDDEN + (1 - HIDDEN) * left) / (HIDDEN + (1 - HIDDEN) * before)
         )
         missed[j] = left
-    before = detections.evidence
-    lost = max(0.0, before.present + min(fewer, MOST_OF_SCAN))
-    most_lost = max(lost, before.largest)
-    first_new = max(before.first_new, 0 if lost > 0 else len(view.ids))
-    return cost, after._replace(evidence=LostEvidence(lost, most_lost, first_new))
+    evidence = evidence_after(detections.evidence, fewer, len(view.ids))
+    return cost, after._replace(evidence=evidence)
+
+
+def evidence_after(known, more, landmarks):
+    present = max(0.0, known.present + min(more, MOST_OF_SCAN))
+    lasting = min(present, known.lasting + (present - known.lasting) / SCANS)
+    return known._replace(
+        present=present,
+        lasting=lasting,
+        largest=max(known.largest, lasting),
+        first_new=max(known.first_new, 0 if present > 0 else landmarks),
+    )
 
 
 def test_missed_landmarks_cost_what_the_dense_equations_say():
-    rng = np.random.default_rng(4)
+    rng, memory = np.random.default_rng(4), np.random.default_rng(9)
     total, evidence = 0.0, []
     for _ in range(200):
         view, slots = random_view(rng), rng.permutation(8)[: rng.integers(5)]
         counts = rng.integers(0, 30, (2, SECTORS, RINGS)) ** rng.uniform(0.2, 1)
         if rng.random() < 0.3:
             counts[:] = 30  # each landmark is shown
-        earlier = {j: rng.uniform() for j in range(0, 8, 2)}
-        known = counts.min(axis=0), counts.max(axis=0), earlier
+        has_returned = memory.random((SECTORS, RINGS)) < memory.uniform()
+        returned = counts.min(axis=0) * has_returned
+        powers = memory.choice([1, 20], 4)
+        earlier = {2 * j: rng.uniform() ** power for j, power in enumerate(powers)}
+        known = np.array([counts.min(axis=0), counts.max(axis=0), returned]), earlier
         shown = {j: min(j % 4, PROVEN) for j in range(7)}
         first_new = int(rng.integers(5, 12))
-        before = Detections(*known, shown, LostEvidence(2.0, 4.0, first_new))
+        lost = LostEvidence(2.0, memory.uniform(0, 2), 2.0, first_new)
+        before = Detections(*known, shown, lost)
         explained = rng.permutation(8)[: rng.integers(4)]
         cost, after = before.after(view, slots, explained, LONGEST)
         expected_cost, expected = plain_count(view, slots, explained, before)
@@ -124,8 +141,7 @@ def test_missed_landmarks_cost_what_the_dense_equations_say():
         evidence.append(after.evidence.present - before.evidence.present)
         more = {j: min(shown.get(j, 0) + (j in slots), PROVEN) for j in range(8)}
         assert {j: after.shown.get(j, 0) for j in range(8)} == more
-        np.testing.assert_array_equal(after.seen, expected.seen)
-        np.testing.assert_array_equal(after.expected, expected.expected)
+        np.testing.assert_array_equal(after.counts, expected.counts)
         for j in set(range(8)) - set(slots.tolist()):
             left = expected.missed.get(j, before.missed.get(j, 1.0))
             assert after.missed.get(j, 1.0) == pytest.approx(left, rel=1e-9)
@@ -287,6 +303,16 @@ def test_a_landmark_beside_a_reading_is_not_missed():
     assert after_scans(places, [seen, ((0,), [-1], [0], 5)]).present == 0
 
 
+@pytest.mark.parametrize("times", [2, 10])
+def test_what_hides_all_landmarks_for_two_scans_raises_no_alarm(times):
+    places = [(3.31, y) for y in (-0.66, 0.66, -2.0, 2.0)]
+    four = range(4)
+    scans = [(four, four, four, 40), (four, [], [], times), (four, four, four, 20)]
+    evidence = after_scans(np.ravel(places), scans)
+    assert evidence.present == 0
+    assert (evidence.largest > LOST_SCORE) == (times > 2)
+
+
 def test_landmarks_that_a_lost_run_maps_anew_do_not_clear_it():
     places = [(3.31, 0.66), (3.31, -0.66)]
     lost = [((0,), [0], [0], 40), ((0,), [-1], [], 3)]
@@ -304,10 +330,26 @@ def test_a_mapped_landmark_outside_the_view_is_not_newer_than_the_view():
     assert after.evidence.first_new == 6
 
 
+@pytest.mark.parametrize(("hides", "is_alarmed"), [(False, True), (True, False)])
+def test_misses_count_little_where_hidden_landmarks_return(hides, is_alarmed):
+    ids, scans = range(8), []
+    bearings = np.pi / 16 + np.pi / 4 * np.arange(8)  # amid cells
+    places = 3.31 * np.column_stack([np.cos(bearings), np.sin(bearings)]).ravel()
+    for j in ids:  # two after the other are hidden for long
+        shown = [i for i in ids if not hides or (i - j) % 8 > 1]
+        scans += [(ids, ids, ids, 3), (ids, shown, shown, 15)]
+    scans.append((ids, ids, ids, 3))
+    assert after_scans(places, scans).largest < LOST_SCORE / 2
+    scans.append((ids, [0, 1], [0, 1], 20))  # then most at once
+    score = after_scans(places, scans).largest
+    assert (score > LOST_SCORE) == is_alarmed
+
+
 def test_a_landmark_at_the_edge_of_the_view_is_no_evidence():
     expected = np.full((SECTORS, RINGS), 30.0)
     seen = np.where(np.arange(RINGS) < 4, expected, 0.0)
-    before = Detections(seen, expected, {}, {0: PROVEN}, LostEvidence(first_new=1))
+    counts = np.array([seen, expected, np.zeros((SECTORS, RINGS))])
+    before = Detections(counts, {}, {0: PROVEN}, LostEvidence(first_new=1))
     evidence = []
     for ring in (3.4, 3.6):
         mean = np.array([0, 0, 0, ring * LONGEST / RINGS, 0.5])
@@ -321,11 +363,11 @@ def test_a_landmark_at_the_edge_of_the_view_is_no_evidence():
 def test_the_alarm_stays_once_the_map_is_seen_again():
     view = MapView(np.array([0, 0, 0, 3.0, 0.5]), 1e-6 * np.eye(5), (0,))
     detections, scores = Detections.none(), []
-    for slot in [0] * 40 + [-1] * 8 + [0] * 40:
+    for slot in [0] * 40 + [-1] * 16 + [0] * 40:
         _, detections = detections.after(view, np.array([slot]), NONE, LONGEST)
-        scores.append(detections.evidence.present)
+        scores.append(detections.evidence.lasting)
     assert scores[39] == scores[-1] == 0
-    assert scores[47] > LOST_SCORE
+    assert scores[55] > LOST_SCORE
     assert detections.evidence.largest == max(scores)
 
 
@@ -447,21 +489,28 @@ def test_a_robot_that_turns_blindly_is_probably_lost(association):
     assert not slam.probably_lost
 
 
+def detected(*counts):
+    """Return the same counts (seen, expected, returned) in all cells."""
+    return np.ones((3, SECTORS, RINGS)) * np.reshape(counts, (3, 1, 1))
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("lost", (-1, 2, 0, 0.1, 0, 0, 0)),
-        ("lost", (3, 2, 0, 0.1, 0, 0, 0)),
-        ("lost", (0, 2, -1, 0.1, 0, 0, 0)),
-        ("lost", (0, 2, 0, -0.1, 0, 0, 0)),
-        ("lost", (0, 2, 0, 0.1, -1, 0, 0)),
-        ("lost", (0, 2, 0, 0.1, 0, -1, 0)),
-        ("lost", (0, 2, 0, 0.1, 0, 0, -1)),
+        ("lost", (-1, 0, 2, 0, 0.1, 0, 0, 0)),
+        ("lost", (0, -1, 2, 0, 0.1, 0, 0, 0)),
+        ("lost", (0, 3, 2, 0, 0.1, 0, 0, 0)),
+        ("lost", (0, 0, 2, -1, 0.1, 0, 0, 0)),
+        ("lost", (0, 0, 2, 0, -0.1, 0, 0, 0)),
+        ("lost", (0, 0, 2, 0, 0.1, -1, 0, 0)),
+        ("lost", (0, 0, 2, 0, 0.1, 0, -1, 0)),
+        ("lost", (0, 0, 2, 0, 0.1, 0, 0, -1)),
         ("density", (1, 2, 0, 1, 8)),
         ("density", (1, 2, 8, 1, -1)),
         ("unexplained", np.full((SECTORS, RINGS), -1)),
-        ("detected", np.full((SECTORS, RINGS), -1)),
-        ("detected", np.full((SECTORS, RINGS), 100)),
+        ("detected", detected(0, 0, -1)),
+        ("detected", detected(1, 2, 2)),
+        ("detected", detected(3, 2, 0)),
         ("missed", [(0, 1.1)]),
         ("missed", [(0, -0.1), (1, 0.5)]),
     ],
@@ -500,18 +549,18 @@ def test_a_single_wrong_range_does_not_stretch_the_cells(scan, wrong):
     assert other.landmark_ids == clean.landmark_ids
     np.testing.assert_array_equal(other.belief().mean, clean.belief().mean)
     shares = [
-        detections.seen.sum(axis=0) / detections.expected.sum(axis=0)
+        detections.counts[0].sum(axis=0) / detections.counts[1].sum(axis=0)
         for detections in (s.candidates.detections for s in (clean, other))
     ]
     np.testing.assert_allclose(*shares, atol=0.05)
     assert not other.probably_lost
 
 
-@pytest.mark.parametrize("place", [0, 4, 5])
+@pytest.mark.parametrize("place", [1, 5, 6])
 def test_a_saved_state_whose_evidence_exceeds_its_largest_is_refused(place):
     state = Candidates().state_dict()
     state["lost"][place] = 4.0
     with pytest.raises(ValueError, match="at most the largest so far"):
         Candidates.from_state_dict(state)
-    state["lost"][1] = 4.0
+    state["lost"][2] = 4.0
     assert Candidates.from_state_dict(state).detections.evidence[place] == 4.0
