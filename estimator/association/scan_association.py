@@ -319,9 +319,9 @@ class LostEvidence(NamedTuple):
         ratio = strange * math.log(1 + more / before.per_scan) - more
         ratio += explained * math.log(FEWER)
         unexplained = max(0.0, self.unexplained + min(ratio, MOST_OF_SCAN / 2) / 2)
-        changed = unexplained, MEMORY * self.explained + explained
+        total = MEMORY * self.explained + explained
         largest = max(self.largest, unexplained)
-        return LostEvidence(*self[:2], largest, *self[3:6], *changed)
+        return self._replace(largest=largest, unexplained=unexplained, explained=total)
 
 
 class Detections(NamedTuple):

@@ -345,6 +345,18 @@ def test_misses_count_little_where_hidden_landmarks_return(hides, is_alarmed):
     assert (score > LOST_SCORE) == is_alarmed
 
 
+def test_two_returns_do_not_show_that_something_hides_landmarks():
+    view = MapView(np.array([0, 0, 0, 3.31, 0.66]), 1e-6 * np.eye(5), (0,))
+    present = []
+    for returned in (0, 2, 30):
+        counts = detected(30, 30, 0)
+        counts[2, 0, :2] = returned / 2
+        telling = {0: 0.1}, {0: PROVEN}, LostEvidence(first_new=1)
+        _, after = Detections(counts, *telling).after(view, np.array([-1]), NONE, 6.0)
+        present.append(after.evidence.present)
+    assert present[0] == present[1] > present[2] > 0
+
+
 def test_a_landmark_at_the_edge_of_the_view_is_no_evidence():
     expected = np.full((SECTORS, RINGS), 30.0)
     seen = np.where(np.arange(RINGS) < 4, expected, 0.0)
