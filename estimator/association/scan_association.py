@@ -226,7 +226,7 @@ class ScanAssociation:
 # the map was right.  If k of n sightings so far were such ones, a miss counts with the
 # probability that nothing hides the landmark::
 #
-#     q / (q + 5 k' / (n + 100)),    k' = max(0, √k − 3/2)²
+#     q / (q + 5 k' / (n + 100)),    k' = max(0, √k − 2)²
 #
 # k' is a lower limit of what k tends to, since a few landmarks seem to be seen again in
 # lost runs, too.  The 5 allows for sightings that begin no absence, since nothing is
@@ -498,7 +498,7 @@ FEWER = 0.5
 HIDDEN_EACH, NO_RETURNS = 5, 100
 
 #: The root of a count is at most this far from the root of its mean, for most counts.
-LIMIT = 1.5
+LIMIT = 2.0
 
 #: A change of the evidence counts in full after about so many scans.
 SCANS = 5
