@@ -105,9 +105,9 @@ class RecentScans(Restorable):
         self, readings: Array, plan: ScanAssociation
     ) -> tuple[list[RecentScan], int | None]:
         """Return the last scans with a new one, and the first to repeat, if any."""
-        kept = readings.copy()  # the caller may reuse the array
         decided = tuple(plan.row_ids), tuple(plan.labels)
-        scan = RecentScan(plan.scan, self.motions, kept, *decided)
+        # The caller may reuse the array of readings.
+        scan = RecentScan(plan.scan, self.motions, readings.copy(), *decided)
         if not self._window:
             return [scan], None
         if scan.begins:

@@ -115,9 +115,8 @@ def _read_measurements(
     subjects = _read_barcodes(folder)
     readings: TimedReadings = []
     robots = unknown = outside = 0
-    for line in _timed_lines(
-        folder / f"Robot{robot}_Measurement.dat", "t barcode range bearing"
-    ):
+    path = folder / f"Robot{robot}_Measurement.dat"
+    for line in _timed_lines(path, "t barcode range bearing"):
         stamp, code, distance, bearing = line.text.split()
         t = round(line.to_real(stamp) - epoch, TIME_DIGITS)
         subject = subjects.get(line.to_id(code))
@@ -152,9 +151,7 @@ def _read_landmarks(folder: Path) -> tuple[IntArray, Array]:
     for place, (line, fields) in enumerate(rows):
         if ids[place] in ids[:place]:
             raise line.error("each subject once", fields[0])
-    positions = [
-        [line.to_real(field) for field in fields[1:3]] for line, fields in rows
-    ]
+    positions = [[line.to_real(x) for x in fields[1:3]] for line, fields in rows]
     return np.array(ids, dtype=np.int64), np.array(positions)
 
 
