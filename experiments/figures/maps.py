@@ -251,6 +251,8 @@ LATER = scene.EllipseKind("landmark later, 3σ", "#128a3a", fill=0.16, width=1.5
 _FORMER = scene.EllipseKind("landmark in between", LATER.colour, width=0.6, alpha=0.35)
 
 _MOST_POSES = 60  # ellipses along the path; longer runs show every second, third, …
+_FEWEST_POSES = 12  # of a longer run
+_COVERED = 0.35  # sum of their areas, relative to that of the map
 _MOST_FORMER = 300  # green ellipses of earlier steps; large maps show fewer steps
 _SHORTEST_SIDE = 0.55  # of a map, as a share of its longest
 
@@ -262,9 +264,9 @@ class _Artists(NamedTuple):
     later: EllipseCollection
     first: EllipseCollection
     estimates: Line2D
-    path: Line2D
     updated: EllipseCollection
     predicted: EllipseCollection
+    path: Line2D
     robot: Polygon
 
 
@@ -355,11 +357,11 @@ class MapPicture:
             later=LATER.add_to(axes, scale),
             first=FIRST.add_to(axes, scale),
             estimates=Line2D([], [], ls="", marker=".", ms=3 * scale, c=LATER.colour),
+            updated=UPDATED.add_to(axes, scale),
+            predicted=PREDICTED.add_to(axes, scale),
             path=Line2D(
                 [], [], color=style.GREY, lw=1.1 * scale, label="estimated path"
             ),
-            updated=UPDATED.add_to(axes, scale),
-            predicted=PREDICTED.add_to(axes, scale),
             robot=Polygon(
                 np.full((1, 2), np.nan), fc=UPDATED.colour, ec="white", lw=0.6
             ),
@@ -372,8 +374,17 @@ class MapPicture:
 
 
 def pose_stride(trace: RunTrace) -> int:
-    """Return the number of steps between two drawn ellipses of the pose."""
-    return -(-len(trace.t) // _MOST_POSES)
+    """Return the number of steps between two drawn ellipses of the pose.
+
+    All of a short run are drawn. Of a long one, fewer are drawn where they are large,
+    so that they do not hide the map.
+    """
+    if len(trace.t) <= _MOST_POSES:
+        return 1
+    low, high = map_limits(trace)
+    areas = 9 * np.pi * np.sqrt(np.linalg.det(trace.pose_covariances[:, :2, :2]))
+    fitting = _COVERED * np.prod(high - low) / max(np.nanmean(areas), 1e-12)
+    return -(-len(trace.t) // int(np.clip(fitting, _FEWEST_POSES, _MOST_POSES)))
 
 
 def map_limits(trace: RunTrace, walls: Walls = ()) -> Array:

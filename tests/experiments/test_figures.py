@@ -220,6 +220,15 @@ def test_long_runs_draw_fewer_poses_and_say_so():
     assert any("1 pose in 11 drawn" in text.get_text() for text in figure.axes[0].texts)
 
 
+def test_a_long_run_draws_fewer_poses_where_their_ellipses_are_large():
+    trace = make_trace(steps=299)
+    large = replace(trace, pose_covariances=400 * trace.pose_covariances)
+    few, many = (
+        len(ellipses_of(map_figure(t), UPDATED).get_widths()) for t in (large, trace)
+    )
+    assert 12 <= few < many / 2
+
+
 def test_view_is_the_same_at_every_step_and_holds_the_whole_run():
     trace = make_trace()
     first, last = map_figure(trace, 0).axes[0], typical(map_figure).axes[0]
