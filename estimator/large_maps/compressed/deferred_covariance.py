@@ -30,6 +30,7 @@ class Downdate(NamedTuple):
 
     root: Array  # W, shape (width, rank)
     signs: Array  # s, shape (rank,), each 1 or -1
+    applied: list[int]  # one number for each block that has changed already
 
 
 class DeferredCovariance:
@@ -42,8 +43,7 @@ class DeferredCovariance:
         P = stored − W diag(s) Wᵀ
 
     W is small.  Reading subtracts its product, and :meth:`work` applies it to one block
-    after the other.  A local map may read the rows of its landmarks and update its
-    copy; the stored rows of these landmarks are invalid until it puts them back.  Rows
+    after the other.  The rows of a new landmark are invalid until they are put.  Rows
     are read and put block by block, between which :meth:`work` must not be called.
     """
 
@@ -52,7 +52,7 @@ class DeferredCovariance:
         self._pending: list[Downdate] = []
         self._under_way = False  # whether the first downdate is being applied
         self._done = 0  # number of blocks to which it has been applied
-        self._credit = 0.0  # multiplications granted and not yet used
+        self._credit = 0.0  # multiplications granted, less those made
 
     @property
     def width(self) -> int:
@@ -108,7 +108,7 @@ class DeferredCovariance:
             if end > start:
                 rows[start:end, : first + BLOCK] = block[columns[start:end] - first]
             read_columns(block, first, columns[:start], rows)
-        for index, (root, signs) in enumerate([*self._pending, coming]):
+        for index, (root, signs, _) in enumerate([*self._pending, coming]):
             applied = self._done if index == 0 else 0  # only the first has been begun
             left = range(max(blocks.start, applied), blocks.stop)
             first, last = left.start * BLOCK, left.stop * BLOCK
@@ -146,13 +146,14 @@ class DeferredCovariance:
 
     def forget(self, columns: IntArray) -> None:
         """Drop the pending downdates of rows that are about to be put."""
-        for root, _ in self._pending:
+        for root, _, _ in self._pending:
             root[columns[columns < len(root)]] = 0.0
 
     def checkpoint(self) -> Undo:
-        """Return what takes back later calls.
+        """Return what takes back later calls, but for changes of the blocks.
 
-        The stored rows of local landmarks are invalid, and remain so.
+        Rows that have been put are invalid again.  A downdate that is applied remains
+        so, and :meth:`work` does not repeat it.
         """
         return contents(self)
 
@@ -165,13 +166,14 @@ class DeferredCovariance:
     def work(self, rank: float) -> None:
         """Apply pending downdates, for the cost of one full downdate of this rank.
 
-        Blocks are changed as a whole; unused cost is kept for the next call.
+        Blocks are changed as a whole; what this costs too little or too much is kept
+        for the next call.
         """
         self._credit += rank * (self.width * (self.width + BLOCK) / 2)
         while self._begin():
-            root, signs = self._pending[0]
+            root, signs, _ = self._pending[0]
             cost = len(signs) * self._blocks[self._done].size
-            if cost > self._credit:
+            if cost > 2 * self._credit:
                 return
             self._apply(self._done)
             self._credit -= cost
@@ -179,7 +181,7 @@ class DeferredCovariance:
             if self._done * BLOCK >= len(root):
                 self._pending.pop(0)
                 self._under_way, self._done = False, 0
-        self._credit = 0.0
+        self._credit = min(self._credit, 0.0)
 
     def marginal(self, columns: IntArray) -> Array:
         """Return the covariance (c, c) of some columns; exactly symmetric."""
@@ -188,7 +190,7 @@ class DeferredCovariance:
         for k in holding:
             read_marginal(self._blocks[k], k * BLOCK, columns, covariance)
         applied = columns < self._done * BLOCK
-        for index, (root, signs) in enumerate(self._pending):
+        for index, (root, signs, _) in enumerate(self._pending):
             rows = rows_of(root, columns)
             change = (rows * signs) @ rows.T
             if index == 0 and self._done:
@@ -241,17 +243,17 @@ class DeferredCovariance:
         saved = saved_states.read(state, PENDING, "far_", w=BLOCK * count)
         pending = _downdates(saved)
         under_way, done, credit = progress = saved["progress"].tolist()
-        if not (
-            under_way in (0, 1) and done in range(count + 1) and credit >= 0
-        ) or under_way > len(pending):
+        if done not in range(count + 1) or under_way not in (0, min(1, len(pending))):
             raise ValueError(
                 f"state['far_progress'] must be 0 or 1, at most {count} blocks and a "
-                f"credit >= 0, got {progress}"
+                f"credit, got {progress}"
             )
         ends = BLOCK**2 * np.cumsum(np.arange(1, count + 1))
         parts = np.split(flat, ends)[:count]
         self._blocks = [part.reshape(BLOCK, -1).copy() for part in parts]
         self._pending = pending
+        if pending:
+            pending[0].applied.extend(range(int(done)))
         self._under_way, self._done, self._credit = bool(under_way), int(done), credit
 
     def _enumerate(self) -> list[tuple[int, Array]]:
@@ -268,25 +270,24 @@ class DeferredCovariance:
                 first, last = last, last + len(downdate.signs)
                 root[: len(downdate.root), first:last] = downdate.root
             signs = np.concatenate([downdate.signs for downdate in self._pending])
-            self._pending = [Downdate(root, signs)]
+            self._pending = [Downdate(root, signs, self._pending[0].applied)]
             self._under_way, self._done = True, 0
         return self._under_way
 
     def _apply(self, k: int) -> None:
-        """Apply the downdate under way to a copy of one block, which replaces it."""
+        """Apply the downdate under way to one block, in place, unless it has been."""
         from scipy.linalg.blas import dgemm  # noqa: PLC0415 (slow to import)
 
-        root, signs = self._pending[0]
+        root, signs, applied = self._pending[0]
+        if len(applied) > k:
+            return
         first, last = k * BLOCK, (k + 1) * BLOCK
         # The transposes are contiguous in Fortran order: dgemm copies none of them.
-        self._blocks[k] = dgemm(
-            -1.0,
-            root[:last].T,
-            (root[first:last] * signs).T,
-            1.0,
-            self._blocks[k].T,
-            trans_a=True,
-        ).T
+        factors = root[:last].T, (root[first:last] * signs).T
+        call = (-1.0, *factors, 1.0, self._blocks[k].T, True, False, True)
+        # No line of Python runs between the change and the note of it: an interrupt
+        # finds neither or both.
+        applied.extend(map(len, map(dgemm, *zip(call))))
 
 
 def stored_bytes(landmarks: int) -> int:
@@ -323,7 +324,9 @@ def _downdates(saved: Mapping[str, Any]) -> list[Downdate]:
         raise ValueError("state['far_pending_signs'] must be 1 or -1")
     ends = np.cumsum(shapes[:, 1]).tolist()
     return [
-        Downdate(root[:rows, end - rank : end].copy(), signs[end - rank : end].copy())
+        Downdate(
+            root[:rows, end - rank : end].copy(), signs[end - rank : end].copy(), []
+        )
         for (rows, rank), end in zip(shapes.tolist(), ends, strict=True)
     ]
 

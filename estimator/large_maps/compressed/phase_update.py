@@ -11,6 +11,7 @@ covariance [P_aa Φ; Φᵀ −Ψ] and mean (x_a, y), the phase changes the rest 
 
     x_b ← x_b + Sᵀ y,   P_ab ← Φ S,   P_bb ← P_bb − Sᵀ Ψ S
 
+This holds for local landmarks, too: x_b may contain them as they were at the beginning.
 (Guivant and Nebot, 2001, in the form of an augmented state.)
 
 In the invariant frame a correction also rotates and shears points,
@@ -166,11 +167,11 @@ def _by_eigenvalues(part: Array) -> tuple[Array, Array]:
 # --------------------------------------------------------------------------------------
 # A change of the local map, spread over several steps.
 #
-# The rows of the landmarks that leave go back to the stored covariance, those of the
-# landmarks that enter are read, and Φ S becomes the strip of the new local map.  The
-# new phase needs none of this before it ends: it begins with the covariance of its own
-# landmarks alone.  Ψ is therefore factored in the step after the change, and the
-# exchange proceeds block by block in the steps that follow.
+# The rows of the landmarks that are new to the map are stored, those of the landmarks
+# that enter are read, and Φ S becomes the strip of the new local map.  The new phase
+# needs none of this before it ends: it begins with the covariance of its own landmarks
+# alone.  Ψ is therefore factored in the step after the change, and the exchange
+# proceeds block by block in the steps that follow.
 
 SPREAD = 4  # steps that an exchange takes in a large map
 
@@ -191,14 +192,15 @@ class Exchanged(NamedTuple):
     """The rows of a change of the local map."""
 
     own: IntArray  # columns of the old local landmarks, shape (a - 3,)
-    kept: IntArray  # rows of the pose and of landmarks that stay, in the old local map
-    leaving: IntArray  # ascending columns of the landmarks that leave
-    places: IntArray  # their rows in the old local map
+    needed: IntArray  # rows, in the old local map, of which Φ S is needed
+    kept: int  # how many of these, the first, belong to the pose and to what stays
+    new: IntArray  # ascending columns of the landmarks to store
+    places: IntArray  # their rows among those needed
     entering: IntArray  # ascending columns of the landmarks that enter
 
 
 def exchanged_rows(
-    slots: Mapping[int, int], local: Iterable[int], chosen: Collection[int]
+    slots: Mapping[int, int], local: Iterable[int], chosen: Collection[int], stored: int
 ) -> tuple[Exchanged, dict[int, None]]:
     """Return the rows of a change of the local map, and its landmarks in their order.
 
@@ -208,20 +210,24 @@ def exchanged_rows(
         Place of each landmark in the map's arrays.
     local, chosen : collection of int
         The old and the new local landmarks.
+    stored : int
+        How many old ones, the first, are in the stored covariance.
     """
     old = list(local)
     staying = [k for k, i in enumerate(old) if i in chosen]
-    places = {slots[i]: k for k, i in enumerate(old) if i not in chosen}
-    leaving, before = sorted(places), set(old)
+    needed = staying + [k for k in range(stored, len(old)) if old[k] not in chosen]
+    rows = {slots[old[k]]: row for row, k in enumerate(needed) if k >= stored}
+    new, before = sorted(rows), set(old)
     entering = sorted((i for i in chosen if i not in before), key=slots.__getitem__)
-    rows = Exchanged(
+    exchanged = Exchanged(
         pairs([slots[i] for i in old]),
-        np.r_[0:3, 3 + pairs(staying)],
-        pairs(leaving),
-        3 + pairs([places[slot] for slot in leaving]),
+        np.r_[0:3, 3 + pairs(needed)],
+        3 + 2 * len(staying),
+        pairs(new),
+        3 + pairs([rows[slot] for slot in new]),
         pairs([slots[i] for i in entering]),
     )
-    return rows, dict.fromkeys([old[k] for k in staying] + entering)
+    return exchanged, dict.fromkeys([old[k] for k in staying] + entering)
 
 
 @dataclass
@@ -241,8 +247,8 @@ class Handover:
     done: int = 0  # number of blocks that have been exchanged
     is_factored: bool = False  # whether what follows is known
     lost: Downdate = field(init=False, repr=False)  # to be deferred at the end
-    _coefficients: Array = field(init=False, repr=False)  # Φ above Uᵀ, (a + r, e)
-    _values: Array = field(init=False, repr=False)
+    _coefficients: Array = field(init=False, repr=False)  # Φ above Uᵀ
+    _values: Array = field(init=False, repr=False)  # Φ S
     _order: IntArray = field(init=False, repr=False)
 
     def advance(self, stored: DeferredCovariance, blocks: int) -> None:
@@ -270,25 +276,26 @@ class Handover:
         root, signs = np.empty((0, self.old.gain.shape[1])), np.empty(0)
         if len(self.old.loss):
             root, signs = roots(self.old.loss, self.invariant)
-        self._coefficients = np.concatenate([self.old.gain, root])
-        self._values = np.zeros((len(self.old.mean), width))
+        self._coefficients = np.concatenate([self.old.gain[self.rows.needed], root])
+        self._values = np.zeros((len(self.rows.needed), width))
         self._order = np.argsort(self.rows.own)
-        self.lost = Downdate(np.zeros((width, len(signs))), signs)
+        self.lost = Downdate(np.zeros((width, len(signs))), signs, [])
         self.is_factored = True
 
     def _exchange(self, stored: DeferredCovariance, blocks: range) -> None:
         here, a = slice(blocks.start * BLOCK, blocks.stop * BLOCK), len(self._values)
+        rows, count = self.rows, self.rows.kept
         if self._coefficients.size:
             part = combine(self._coefficients, self.strip[:, here], self.invariant)
             self._values[:, here] = part[:a]
             self.lost.root[here] = part[a:].T
-        own = self._order[_within(self.rows.own[self._order], here)]
-        self._values[:, self.rows.own[own]] = self.old.covariance[:, 3 + own]
-        self.lost.root[self.rows.leaving[_within(self.rows.leaving, here)]] = 0.0
-        stored.put(blocks, self.rows.leaving, self._values, self.rows.places)
-        count = len(self.rows.kept)
-        self.next_strip[:count, here] = self._values[self.rows.kept, here]
-        stored.read(blocks, self.rows.entering, self.next_strip[count:], self.lost)
+        own = self._order[_within(rows.own[self._order], here)]
+        inside = self.old.covariance[rows.needed[:, None], 3 + own]
+        self._values[:, rows.own[own]] = inside
+        self.lost.root[rows.new[_within(rows.new, here)]] = 0.0
+        stored.put(blocks, rows.new, self._values, rows.places)
+        self.next_strip[:count, here] = self._values[:count, here]
+        stored.read(blocks, rows.entering, self.next_strip[count:], self.lost)
 
 
 def begin_handover(
@@ -322,12 +329,13 @@ def begin_handover(
     block = stored.marginal(rows.entering)
     lost = np.ascontiguousarray(combine(now.loss, entering, invariant).T)
     block -= combine(lost, entering, invariant)  # Sᵀ Ψ S
-    stored.forget(rows.leaving)
-    next_strip = np.empty((len(rows.kept) + len(rows.entering), stored.width))
+    stored.forget(rows.new)
+    next_strip = np.empty((rows.kept + len(rows.entering), stored.width))
     group = blocks_in_a_step(stored.width, hurried=hurried)
     handover = Handover(now, strip, rows, next_strip, invariant, group)
-    across = combine(now.gain[rows.kept], entering, invariant)
-    inside = now.covariance[np.ix_(rows.kept, rows.kept[3:])]
+    kept = rows.needed[: rows.kept]
+    across = combine(now.gain[kept], entering, invariant)
+    inside = now.covariance[np.ix_(kept, kept[3:])]
     return handover, np.block([[inside, across], [across[3:].T, symmetric(block)]])
 
 
