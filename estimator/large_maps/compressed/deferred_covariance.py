@@ -104,10 +104,7 @@ class DeferredCovariance:
         """
         bounds = _bounds(columns, blocks)
         for k, start, end in zip(blocks, bounds, bounds[1:], strict=False):
-            block, first = self._blocks[k], k * BLOCK
-            if end > start:
-                rows[start:end, : first + BLOCK] = block[columns[start:end] - first]
-            read_columns(block, first, columns[:start], rows)
+            read_rows(self._blocks[k], k * BLOCK, columns[:end], start, rows)
         for index, (root, signs, _) in enumerate([*self._pending, coming]):
             applied = self._done if index == 0 else 0  # only the first has been begun
             left = range(max(blocks.start, applied), blocks.stop)
@@ -354,14 +351,19 @@ def subtract(covariance: Array, root: Array, signs: Array) -> None:
 
 
 @jit
-def read_columns(block: Array, first: int, columns: IntArray, rows: Array) -> None:
-    """Copy some columns of a block into rows (c, width), from column ``first`` on.
+def read_rows(
+    block: Array, first: int, columns: IntArray, start: int, rows: Array
+) -> None:
+    """Copy what a block holds of the rows (c, width) of some columns.
 
-    The copy runs row by row, because neighbours share a cache line.
+    The first ``start`` are columns of the block, and the others are among its rows.
+    Columns are copied row by row, because neighbours share a cache line.
     """
     for i in range(len(block)):
-        for j in range(len(columns)):
+        for j in range(start):
             rows[j, first + i] = block[i, columns[j]]
+    for j in range(start, len(columns)):
+        rows[j, : first + len(block)] = block[columns[j] - first]
 
 
 @jit

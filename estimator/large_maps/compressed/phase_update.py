@@ -30,7 +30,7 @@ import numpy as np
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
 from ...filters.gaussian_map import parts_of
-from ..multifrontal import pairs, symmetric
+from ..multifrontal import pairs
 from .deferred_covariance import (
     BLOCK,
     DeferredCovariance,
@@ -221,7 +221,7 @@ def exchanged_rows(
     entering = sorted((i for i in chosen if i not in before), key=slots.__getitem__)
     exchanged = Exchanged(
         pairs([slots[i] for i in old]),
-        np.r_[0:3, 3 + pairs(needed)],
+        np.concatenate([(0, 1, 2), 3 + pairs(needed)]),
         3 + 2 * len(staying),
         pairs(new),
         3 + pairs([rows[slot] for slot in new]),
@@ -292,8 +292,9 @@ class Handover:
         own = self._order[_within(rows.own[self._order], here)]
         inside = self.old.covariance[rows.needed[:, None], 3 + own]
         self._values[:, rows.own[own]] = inside
-        self.lost.root[rows.new[_within(rows.new, here)]] = 0.0
-        stored.put(blocks, rows.new, self._values, rows.places)
+        if len(rows.new):
+            self.lost.root[rows.new[_within(rows.new, here)]] = 0.0
+            stored.put(blocks, rows.new, self._values, rows.places)
         self.next_strip[:count, here] = self._values[:count, here]
         stored.read(blocks, rows.entering, self.next_strip[count:], self.lost)
 
@@ -309,6 +310,8 @@ def begin_handover(
 ) -> tuple[Handover, Array]:
     """Begin a handover; also return the covariance with which a new phase begins.
 
+    If it is hurried, this is read from the new strip, which is filled at once.
+
     Parameters
     ----------
     stored : DeferredCovariance
@@ -323,20 +326,25 @@ def begin_handover(
     -------
     handover : Handover
     covariance : ndarray, shape (a', a' - 3)
-        Of pose and new local landmarks, without the columns of the pose.
+        Of pose and new local landmarks, without the columns of the pose.  Of the
+        columns of the landmarks, the lower half is right.
     """
-    entering = np.ascontiguousarray(strip[:, rows.entering])
-    block = stored.marginal(rows.entering)
-    lost = np.ascontiguousarray(combine(now.loss, entering, invariant).T)
-    block -= combine(lost, entering, invariant)  # Sᵀ Ψ S
     stored.forget(rows.new)
     next_strip = np.empty((rows.kept + len(rows.entering), stored.width))
     group = blocks_in_a_step(stored.width, hurried=hurried)
     handover = Handover(now, strip, rows, next_strip, invariant, group)
     kept = rows.needed[: rows.kept]
+    if hurried:
+        handover.advance(stored, stored.width // BLOCK)
+        local = np.concatenate([rows.own[kept[3:] - 3], rows.entering])
+        return handover, next_strip[:, local]
+    entering = np.ascontiguousarray(strip[:, rows.entering])
+    block = stored.marginal(rows.entering)
+    lost = np.ascontiguousarray(combine(now.loss, entering, invariant).T)
+    block -= combine(lost, entering, invariant)  # Sᵀ Ψ S
     across = combine(now.gain[kept], entering, invariant)
     inside = now.covariance[np.ix_(kept, kept[3:])]
-    return handover, np.block([[inside, across], [across[3:].T, symmetric(block)]])
+    return handover, np.block([[inside, across], [across[3:].T, block]])
 
 
 def _within(columns: IntArray, here: slice) -> slice:
