@@ -261,8 +261,9 @@ def test_no_step_does_more_of_the_map_than_a_full_update(base, jumping, monkeypa
     count, seen = 400, 10
     done = []
 
-    def count_numbers(self, k):
-        done[-1] += len(self._pending[0].signs) * self._blocks[k].size
+    def count_numbers(self, blocks):
+        size = sum(self._blocks[k].size for k in blocks)
+        done[-1] += len(self._pending[0].signs) * size
 
     slam = map_all(CompressedEkfSlam(*NOISE, base=base), count)
     spied(monkeypatch, DeferredCovariance, "_apply", count_numbers)
@@ -281,7 +282,12 @@ def test_no_step_does_more_of_the_map_than_a_full_update(base, jumping, monkeypa
 def test_an_interrupt_applies_no_downdate_twice(monkeypatch):
     """The last lines of a step are interrupted, which apply one to two blocks."""
     slam, applied = map_all(CompressedEkfSlam(*NOISE), 150), []
-    spied(monkeypatch, DeferredCovariance, "_apply", lambda _, k: applied.append(k))
+    spied(
+        monkeypatch,
+        DeferredCovariance,
+        "_apply",
+        lambda _, blocks: applied.extend(blocks),
+    )
     for odometry, readings, ids in wander(150, 80, jumping=True):
         slam.predict(odometry)
         twin = copy.deepcopy(slam)

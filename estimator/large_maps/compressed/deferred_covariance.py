@@ -5,6 +5,7 @@ applied later; the compiled functions below copy rows and columns.
 """
 
 from collections.abc import Mapping
+from itertools import starmap
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,8 +17,11 @@ from ...support.argument_checks import refuse_beyond_memory
 from ...support.undo import Undo, contents
 from ..multifrontal import symmetric
 
-# Rows of one block: 64 landmarks.
-BLOCK = 128
+# Rows of one block: 68 landmarks.
+#
+# Rows whose lengths are multiples of a power of two would compete for the same few
+# places of the processor's caches.
+BLOCK = 136
 # Smallest rank to apply; smaller downdates wait: memory limits thin products.
 WORTHWHILE = 40
 # Larger pending ranks must not wait for the exchange of rows.
@@ -36,7 +40,7 @@ class Downdate(NamedTuple):
 class DeferredCovariance:
     """Lower half of a growing covariance, in blocks of rows, with pending downdates.
 
-    Block k holds rows 128 k to 128 (k + 1) of P, as far as the diagonal.  This takes
+    Block k holds rows 136 k to 136 (k + 1) of P, as far as the diagonal.  This takes
     half the memory of a square and grows without a copy.  Every block is contiguous, so
     that BLAS changes it in place::
 
@@ -169,15 +173,18 @@ class DeferredCovariance:
         self._credit += rank * (self.width * (self.width + BLOCK) / 2)
         while self._begin():
             root, signs, _ = self._pending[0]
-            cost = len(signs) * self._blocks[self._done].size
-            if cost > 2 * self._credit:
+            first, count = self._done, len(root) // BLOCK
+            for block in self._blocks[first:count]:
+                cost = len(signs) * block.size
+                if cost > 2 * self._credit:
+                    break
+                self._credit -= cost
+                self._done += 1
+            self._apply(range(first, self._done))
+            if self._done < count:
                 return
-            self._apply(self._done)
-            self._credit -= cost
-            self._done += 1
-            if self._done * BLOCK >= len(root):
-                self._pending.pop(0)
-                self._under_way, self._done = False, 0
+            self._pending.pop(0)
+            self._under_way, self._done = False, 0
         self._credit = min(self._credit, 0.0)
 
     def marginal(self, columns: IntArray) -> Array:
@@ -271,20 +278,22 @@ class DeferredCovariance:
             self._under_way, self._done = True, 0
         return self._under_way
 
-    def _apply(self, k: int) -> None:
-        """Apply the downdate under way to one block, in place, unless it has been."""
+    def _apply(self, blocks: range) -> None:
+        """Apply the downdate under way to some blocks, in place, unless it has been."""
         from scipy.linalg.blas import dgemm  # noqa: PLC0415 (slow to import)
 
         root, signs, applied = self._pending[0]
-        if len(applied) > k:
-            return
-        first, last = k * BLOCK, (k + 1) * BLOCK
-        # The transposes are contiguous in Fortran order: dgemm copies none of them.
-        factors = root[:last].T, (root[first:last] * signs).T
-        call = (-1.0, *factors, 1.0, self._blocks[k].T, True, False, True)
-        # No line of Python runs between the change and the note of it: an interrupt
-        # finds neither or both.
-        applied.extend(map(len, map(dgemm, *zip(call))))
+        first = max(blocks.start, len(applied))
+        weighted = root[first * BLOCK : blocks.stop * BLOCK] * signs
+        calls = []
+        for k, block in enumerate(self._blocks[first : blocks.stop]):
+            own = weighted[k * BLOCK : (k + 1) * BLOCK]
+            # The transposes are contiguous in Fortran order: dgemm copies none of them.
+            factors = root[: block.shape[1]].T, own.T
+            calls.append((-1.0, *factors, 1.0, block.T, True, False, True))
+        # No line of Python runs between the change of a block and the note of it: an
+        # interrupt finds neither or both.
+        applied.extend(map(len, starmap(dgemm, calls)))
 
 
 def stored_bytes(landmarks: int) -> int:
