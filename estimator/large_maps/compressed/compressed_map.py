@@ -158,16 +158,17 @@ class CompressedMap:
         rows, self.local = phase_update.exchanged_rows(
             self.slots, self.local, chosen, self._stored
         )
-        self._handover, covariance = phase_update.begin_handover(
-            self.deferred,
-            self._strip,
-            now,
-            rows,
-            invariant=self.is_invariant,
-            hurried=hurried,
+        blocks = phase_update.blocks_in_a_step(self.deferred.width, hurried=hurried)
+        self._handover = phase_update.Handover(
+            now, self._strip, rows, self.is_invariant, blocks
         )
-        self._strip = self._handover.next_strip
-        self._begin(covariance)
+        self.deferred.forget(rows.new)
+        columns = self._columns(list(self.local))
+        if hurried:
+            self._handover.advance(self.deferred, blocks)
+            self._begin(columns, self._handover.next_strip[:, columns])
+        else:
+            self._begin(columns, self._handover.beginning(self.deferred))
 
     def work(self, rank: int, age: int, *, hurried: bool) -> None:
         """Do a part of the deferred work.
@@ -197,6 +198,7 @@ class CompressedMap:
         if self._handover is not None:
             self._handover.advance(self.deferred, self.deferred.width // BLOCK)
             self.deferred.defer(self._handover.lost)
+            self._strip = self._handover.next_strip
             self._handover = None
 
     @property
@@ -286,9 +288,8 @@ class CompressedMap:
         self._stored = len(stored) - len(gone.intersection(stored))
         self.local = {i: None for i in self.local if i not in gone}
 
-    def _begin(self, rows: Array) -> None:
+    def _begin(self, columns: IntArray, rows: Array) -> None:
         """Load the local map with these covariance rows (a, a - 3) into the filter."""
-        columns = self._columns(list(self.local))
         whole = len(self.local) == len(self.slots)
         self._stored = 0 if whole else len(self.local)
         self._virtual = (

@@ -109,16 +109,16 @@ class DeferredCovariance:
         bounds = _bounds(columns, blocks)
         for k, start, end in zip(blocks, bounds, bounds[1:], strict=False):
             read_rows(self._blocks[k], k * BLOCK, columns[:end], start, rows)
-        for index, (root, signs, _) in enumerate([*self._pending, coming]):
-            applied = self._done if index == 0 else 0  # only the first has been begun
+        applied = self._done  # blocks; only the first downdate has been begun
+        for root, signs, _ in [*self._pending, coming]:
             left = range(max(blocks.start, applied), blocks.stop)
-            first, last = left.start * BLOCK, left.stop * BLOCK
-            if last > first:
-                start, end = _bounds(columns, range(left.start, left.stop))[
-                    :: len(left)
-                ]
-                weights, before = rows_of(root, columns[:end]) * signs, root[:last]
-                rows[start:end, : len(before)] -= weights[start:] @ before.T
+            applied, first, last = 0, left.start * BLOCK, left.stop * BLOCK
+            if last <= first:
+                continue
+            start, end = columns.searchsorted((first, last)).tolist()
+            weights, before = rows_of(root, columns[:end]) * signs, root[:last]
+            rows[start:end, : len(before)] -= weights[start:] @ before.T
+            if start:
                 rows[:start, first : len(before)] -= weights[:start] @ before[first:].T
 
     def put(

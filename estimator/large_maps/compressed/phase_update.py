@@ -146,10 +146,9 @@ def _by_pivots(loss: Array) -> tuple[Array, Array]:
     """Pivoted Cholesky decomposition of a semidefinite matrix."""
     from scipy.linalg.lapack import dpstrf  # noqa: PLC0415 (slow to import)
 
-    used = np.flatnonzero(loss.diagonal())
-    factor, pivots, rank, _ = dpstrf(loss[used[:, None], used], lower=True)
+    factor, pivots, rank, _ = dpstrf(loss, lower=True)
     root = np.zeros((rank, len(loss)))
-    unpivot(factor.T, used[pivots - 1], root)
+    unpivot(factor.T, pivots - 1, root)
     return root, np.ones(rank)
 
 
@@ -191,9 +190,10 @@ def blocks_in_a_step(width: int, *, hurried: bool) -> int:
 class Exchanged(NamedTuple):
     """The rows of a change of the local map."""
 
-    own: IntArray  # columns of the old local landmarks, shape (a - 3,)
-    needed: IntArray  # rows, in the old local map, of which Φ S is needed
-    kept: int  # how many of these, the first, belong to the pose and to what stays
+    own: IntArray  # ascending columns of the old local landmarks, shape (a - 3,)
+    order: IntArray  # their rows in the old local map
+    needed: IntArray  # rows of the old local map of which Φ S is needed
+    left: int  # how many of these, the first, belong to new landmarks that leave
     new: IntArray  # ascending columns of the landmarks to store
     places: IntArray  # their rows among those needed
     entering: IntArray  # ascending columns of the landmarks that enter
@@ -215,16 +215,25 @@ def exchanged_rows(
     """
     old = list(local)
     staying = [k for k, i in enumerate(old) if i in chosen]
-    needed = staying + [k for k in range(stored, len(old)) if old[k] not in chosen]
-    rows = {slots[old[k]]: row for row, k in enumerate(needed) if k >= stored}
-    new, before = sorted(rows), set(old)
+    leaving = [k for k in range(stored, len(old)) if old[k] not in chosen]
+    places = {slots[old[k]]: 2 * row for row, k in enumerate(leaving)}
+    first = 3 + 2 * len(leaving)
+    for row, k in enumerate(staying):
+        if k >= stored:
+            places[slots[old[k]]] = first + 2 * row
+    new, before = sorted(places), set(old)
     entering = sorted((i for i in chosen if i not in before), key=slots.__getitem__)
+    own = pairs([slots[i] for i in old])
+    order = own.argsort()
+    rows = [2 * k + c for k in leaving for c in (3, 4)]
+    rows += [0, 1, 2, *(2 * k + c for k in staying for c in (3, 4))]
     exchanged = Exchanged(
-        pairs([slots[i] for i in old]),
-        np.concatenate([(0, 1, 2), 3 + pairs(needed)]),
-        3 + 2 * len(staying),
+        own[order],
+        3 + order,
+        np.array(rows),
+        first - 3,
         pairs(new),
-        3 + pairs([rows[slot] for slot in new]),
+        np.array([places[slot] + c for slot in new for c in (0, 1)], dtype=np.int64),
         pairs([slots[i] for i in entering]),
     )
     return exchanged, dict.fromkeys([old[k] for k in staying] + entering)
@@ -241,15 +250,23 @@ class Handover:
     old: Phase  # the end of the old phase
     strip: Array  # S of the old phase, shape (s, width)
     rows: Exchanged
-    next_strip: Array  # S of the new phase, shape (s', width), to be filled
     invariant: bool
     group: int  # number of blocks that are exchanged at a time
     done: int = 0  # number of blocks that have been exchanged
     is_factored: bool = False  # whether what follows is known
     lost: Downdate = field(init=False, repr=False)  # to be deferred at the end
-    _coefficients: Array = field(init=False, repr=False)  # Φ above Uᵀ
-    _values: Array = field(init=False, repr=False)  # Φ S
-    _order: IntArray = field(init=False, repr=False)
+    _root: Array = field(init=False, repr=False)  # Uᵀ, (r, e)
+    _values: Array = field(init=False, repr=False)  # rows of P, (left + s', width)
+
+    def __post_init__(self) -> None:
+        """Make room for the new strip and for the rows to store."""
+        size = len(self.rows.needed) + len(self.rows.entering)
+        self._values = np.empty((size, self.strip.shape[1]))
+
+    @property
+    def next_strip(self) -> Array:
+        """S of the new phase, shape (s', width), as far as it has been exchanged."""
+        return self._values[self.rows.left :]
 
     def advance(self, stored: DeferredCovariance, blocks: int) -> None:
         """Exchange groups of blocks until ``blocks`` are done, or all.
@@ -264,87 +281,50 @@ class Handover:
             self._exchange(stored, range(self.done, last))
             self.done = last
 
+    def beginning(self, stored: DeferredCovariance) -> Array:
+        """Return the covariance with which a new phase begins, shape (a', a' - 3).
+
+        It is that of pose and new local landmarks, without the columns of the pose, and
+        does not need the new strip.
+        """
+        kept, entering = self.rows.needed[self.rows.left :], self.rows.entering
+        S = np.ascontiguousarray(self.strip[:, entering])
+        block = stored.marginal(entering)
+        lost = np.ascontiguousarray(combine(self.old.loss, S, self.invariant).T)
+        block -= combine(lost, S, self.invariant)  # Sᵀ Ψ S
+        across = combine(self.old.gain[kept], S, self.invariant)
+        inside = self.old.covariance[np.ix_(kept, kept[3:])]
+        return np.block([[inside, across], [across[3:].T, block]])
+
     @property
     def nbytes(self) -> int:
-        """Memory that the exchange holds [bytes]."""
-        arrays = [self.strip, self.old.covariance, self.old.gain, self.old.loss]
+        """Memory that the exchange holds, without the old strip [bytes]."""
+        arrays = [self._values, self.old.covariance, self.old.gain, self.old.loss]
         if self.is_factored:
-            arrays += [self._coefficients, self._values, self.lost.root]
+            arrays += [self._root, self.lost.root]
         return sum(array.nbytes for array in arrays)
 
     def _factor(self, width: int) -> None:
-        root, signs = np.empty((0, self.old.gain.shape[1])), np.empty(0)
-        if len(self.old.loss):
-            root, signs = roots(self.old.loss, self.invariant)
-        self._coefficients = np.concatenate([self.old.gain[self.rows.needed], root])
-        self._values = np.zeros((len(self.rows.needed), width))
-        self._order = np.argsort(self.rows.own)
-        self.lost = Downdate(np.zeros((width, len(signs))), signs, [])
+        self._root, signs = roots(self.old.loss, self.invariant)
+        self.lost = Downdate(np.empty((width, len(signs))), signs, [])
         self.is_factored = True
 
     def _exchange(self, stored: DeferredCovariance, blocks: range) -> None:
-        here, a = slice(blocks.start * BLOCK, blocks.stop * BLOCK), len(self._values)
-        rows, count = self.rows, self.rows.kept
-        if self._coefficients.size:
-            part = combine(self._coefficients, self.strip[:, here], self.invariant)
-            self._values[:, here] = part[:a]
-            self.lost.root[here] = part[a:].T
-        own = self._order[_within(rows.own[self._order], here)]
-        inside = self.old.covariance[rows.needed[:, None], 3 + own]
-        self._values[:, rows.own[own]] = inside
+        here = slice(blocks.start * BLOCK, blocks.stop * BLOCK)
+        rows, values, S = self.rows, self._values, self.strip[:, here]
+        needed = self.old.gain[rows.needed]
+        values[: len(needed), here] = combine(needed, S, self.invariant)
+        if self.invariant:
+            self.lost.root[here] = combine(self._root, S, self.invariant).T
+        else:  # without a copy
+            np.matmul(S.T, self._root[:, : len(S)].T, out=self.lost.root[here])
+        own = _within(rows.own, here)
+        inside = self.old.covariance[rows.needed[:, None], rows.order[own]]
+        values[: len(needed), rows.own[own]] = inside
         if len(rows.new):
             self.lost.root[rows.new[_within(rows.new, here)]] = 0.0
-            stored.put(blocks, rows.new, self._values, rows.places)
-        self.next_strip[:count, here] = self._values[:count, here]
-        stored.read(blocks, rows.entering, self.next_strip[count:], self.lost)
-
-
-def begin_handover(
-    stored: DeferredCovariance,
-    strip: Array,
-    now: Phase,
-    rows: Exchanged,
-    *,
-    invariant: bool,
-    hurried: bool,
-) -> tuple[Handover, Array]:
-    """Begin a handover; also return the covariance with which a new phase begins.
-
-    If it is hurried, this is read from the new strip, which is filled at once.
-
-    Parameters
-    ----------
-    stored : DeferredCovariance
-    strip : ndarray, shape (s, width)
-        S of the old phase.
-    now : Phase
-        The end of the old phase.
-    rows : Exchanged
-    invariant, hurried : bool
-
-    Returns
-    -------
-    handover : Handover
-    covariance : ndarray, shape (a', a' - 3)
-        Of pose and new local landmarks, without the columns of the pose.  Of the
-        columns of the landmarks, the lower half is right.
-    """
-    stored.forget(rows.new)
-    next_strip = np.empty((rows.kept + len(rows.entering), stored.width))
-    group = blocks_in_a_step(stored.width, hurried=hurried)
-    handover = Handover(now, strip, rows, next_strip, invariant, group)
-    kept = rows.needed[: rows.kept]
-    if hurried:
-        handover.advance(stored, stored.width // BLOCK)
-        local = np.concatenate([rows.own[kept[3:] - 3], rows.entering])
-        return handover, next_strip[:, local]
-    entering = np.ascontiguousarray(strip[:, rows.entering])
-    block = stored.marginal(rows.entering)
-    lost = np.ascontiguousarray(combine(now.loss, entering, invariant).T)
-    block -= combine(lost, entering, invariant)  # Sᵀ Ψ S
-    across = combine(now.gain[kept], entering, invariant)
-    inside = now.covariance[np.ix_(kept, kept[3:])]
-    return handover, np.block([[inside, across], [across[3:].T, block]])
+            stored.put(blocks, rows.new, values, rows.places)
+        stored.read(blocks, rows.entering, values[len(needed) :], self.lost)
 
 
 def _within(columns: IntArray, here: slice) -> slice:
