@@ -89,7 +89,7 @@ class CompressedMap:
         covariance = np.zeros((len(mean), len(mean)))
         is_local = np.array([i in order for i in ids], dtype=bool)
         inside = np.r_[0:3, 3 + pairs(np.flatnonzero(is_local))]
-        local = np.r_[0:3, 3 + pairs([order[i] for i in ids if i in order])]
+        local = np.r_[0:3, now.first + pairs([order[i] for i in ids if i in order])]
         mean[inside] = now.mean[local]
         covariance[np.ix_(inside, inside)] = now.covariance[np.ix_(local, local)]
         if not is_local.all():
@@ -98,7 +98,7 @@ class CompressedMap:
             columns = self._columns([i for i in ids if i not in order])
             strip = np.ascontiguousarray(self._strip[:, columns])
             mean[outside] = self._points[columns] + self._combine(now.shift, strip)[0]
-            cross = self._combine(now.gain[local], strip)
+            cross = self._combine(now.gain(local), strip)
             covariance[np.ix_(inside, outside)] = cross
             covariance[np.ix_(outside, inside)] = cross.T
             root, signs = phase_update.roots(now.loss, self.is_invariant)
@@ -149,14 +149,14 @@ class CompressedMap:
         self._points, self._references = self._points.copy(), self._references.copy()
         if not whole:
             self._points += self._combine(now.shift, self._strip)[0]
-        self._points[own] = now.mean[3:]
-        self._references[own] = now.reference[3:]
+        self._points[own] = now.mean[now.first :]
+        self._references[own] = now.reference[now.first :]
         ahead = now.mean[:2] + (now.mean[:2] - self._origin) / 2  # likely direction
         points = self._points.reshape(-1, 2)
         chosen = choose_local(ahead, required, self.slots, points, size)
         self._origin = now.mean[:2].copy()
         rows, self.local = phase_update.exchanged_rows(
-            self.slots, self.local, chosen, self._stored
+            self.slots, self.local, chosen, self._stored, now.first
         )
         blocks = phase_update.blocks_in_a_step(self.deferred.width, hurried=hurried)
         self._handover = phase_update.Handover(

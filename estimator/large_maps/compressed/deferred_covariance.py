@@ -268,11 +268,11 @@ class DeferredCovariance:
         """Return whether a downdate is under way; join the pending ones to start it."""
         if not self._under_way and self.pending_rank >= WORTHWHILE:
             width = max(len(downdate.root) for downdate in self._pending)
-            root = np.zeros((width, self.pending_rank))
-            last = 0
+            root, last = np.empty((width, self.pending_rank)), 0
             for downdate in self._pending:
                 first, last = last, last + len(downdate.signs)
                 root[: len(downdate.root), first:last] = downdate.root
+                root[len(downdate.root) :, first:last] = 0.0
             signs = np.concatenate([downdate.signs for downdate in self._pending])
             self._pending = [Downdate(root, signs, self._pending[0].applied)]
             self._under_way, self._done = True, 0

@@ -41,14 +41,31 @@ from .deferred_covariance import (
 
 
 class Phase(NamedTuple):
-    """The parts of the filter's belief at the end of a phase."""
+    """The belief of the filter at the end of a phase, (x_a, y) in its own order.
 
-    mean: Array  # (a,) of pose and local landmarks
-    reference: Array  # (a,) their linearisation points, for filters that fix them
-    covariance: Array  # P_aa, (a, a)
-    gain: Array  # Φ, (a, e)
-    loss: Array  # Ψ, (e, e)
-    shift: Array  # y, (1, e)
+    The pose comes first, then y, then the local landmarks.  The arrays are views of the
+    filter's memory, which the next phase does not use.
+    """
+
+    mean: Array  # (size,)
+    reference: Array  # linearisation points, for filters that fix them
+    covariance: Array  # (size, size)
+    first: int  # row of the first local landmark, 3 + e
+
+    def gain(self, rows: IntArray) -> Array:
+        """Return rows of Φ, shape (k, e)."""
+        chosen: Array = self.covariance[rows, 3 : self.first]
+        return chosen
+
+    @property
+    def loss(self) -> Array:
+        """Ψ, shape (e, e)."""
+        return -self.covariance[3 : self.first, 3 : self.first]
+
+    @property
+    def shift(self) -> Array:
+        """The mean of y, shape (1, e)."""
+        return self.mean[None, 3 : self.first]
 
 
 def virtual_landmarks(coordinates: int, invariant: bool) -> int:
@@ -86,29 +103,9 @@ def begin_phase(
 
 
 def end_phase(slam: EkfSlam, virtual: int) -> Phase:
-    """Split the belief of a filter that ran on an extended state; return copies.
-
-    Without an extension the covariance is a view: the local map may be large.
-    """
-    size, rest = slam.map.size, 3 + 2 * virtual
-    mean, covariance = slam.map.mean[:size], slam.map.covariance[:size, :size]
-    if not virtual:
-        reference, nothing = slam.map.reference[:size].copy(), np.empty((size, 0))
-        none = np.empty((1, 0))
-        return Phase(mean.copy(), reference, covariance, nothing, none[:0], none)
-    rows = np.concatenate([covariance[:3], covariance[rest:]])
-    return Phase(
-        _without(mean, rest),
-        _without(slam.map.reference[:size], rest),
-        np.concatenate([rows[:, :3], rows[:, rest:]], axis=1),
-        rows[:, 3:rest].copy(),
-        -covariance[3:rest, 3:rest],
-        mean[None, 3:rest].copy(),
-    )
-
-
-def _without(vector: Array, rest: int) -> Array:
-    return np.concatenate([vector[:3], vector[rest:]])
+    """Return the belief of a filter that ran on an extended state."""
+    mean, covariance, reference = slam.map.used
+    return Phase(mean, reference, covariance, 3 + 2 * virtual)
 
 
 def combine(coefficients: Array, strip: Array, invariant: bool) -> Array:
@@ -191,8 +188,8 @@ class Exchanged(NamedTuple):
     """The rows of a change of the local map."""
 
     own: IntArray  # ascending columns of the old local landmarks, shape (a - 3,)
-    order: IntArray  # their rows in the old local map
-    needed: IntArray  # rows of the old local map of which Φ S is needed
+    order: IntArray  # their rows in the old belief of the filter
+    needed: IntArray  # rows of this of which Φ S is needed
     left: int  # how many of these, the first, belong to new landmarks that leave
     new: IntArray  # ascending columns of the landmarks to store
     places: IntArray  # their rows among those needed
@@ -200,7 +197,11 @@ class Exchanged(NamedTuple):
 
 
 def exchanged_rows(
-    slots: Mapping[int, int], local: Iterable[int], chosen: Collection[int], stored: int
+    slots: Mapping[int, int],
+    local: Iterable[int],
+    chosen: Collection[int],
+    stored: int,
+    first: int,
 ) -> tuple[Exchanged, dict[int, None]]:
     """Return the rows of a change of the local map, and its landmarks in their order.
 
@@ -212,31 +213,29 @@ def exchanged_rows(
         The old and the new local landmarks.
     stored : int
         How many old ones, the first, are in the stored covariance.
+    first : int
+        Row of the first old one in the belief of the filter.
     """
     old = list(local)
     staying = [k for k, i in enumerate(old) if i in chosen]
     leaving = [k for k in range(stored, len(old)) if old[k] not in chosen]
-    places = {slots[old[k]]: 2 * row for row, k in enumerate(leaving)}
-    first = 3 + 2 * len(leaving)
-    for row, k in enumerate(staying):
-        if k >= stored:
-            places[slots[old[k]]] = first + 2 * row
-    new, before = sorted(places), set(old)
+    left, before = 2 * len(leaving), set(old)
     entering = sorted((i for i in chosen if i not in before), key=slots.__getitem__)
     own = pairs([slots[i] for i in old])
     order = own.argsort()
-    rows = [2 * k + c for k in leaving for c in (3, 4)]
-    rows += [0, 1, 2, *(2 * k + c for k in staying for c in (3, 4))]
-    exchanged = Exchanged(
+    place = {k: 2 * row for row, k in enumerate(leaving)}
+    place |= {k: left + 3 + 2 * row for row, k in enumerate(staying)}
+    new = sorted(range(stored, len(old)), key=lambda k: slots[old[k]])
+    rows = Exchanged(
         own[order],
-        3 + order,
-        np.array(rows),
-        first - 3,
-        pairs(new),
-        np.array([places[slot] + c for slot in new for c in (0, 1)], dtype=np.int64),
+        first + order,
+        np.concatenate([first + pairs(leaving), (0, 1, 2), first + pairs(staying)]),
+        left,
+        pairs([slots[old[k]] for k in new]),
+        np.array([place[k] + c for k in new for c in (0, 1)], dtype=np.int64),
         pairs([slots[i] for i in entering]),
     )
-    return exchanged, dict.fromkeys([old[k] for k in staying] + entering)
+    return rows, dict.fromkeys([old[k] for k in staying] + entering)
 
 
 @dataclass
@@ -289,17 +288,16 @@ class Handover:
         """
         kept, entering = self.rows.needed[self.rows.left :], self.rows.entering
         S = np.ascontiguousarray(self.strip[:, entering])
-        block = stored.marginal(entering)
+        block, P = stored.marginal(entering), self.old.covariance
         lost = np.ascontiguousarray(combine(self.old.loss, S, self.invariant).T)
         block -= combine(lost, S, self.invariant)  # Sᵀ Ψ S
-        across = combine(self.old.gain[kept], S, self.invariant)
-        inside = self.old.covariance[np.ix_(kept, kept[3:])]
-        return np.block([[inside, across], [across[3:].T, block]])
+        across = combine(self.old.gain(kept), S, self.invariant)
+        return np.block([[P[np.ix_(kept, kept[3:])], across], [across[3:].T, block]])
 
     @property
     def nbytes(self) -> int:
         """Memory that the exchange holds, without the old strip [bytes]."""
-        arrays = [self._values, self.old.covariance, self.old.gain, self.old.loss]
+        arrays = [self._values, self.old.covariance]
         if self.is_factored:
             arrays += [self._root, self.lost.root]
         return sum(array.nbytes for array in arrays)
@@ -312,7 +310,7 @@ class Handover:
     def _exchange(self, stored: DeferredCovariance, blocks: range) -> None:
         here = slice(blocks.start * BLOCK, blocks.stop * BLOCK)
         rows, values, S = self.rows, self._values, self.strip[:, here]
-        needed = self.old.gain[rows.needed]
+        needed = self.old.gain(rows.needed)
         values[: len(needed), here] = combine(needed, S, self.invariant)
         if self.invariant:
             self.lost.root[here] = combine(self._root, S, self.invariant).T
