@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
 from ..interface import MapView
-from ..models.bearing_range import wrap_angle
+from ..models.bearing_range import locate_landmark, predict_measurement, wrap_angle
 from ..models.rigid_motion import rotation
 from ..support import saved_states
 from .scan_assignments import Noise
@@ -58,7 +58,7 @@ class TentativeLandmarks(NamedTuple):
     --------
     Three sightings within five scans make a landmark:
 
-    >>> noise, none = Noise(0.1, 0.1), TentativeLandmarks.none()
+    >>> noise, none = Noise(0.1, 0.1), TentativeLandmarks()
     >>> one = none.with_new(np.array([[0.0, 4.0]]), noise, np.array([1]), share=0.5)
     >>> two = one.next_scan(5).with_sighting(0, np.array([0.1, 4.1]), noise, 0.05)
     >>> two.sightings.tolist()
@@ -66,21 +66,15 @@ class TentativeLandmarks(NamedTuple):
     """
 
     #: q, shape (t, 2) [m].
-    places: Array
+    places: Array = np.empty((0, 2))
     #: C, shape (t, 2, 2) [m²].
-    covariances: Array
+    covariances: Array = np.empty((0, 2, 2))
     #: One bit per scan, the latest scan lowest: whether the landmark was seen, (t,).
-    seen: Masks
+    seen: Masks = np.empty(0, np.uint64)
     #: Unique number of each, shape (t,).
-    labels: IntArray
+    labels: IntArray = np.empty(0, np.int64)
     #: ln o of each, shape (t,).
-    odds: Array
-
-    @classmethod
-    def none(cls) -> "TentativeLandmarks":
-        """Return no tentative landmarks."""
-        lists = np.empty(0, np.uint64), np.empty(0, np.int64), np.empty(0)
-        return cls(np.empty((0, 2)), np.empty((0, 2, 2)), *lists)
+    odds: Array = np.empty(0)
 
     @property
     def sightings(self) -> IntArray:
@@ -125,12 +119,9 @@ class TentativeLandmarks(NamedTuple):
         self, which: int, reading: Array, noise: Noise, density: float
     ) -> "TentativeLandmarks":
         """Correct one landmark by another reading (β, r), where the density is ρ."""
-        (x, y), C = self.places[which], self.covariances[which]
-        distance = np.hypot(x, y)
-        H = np.array(
-            [[-y / distance**2, x / distance**2], [x / distance, y / distance]]
-        )
-        nu = reading - (np.arctan2(y, x), distance)
+        C, here = self.covariances[which], self.places[which : which + 1]
+        (expected,), _, (H,) = predict_measurement(np.zeros(3), here)
+        nu = reading - expected
         nu[0] = wrap_angle(float(nu[0]))
         S = H @ C @ H.T + np.diag(noise.variances(reading[1:])[0])
         gain = np.linalg.solve(S, H @ C).T
@@ -150,17 +141,12 @@ class TentativeLandmarks(NamedTuple):
         if not len(readings):
             return self
         share = min(max(share, LEAST_SHARE), 0.5)
-        places, spread = [], []
-        pairs = zip(readings, noise.variances(readings[:, 1]), strict=True)
-        for (bearing, distance), (across, along) in pairs:
-            direction = rotation(bearing)
-            places.append(direction @ (distance, 0.0))
-            local = np.diag([along, across * distance**2])
-            spread.append(direction @ local @ direction.T)
+        places, _, J = locate_landmark(np.zeros(3), readings)
+        variances = noise.variances(readings[:, 1])
+        spread = J * variances[:, None] @ J.transpose(0, 2, 1)
         odds = np.full(len(readings), np.log(share / (1 - share)))
         new = places, spread, np.ones(len(readings), np.uint64), labels, odds
-        pairs = zip(self, new, strict=True)
-        return TentativeLandmarks(*(np.concatenate(pair) for pair in pairs))
+        return TentativeLandmarks(*map(np.concatenate, zip(self, new, strict=True)))
 
     def chosen(self, which: BoolArray) -> "TentativeLandmarks":
         """Return some of them."""

@@ -168,8 +168,8 @@ class HypothesisSlam:
     ) -> None:
         self._policy = as_policy(management)
         noise = motion_std, measurement_std
-        make = partial(ManagedSlam, estimator, *noise, management=self._policy)
-        self._pool = FilterPool(partial(make, **options))
+        options |= {"management": self._policy}
+        self._pool = FilterPool(partial(ManagedSlam, estimator, *noise, **options))
         #: The hypotheses, the most probable first.
         self.hypotheses = [Hypothesis(0.0, self._pool.fresh())]
         #: Number of steps taken.
@@ -218,9 +218,7 @@ class HypothesisSlam:
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
-        with undone_on_error(self.bookmark()):
-            self.best.reset(pose, pose_std)
-            self._keep([Hypothesis(0.0, self.best)])
+        self._change_best(lambda best: best.reset(pose, pose_std))
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], dt multiplies its noise variance."""
@@ -266,13 +264,8 @@ class HypothesisSlam:
         """
         readings = argument_checks.scan(measurements)
         views = (h.slam.bookmark_views() for h in self.hypotheses)
-        undo, steps = undo_all(*views, self._pool.bookmark()), self.steps
-
-        def undo_options() -> None:
-            if self.steps == steps:
-                undo()
-
-        with undone_on_error(undo_options):
+        undo = undo_all(*views, self._pool.bookmark())
+        with undone_on_error(undo, unless_moved=self):
             if landmark_ids is None:
                 options = self._options(readings)
             else:
@@ -303,10 +296,10 @@ class HypothesisSlam:
                 errors[k] = error
 
         def then() -> UpdateReport:
-            branches = enumerate(zip(costs, slams, strict=True))
-            kept = [Hypothesis(c, slam) for k, (c, slam) in branches if k not in errors]
-            if not kept:
+            taken = [k for k in range(len(slams)) if k not in errors]
+            if not taken:
                 raise errors[0]
+            kept = [Hypothesis(costs[k], slams[k]) for k in taken]
             return self._take_over(distinct(kept, self._policy.hypotheses))
 
         try:
@@ -350,14 +343,16 @@ class HypothesisSlam:
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise landmarks on request; only the best hypothesis continues."""
-        with undone_on_error(self.bookmark()):
-            self.best.remove(landmark_ids)
-            self._keep(self.hypotheses[:1])
+        self._change_best(lambda best: best.remove(landmark_ids))
 
     def merge(self, kept: int, gone: int) -> None:
         """Merge two landmarks on request; only the best hypothesis continues."""
+        self._change_best(lambda best: best.merge(kept, gone))
+
+    def _change_best(self, change: Callable[[ManagedSlam], None]) -> None:
+        """Change the best hypothesis; only this one continues."""
         with undone_on_error(self.bookmark()):
-            self.best.merge(kept, gone)
+            change(self.best)
             self._keep(self.hypotheses[:1])
 
     def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:

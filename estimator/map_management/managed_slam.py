@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array
+from ..association.detections import LOST_SCORE
 from ..association.scan_assignments import Sensor
 from ..association.scan_association import (
-    LOST_SCORE,
     Candidates,
     Option,
     ScanAssociation,
@@ -272,13 +272,7 @@ class ManagedSlam:
         self, readings: Array, associate: Callable[[], ScanAssociation]
     ) -> UpdateReport:
         """Correct the belief with readings (m, 2) as associated, then prune the map."""
-        undo, steps = self.bookmark_views(), self.steps
-
-        def undo_views() -> None:
-            if self.steps == steps:
-                undo()
-
-        with undone_on_error(undo_views):
+        with undone_on_error(self.bookmark_views(), unless_moved=self):
             plan = associate()
             missed = self._pruner.expected(readings) - plan.explained
             scans, first = self._recent.with_scan(readings, plan)

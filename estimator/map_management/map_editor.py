@@ -19,7 +19,6 @@ What a filter lacks goes through ``belief()``, ``state_dict()`` and
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -52,9 +51,6 @@ class MapEditor:
         self._slam: Any = slam
         self._view: MapView | None = None
         self._within = 0.0
-        self._read: Any = partial(view_map, slam)
-        if hasattr(slam, "map_view") and not hides_its_belief(slam):
-            self._read = slam.map_view
         #: Whether the filter can show only the landmarks around the robot.
         self.is_local = hasattr(slam, "local_view")
         wanted = ("remove", "merge") if merging else ("remove",)
@@ -82,7 +78,7 @@ class MapEditor:
             if self._has_methods and self.is_local:
                 self._view = self._slam.local_view(reach)
             else:
-                self._view = self._read()
+                self._view = view_map(self._slam)
         self._within = reach
         return self._view
 

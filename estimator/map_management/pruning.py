@@ -141,7 +141,7 @@ class MapPruner:
         most, records = self._policy.remove_after, self.records
         if most is None:
             return []
-        _, misses, _ = records.renewed()
+        misses, _ = records.renewed()
         misses[records.slots(missed)] += 1
         overdue = np.flatnonzero(records.misses >= most)
         return self.remove([records.ids[k] for k in overdue.tolist()])
@@ -234,7 +234,7 @@ def _renamed(pair: tuple[int, int], old: int, new: int) -> tuple[int, int]:
 class LandmarkRecords(Restorable):
     """What a run has shown of the landmarks of its map.
 
-    Sightings, misses and information are in the order of the map.
+    Misses and information are in the order of the map.
 
     The information of a landmark is its block of the information matrix, summed over
     all its readings with the pose of the robot taken as known::
@@ -256,13 +256,12 @@ class LandmarkRecords(Restorable):
     """
 
     replaced = (
-        *("ids", "_slots", "sightings", "misses", "information"),
+        *("ids", "_slots", "misses", "information"),
         *("apart", "aliases", "doubtful"),
     )
 
     def __init__(self) -> None:
         self.ids: tuple[int, ...] = ()
-        self.sightings: IntArray = np.zeros(0, dtype=np.int64)
         self.misses: IntArray = np.zeros(0, dtype=np.int64)
         self.information: Array = np.zeros((0, 3))
         self._slots: dict[int, int] = {}
@@ -280,7 +279,7 @@ class LandmarkRecords(Restorable):
         old = {i: k for k, i in enumerate(self.ids)}
         rows = np.array([old.get(i, -1) for i in ids], dtype=np.int64)
         fresh = rows < 0
-        for name in ("sightings", "misses", "information"):
+        for name in ("misses", "information"):
             before = getattr(self, name)
             after = np.zeros((len(rows), *before.shape[1:]), dtype=before.dtype)
             after[~fresh] = before[rows[~fresh]]
@@ -295,7 +294,7 @@ class LandmarkRecords(Restorable):
         heading: float,
         noise: tuple[float, float, float, float],
     ) -> None:
-        """Count one sighting of each landmark.
+        """Add the information of one sighting of each landmark, which forgives misses.
 
         Parameters
         ----------
@@ -313,14 +312,13 @@ class LandmarkRecords(Restorable):
         rows = np.array([-1 if i is None else slots[i] for i in ids], dtype=np.int64)
         _add_sightings(self.renewed(), rows, readings, heading, noise)
 
-    def renewed(self) -> tuple[IntArray, IntArray, Array]:
-        """Replace sightings, misses and information by copies; return the copies.
+    def renewed(self) -> tuple[IntArray, Array]:
+        """Replace misses and information by copies; return the copies.
 
         The caller may change these in place, since no saved state shares them.
         """
-        self.sightings, self.misses = self.sightings.copy(), self.misses.copy()
-        self.information = self.information.copy()
-        return self.sightings, self.misses, self.information
+        self.misses, self.information = self.misses.copy(), self.information.copy()
+        return self.misses, self.information
 
     def slots(self, ids: Iterable[int]) -> IntArray:
         """Return the places of landmarks in the order of the map."""
@@ -329,8 +327,7 @@ class LandmarkRecords(Restorable):
     def join(self, kept: int, gone: int) -> None:
         """Add the records of one landmark to those of another."""
         i, j = self._slots[kept], self._slots[gone]
-        sightings, misses, information = self.renewed()
-        sightings[i] += sightings[j]
+        misses, information = self.renewed()
         information[i] += information[j]
         misses[i] = min(misses[i], misses[j])
         earlier = {i: kept for i, j in self.aliases.items() if j == gone}
@@ -366,7 +363,6 @@ class LandmarkRecords(Restorable):
 #: What a saved state holds about the landmarks of a map.
 RECORDS: saved_states.Table = {
     "ids": (saved_states.IDS, "n"),
-    "sightings": (saved_states.COUNTS, "n"),
     "misses": (saved_states.COUNTS, "n"),
     "information": (saved_states.NUMBERS, "n", 3),
     "apart": (saved_states.WHOLE, -1, 2),
@@ -377,22 +373,21 @@ RECORDS: saved_states.Table = {
 
 @jit
 def _add_sightings(
-    counts: tuple[IntArray, IntArray, Array],
+    counts: tuple[IntArray, Array],
     slots: IntArray,
     readings: Array,
     heading: float,
     noise: tuple[float, float, float, float],
 ) -> None:
-    """Count a sighting by each reading with a slot ≥ 0; Λ ← Λ + H_lᵀ Q⁻¹ H_l.
+    """Forgive misses for each reading with a slot ≥ 0; Λ ← Λ + H_lᵀ Q⁻¹ H_l.
 
-    ``counts`` are sightings, misses, and the information as xx, xy, yy.
+    ``counts`` are misses, and the information as xx, xy, yy.
     """
-    sightings, misses, information = counts
+    misses, information = counts
     bearing_std, range_std, per_metre, metres = noise
     for k in range(len(slots)):
         if slots[k] < 0:
             continue
-        sightings[slots[k]] += 1
         misses[slots[k]] = 0
         bearing, distance = readings[k, 0] + heading, readings[k, 1]
         along = (range_std + per_metre * distance) ** -2.0

@@ -176,14 +176,11 @@ class RecentScans(Restorable):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
         saved = saved_states.read(state, WINDOW, "recent.")
-        count, most = int(saved["count"]), self._window + 1
-        if count > most:
-            raise ValueError(
-                f"state['recent.count'] must be at most {most}, got {count}"
-            )
+        n, most = int(saved["count"]), self._window + 1
+        if n > most:
+            raise ValueError(f"state['recent.count'] must be at most {most}, got {n}")
         self.scans = [
-            RecentScan.from_state_dict(without_prefix(state, str(k)))
-            for k in range(count)
+            RecentScan.from_state_dict(without_prefix(state, str(k))) for k in range(n)
         ]
         self.motions = _as_tuples(saved["motions"].tolist())
         self.decisions = []
@@ -216,8 +213,6 @@ def _relabel(scans: list[RecentScan], confirmed: Mapping[int, int]) -> int | Non
         the filter was kept.
     """
     names = {label: i for i, label in confirmed.items() if label != NO_LABEL}
-    if not names:
-        return None
     starts = [k for k, scan in enumerate(scans[:-1]) if scan.before is not None]
     shown = [k for k in starts if not names.keys().isdisjoint(scans[k].labels)]
     if not shown:

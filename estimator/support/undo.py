@@ -10,17 +10,21 @@ Undo = Callable[[], None]
 
 
 class undone_on_error:  # noqa: N801 (reads as a verb, in a with statement)
-    """Take back what the block has changed if it raises, even `KeyboardInterrupt`."""
+    """Take back what the block has changed if it raises, even `KeyboardInterrupt`.
 
-    def __init__(self, undo: Undo) -> None:
-        self._undo = undo
+    With ``unless_moved``, only if this filter has not taken another step.
+    """
+
+    def __init__(self, undo: Undo, unless_moved: Any = None) -> None:
+        self._undo, self._slam = undo, unless_moved
+        self._steps = getattr(unless_moved, "steps", None)
 
     def __enter__(self) -> None:
         """Begin the block."""
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Take back the changes if there is an error."""
-        if kind is not None:
+        if kind is not None and getattr(self._slam, "steps", None) == self._steps:
             to_the_end(self._undo)
 
 

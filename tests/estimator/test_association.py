@@ -140,7 +140,7 @@ def test_every_reading_gets_one_landmark_or_none(squared, log_det, ambiguity, ex
 
 def tracked(readings):
     rows, labels = np.array(readings, dtype=float), np.arange(len(readings))
-    return TentativeLandmarks.none().with_new(rows, NOISE, labels, share=0.2)
+    return TentativeLandmarks().with_new(rows, NOISE, labels, share=0.2)
 
 
 def test_a_tentative_landmark_starts_where_it_was_read():

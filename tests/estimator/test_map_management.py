@@ -737,9 +737,10 @@ def test_landmarks_begun_in_a_new_submap_count_as_seen():
         slam.predict(odometry)
         ids = IDS if step % 3 == 0 else others
         assert slam.update(readings[ids], ids).removed_ids == ()
-    sightings = slam.state_dict()["landmarks.sightings"]
+    state = slam.state_dict()
     assert slam.filter.closed_count > 3
-    assert sightings.tolist() == [20] * 5 + [7]
+    assert state["landmarks.misses"].tolist() == [0] * 5 + [1]
+    assert (state["landmarks.information"][:, [0, 2]] > 0).all()
 
 
 @pytest.mark.slow

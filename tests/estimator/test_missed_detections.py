@@ -9,8 +9,7 @@ from plain_association import predicted_readings
 from scipy.stats import poisson
 
 from slamgym.estimator import make_estimator
-from slamgym.estimator.association.scan_assignments import missing_costs
-from slamgym.estimator.association.scan_association import (
+from slamgym.estimator.association.detections import (
     FEWER,
     HIDDEN,
     HIDDEN_EACH,
@@ -20,16 +19,20 @@ from slamgym.estimator.association.scan_association import (
     MOST_OF_SCAN,
     NO_RETURNS,
     PROVEN,
-    RINGS,
     SCANS,
-    SECTORS,
     SUREST,
     WIDEST,
-    Candidates,
     Detections,
     LostEvidence,
 )
-from slamgym.estimator.association.tentative_landmarks import MEMORY, UnexplainedDensity
+from slamgym.estimator.association.scan_assignments import missing_costs
+from slamgym.estimator.association.scan_association import Candidates
+from slamgym.estimator.association.tentative_landmarks import (
+    MEMORY,
+    RINGS,
+    SECTORS,
+    UnexplainedDensity,
+)
 from slamgym.estimator.interface import MapView
 from slamgym.estimator.map_management.hypotheses import Hypothesis
 

@@ -223,7 +223,7 @@ def without_the_last(value):
         ("sparse_information", "local_slots", lambda v: v[:, None],
          r"state\['local_slots'\] must have shape"),
         *(("joint", f"landmarks.{key}", without_the_last, r"state\['landmarks")
-          for key in ("ids", "sightings", "misses", "information")),
+          for key in ("ids", "misses", "information")),
     ],
 )  # fmt: skip
 def test_a_damaged_entry_is_refused_by_name(name, key, damaged, message):

@@ -1,0 +1,371 @@
+"""The landmarks that scans should have shown: how likely they are to be missed.
+
+An assignment that leaves a landmark without a reading, although the sensor sees it
+with probability P_D, is less likely by the factor 1 − P_D::
+
+    cost = −2 Σ ln(1 − P_D(β, r))
+
+P_D is the share of expected landmarks that the scans so far have shown, in cells of
+bearing and range up to the longest reading; a cell counts the share of its sector or
+its ring, the lower one, as one more try or two.  A landmark that is shown costs
+−2 ln P_D: a map that explains little does not become likely by expecting little.
+
+A landmark that is in view for sure counts with the least P_D within two σ of where it
+should be seen, and scan after scan.  One that may be out of view counts with its mean
+P_D, and only where that exceeds those before: what keeps it out of view once does so
+for long.  For the same reason something may hide a landmark until it is seen again::
+
+    P(missed so often) = ε + (1 − ε) Π (1 − P_D)
+
+A run is probably lost if the scans show far fewer landmarks than its map promises.
+For landmarks that are in view for sure, Page's test [1]_ compares the rate P_D, the
+least within two σ and half a cell, with a fraction ρ of it.  The half cell makes
+landmarks at the edge of the view count little::
+
+    g ← max(0, g + min(c, Σ_seen ln ρ + Σ_missed ln (1 − ρ P_D) / (1 − P_D)))
+
+A scan adds at most c, since a single wrong pose may cause all its misses.  Three
+kinds of landmarks are no evidence.  If fewer than two scans have shown a landmark
+since it entered the map, it may be clutter.  If a landmark is not assigned a reading
+that may belong to it, the scan may show it.  If a landmark entered the map after the
+last scan at which g was 0, a lost filter may have mapped it a second time.  P_D
+learns the rates of a lost run, too, so g falls again: the largest evidence counts.
+
+Misses in succession are independent in few real drives: a tree hides another one for
+as long as the robot stands.  A landmark seen again after misses of q < ε, where
+q = Π (1 − P_D) since its last sighting, shows that something had hidden it and that
+the map was right.  If k of n sightings so far were such ones, a miss counts with the
+probability that nothing hides the landmark::
+
+    q / (q + 5 k' / (n + 100)),    k' = max(0, √k − 2)²
+
+k' is a lower limit of what k tends to, since a few landmarks seem to be seen again in
+lost runs, too.  The 5 allows for sightings that begin no absence, since nothing is
+near, and for hidden landmarks that are never seen again.
+
+Something near may hide all landmarks for a few scans.  So the alarm follows g slowly,
+until g falls::
+
+    s ← min(g, s + (g − s) / 5)
+
+A robot whose odometry fails where no landmark is in view for sure misses none.  Its
+readings are strange instead: they fit neither the map nor those of earlier scans.  A
+second sum compares the likelihoods of n strange readings and m others if as many are
+strange as so far, μ in a scan, or if 1 − ρ of those that fitted so far, e in a scan,
+are strange, too::
+
+    w ← max(0, w + min(c / 2, n ln (1 + δ / μ) − δ + m ln ρ) / 2),    δ = (1 − ρ) e
+
+A new landmark is strange in its first scan only, which counts c / 4 at most.  The
+half allows for clutter that comes in bursts.  Where one scan confirms a landmark, no
+reading is strange.
+
+A lost run whose landmarks all stay in view misses none, either.  Many of these have
+lost the heading: linearised equations do not hold where its standard deviation is a
+radian.  Scans in succession that leave the heading unknown count c / 2 each::
+
+    h ← h + c / 2  if min(σ²_θ, π²/3) > least + 0.8 rad² and there is a map
+    h ← 0          otherwise
+
+π²/3 is the variance of a uniform heading: one that is unknown at the start is no
+evidence.
+
+References
+----------
+.. [1] E. S. Page, Continuous inspection schemes, Biometrika 41, 1954.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ...arrays import Array, BoolArray, IntArray
+from ...jit import jit, njit_internal
+from ..interface import MapView
+from ..kernels.assignment_search import reading_covariance
+from ..models.bearing_range import (
+    expected_reading_jit,
+    reading_slopes_jit,
+    wrap_angle_jit,
+)
+from .tentative_landmarks import MEMORY, RINGS, SECTORS, UnexplainedDensity
+
+#: Weights of a Gaussian at 0, +2 σ and −2 σ, which keep its variance.
+NODES = np.array([3 / 4, 1 / 8, 1 / 8])
+
+#: Probability that something hides a landmark until it is seen again.
+HIDDEN = 0.0003
+
+#: Largest P_D: something may stand before a landmark.
+SUREST = 0.95
+
+#: A bearing whose two σ are wider than this says nothing [rad].
+WIDEST = np.pi / 4
+
+#: ρ: detection rate of a lost run, relative to that of its map.
+FEWER = 0.5
+
+#: Landmarks hidden for each one seen again, and sightings that count as none of these.
+HIDDEN_EACH, NO_RETURNS = 5, 100
+
+#: The root of a count is at most this far from the root of its mean, for most counts.
+LIMIT = 2.0
+
+#: A change of the evidence counts in full after about so many scans.
+SCANS = 5
+
+#: P_D of a missed landmark is the least up to this many cells beyond two σ.
+MARGIN = 0.5
+
+#: c: most evidence of being lost from one scan.
+MOST_OF_SCAN = 3.0
+
+#: A heading is unknown if its variance has grown by this [rad²].
+UNKNOWN = 0.8
+
+#: A run whose evidence has exceeded this is probably lost.
+LOST_SCORE = 3.0
+
+#: A landmark that was shown in this many scans is not of clutter.
+PROVEN = 2
+
+#: Bearing + π and range of a landmark, and two σ of both.
+Place = tuple[float, float, float, float]
+
+#: Variance of a heading that is equally likely everywhere [rad²].
+UNIFORM = np.pi**2 / 3
+
+
+class LostEvidence(NamedTuple):
+    """Evidence that the run is lost."""
+
+    #: g: a logarithm of a ratio of likelihoods.
+    present: float = 0.0
+    #: s, which follows g.
+    lasting: float = 0.0
+    #: The largest evidence so far.
+    largest: float = 0.0
+    #: Landmarks from this identity on are newer than the last scan at which g was 0.
+    first_new: int = 0
+    #: Least variance of the heading so far [rad²].
+    surest: float = UNIFORM
+    #: h, of scans in succession that have left the heading unknown.
+    unknown: float = 0.0
+    #: w, of strange readings.
+    unexplained: float = 0.0
+    #: Running sum of other readings.
+    explained: float = 0.0
+
+    def after(self, more: float, mapped: Sequence[int]) -> LostEvidence:
+        """Add the evidence of a scan before which these landmarks were in the map."""
+        present = max(0.0, self.present + min(more, MOST_OF_SCAN))
+        first_new = self.first_new
+        if present == 0:
+            first_new = max(first_new, 1 + max(mapped, default=-1))
+        lasting = min(present, self.lasting + (present - self.lasting) / SCANS)
+        changed = present, lasting, max(self.largest, lasting), first_new
+        return LostEvidence(*changed, *self[4:])
+
+    def with_heading(self, variance: float, has_map: bool = True) -> LostEvidence:
+        """Count a scan that leaves a variance of the heading [rad²].
+
+        Examples
+        --------
+        >>> evidence = LostEvidence()
+        >>> for variance in (0.01, 0.9, 1.0, 1.1):
+        ...     evidence = evidence.with_heading(variance)
+        >>> evidence.unknown > LOST_SCORE
+        True
+        """
+        variance = min(float(variance), UNIFORM)
+        is_unknown = has_map and variance - self.surest > UNKNOWN
+        unknown = self.unknown + MOST_OF_SCAN / 2 if is_unknown else 0.0
+        largest, surest = max(self.largest, unknown), min(self.surest, variance)
+        return self._replace(largest=largest, surest=surest, unknown=unknown)
+
+    def with_readings(
+        self, strange: int, explained: int, before: UnexplainedDensity
+    ) -> LostEvidence:
+        """Count a scan with readings that fit nothing, and with others."""
+        more = (1 - FEWER) * self.explained / before.scans
+        ratio = strange * math.log(1 + more / before.per_scan) - more
+        ratio += explained * math.log(FEWER)
+        unexplained = max(0.0, self.unexplained + min(ratio, MOST_OF_SCAN / 2) / 2)
+        total = MEMORY * self.explained + explained
+        largest = max(self.largest, unexplained)
+        return self._replace(largest=largest, unexplained=unexplained, explained=total)
+
+
+class Detections(NamedTuple):
+    """How many expected landmarks the scans have shown.
+
+    Examples
+    --------
+    >>> view = MapView(np.array([0, 0, 0, 4.5, 0.5]), 1e-6 * np.eye(5), (7,))
+    >>> detections = Detections.none()
+    >>> for slot in (0, 0, 0, -1):
+    ...     row = np.array([slot])
+    ...     cost, detections = detections.after(view, row, row[:0], longest=8.0)
+    >>> share = (3 + 2 * 4 / 5) / 5  # of the cell, with that of its ring
+    >>> bool(np.isclose(cost, -2 * np.log(HIDDEN + (1 - HIDDEN) * (1 - share))))
+    True
+    """
+
+    #: Landmarks seen, expected, and returned after misses of odds below ε: shape
+    #: (3, SECTORS, RINGS).
+    counts: Array
+    #: For landmarks that may have been in view since they were last seen, the
+    #: probability of missing them so often if nothing hides them.
+    missed: Mapping[int, float]
+    #: In how many scans a landmark was shown, up to `PROVEN`.
+    shown: Mapping[int, int]
+    #: That the run is lost.
+    evidence: LostEvidence
+
+    @classmethod
+    def none(cls) -> Detections:
+        """Return the state before the first scan."""
+        return cls(np.zeros((3, SECTORS, RINGS)), {}, {}, LostEvidence())
+
+    def after(
+        self, view: MapView, slots: IntArray, explained: IntArray, longest: float
+    ) -> tuple[float, Detections]:
+        """Count one scan; return the cost of the landmarks that it has missed, too.
+
+        Parameters
+        ----------
+        view : MapView
+            The map before the scan.
+        slots : ndarray of int64, shape (m,)
+            Its landmarks that the rows of the scan show; below 0: none.
+        explained : ndarray of int64, shape (k,)
+            Its landmarks that some row may belong to: to miss these is no evidence.
+        longest : float
+            Longest range read so far [m].
+        """
+        ids, counts, evidence = view.ids, self.counts.copy(), self.evidence
+        times = [self.shown.get(i, 0) for i in ids]
+        pairs = zip(ids, times, strict=True)
+        proven = [i < evidence.first_new and count >= PROVEN for i, count in pairs]
+        is_telling, scan = np.array(proven, dtype=np.bool_), (slots, explained)
+        missed = np.array([self.missed.get(i, 1.0) for i in ids])
+        cost, fewer = _count(view[:2], scan, is_telling, longest, counts, missed)
+        left, chances = self.missed, missed.tolist()
+        if left or min(chances, default=1.0) < 1:
+            left = {**left, **dict(zip(ids, chances, strict=True))}
+            left = {i: chance for i, chance in left.items() if chance < 1}
+        seen = [slot for slot in slots.tolist() if slot >= 0]
+        more = {ids[j]: times[j] + 1 for j in seen if times[j] < PROVEN}
+        shown = {**self.shown, **more} if more else self.shown
+        evidence = evidence.after(fewer, view.mapped)
+        return cost, Detections(counts, left, shown, evidence)
+
+    def chance_to_miss(self, view: MapView, longest: float) -> Array:
+        """Return the probability that a scan does not show a landmark, shape (n,)."""
+        none, chance = np.zeros(0, dtype=np.int64), np.ones(len(view.ids))
+        is_telling, counts = np.zeros(len(chance), dtype=np.bool_), self.counts.copy()
+        _count(view[:2], (none, none), is_telling, longest, counts, chance)
+        return chance
+
+
+@jit
+def _count(
+    belief: tuple[Array, Array],
+    scan: tuple[IntArray, IntArray],
+    is_telling: BoolArray,
+    longest: float,
+    counts: Array,
+    missed: Array,
+) -> tuple[float, float]:
+    """Count a scan; return its cost, and the evidence that the run is lost.
+
+    Parameters
+    ----------
+    belief : tuple
+        Mean and covariance of the map.
+    scan : tuple
+        The landmark that each row shows (m,), below 0: none; and the landmarks (k,)
+        that some row may belong to: to miss these is no evidence.
+    is_telling : ndarray, shape (n,)
+        Whether each landmark can be evidence.  Overwritten.
+    longest : float
+        Longest range read so far [m].
+    counts : ndarray, shape (3, SECTORS, RINGS)
+        As in :class:`Detections`.  The scan is added.
+    missed : ndarray, shape (n,)
+        Probability of missing each landmark so often.  Updated.
+    """
+    (mean, P), (slots, explained) = belief, scan
+    seen, expected, returned = counts[0], counts[1], counts[2]
+    is_seen = np.zeros(len(missed), np.bool_)
+    is_seen[slots[slots >= 0]] = True
+    is_telling[explained] &= is_seen[explained]
+    sectors, rings = seen.shape
+    ring = (seen.sum(axis=0) + 1) / (expected.sum(axis=0) + 2)
+    sector = (seen.sum(axis=1) + 1) / (expected.sum(axis=1) + 2)
+    usual = np.minimum(sector.reshape(-1, 1), ring.reshape(1, -1))
+    shares = np.minimum((seen + 2 * usual) / (expected + 2), SUREST)
+    returns = max(np.sqrt(returned.sum()) - LIMIT, 0.0) ** 2
+    hidden = HIDDEN_EACH * returns / (seen.sum() + NO_RETURNS)
+    cost, fewer = 0.0, 0.0
+    for j in range(len(is_seen)):
+        place = _place_in_scan(mean, P, j)
+        bearing, distance, turn, aside = place
+        cell = (
+            int(bearing // (2 * np.pi / sectors)) % sectors,
+            min(int(distance // (longest / rings)), rings - 1),
+        )
+        is_sure = distance + aside < longest and turn <= WIDEST
+        if is_sure:
+            seen[cell] += is_seen[j]
+            expected[cell] += 1
+            returned[cell] += is_seen[j] and missed[j] < HIDDEN
+        if is_seen[j]:
+            cost -= 2 * np.log(shares[cell])
+            missed[j] = 1.0
+            fewer += is_sure * is_telling[j] * np.log(FEWER)
+        elif distance - aside < longest:
+            least, likely = _shares_around(shares, place, longest, 0.0)
+            left = missed[j] * (1 - least) if is_sure else min(missed[j], 1 - likely)
+            odds = HIDDEN + (1 - HIDDEN) * left
+            cost -= 2 * np.log(odds / (HIDDEN + (1 - HIDDEN) * missed[j]))
+            if is_sure and is_telling[j]:
+                least, _ = _shares_around(shares, place, longest, MARGIN)
+                telling = 1 / (1 + hidden / max(missed[j], 1e-99))
+                fewer += telling * np.log((1 - FEWER * least) / (1 - least))
+            missed[j] = left
+    return cost, fewer
+
+
+@njit_internal
+def _shares_around(
+    shares: Array, place: Place, longest: float, margin: float
+) -> tuple[float, float]:
+    """Return the least and the mean P_D within two σ and a margin [cells]."""
+    sectors, rings = shares.shape
+    width, depth = 2 * np.pi / sectors, longest / rings
+    bearing, distance, turn, aside = place
+    least, likely = SUREST, 0.0
+    for a in range(-1, 2):
+        side = int((bearing + a * (turn + margin * width)) // width) % sectors
+        for b in range(-1, 2):
+            far = int(abs(distance + b * (aside + margin * depth)) // depth)
+            share = shares[side, far] if far < rings else 0.0
+            least = min(least, share)
+            likely += NODES[a] * NODES[b] * share
+    return least, likely
+
+
+@njit_internal
+def _place_in_scan(mean: Array, P: Array, j: int) -> Place:
+    """Return where a scan is expected to show landmark j."""
+    c = 3 + 2 * j
+    dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
+    bearing, distance = expected_reading_jit(dx, dy, mean[2])
+    turn, _, aside = reading_covariance(P, c, reading_slopes_jit(dx, dy))
+    std = np.sqrt(max(turn, 0.0)), np.sqrt(max(aside, 0.0))
+    return wrap_angle_jit(bearing) + np.pi, distance, 2 * std[0], 2 * std[1]
