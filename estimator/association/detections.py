@@ -17,6 +17,12 @@ for long.  For the same reason something may hide a landmark until it is seen ag
 
     P(missed so often) = ε + (1 − ε) Π (1 − P_D)
 
+A landmark that enters the map has the same cost, for the scans before the first one
+that shows it.  Beliefs about earlier poses represent these, one for each ring that the
+robot has passed.  They are taken as independent of the landmark: where both share an
+error, as before a loop is closed, their distance counts as less certain than it is,
+and the landmark costs less.
+
 A run is probably lost if the scans show far fewer landmarks than its map promises.
 For landmarks that are in view for sure, Page's test [1]_ compares the rate P_D, the
 least within two σ and half a cell, with a fraction ρ of it.  The half cell makes
@@ -136,6 +142,8 @@ PROVEN = 2
 #: Bearing + π and range of a landmark, and two σ of both.
 Place = tuple[float, float, float, float]
 
+NO_PATH = np.empty((0, 13))
+
 #: Variance of a heading that is equally likely everywhere [rad²].
 UNIFORM = np.pi**2 / 3
 
@@ -206,7 +214,7 @@ class Detections(NamedTuple):
     Examples
     --------
     >>> view = MapView(np.array([0, 0, 0, 4.5, 0.5]), 1e-6 * np.eye(5), (7,))
-    >>> detections = Detections.none()
+    >>> detections = Detections()
     >>> for slot in (0, 0, 0, -1):
     ...     row = np.array([slot])
     ...     cost, detections = detections.after(view, row, row[:0], longest=8.0)
@@ -217,19 +225,17 @@ class Detections(NamedTuple):
 
     #: Landmarks seen, expected, and returned after misses of odds below ε: shape
     #: (3, SECTORS, RINGS).
-    counts: Array
+    detected: Array = np.zeros((3, SECTORS, RINGS))
     #: For landmarks that may have been in view since they were last seen, the
     #: probability of missing them so often if nothing hides them.
-    missed: Mapping[int, float]
+    missed: Mapping[int, float] = {}
     #: In how many scans a landmark was shown, up to `PROVEN`.
-    shown: Mapping[int, int]
+    shown: Mapping[int, int] = {}
     #: That the run is lost.
-    evidence: LostEvidence
-
-    @classmethod
-    def none(cls) -> Detections:
-        """Return the state before the first scan."""
-        return cls(np.zeros((3, SECTORS, RINGS)), {}, {}, LostEvidence())
+    lost: LostEvidence = LostEvidence()
+    #: Beliefs about poses of scans: rows of the number of the scan, (x, y, θ), and P,
+    #: shape (p, 13).
+    path: Array = NO_PATH
 
     def after(
         self, view: MapView, slots: IntArray, explained: IntArray, longest: float
@@ -247,7 +253,7 @@ class Detections(NamedTuple):
         longest : float
             Longest range read so far [m].
         """
-        ids, counts, evidence = view.ids, self.counts.copy(), self.evidence
+        ids, counts, evidence = view.ids, self.detected.copy(), self.lost
         times = [self.shown.get(i, 0) for i in ids]
         pairs = zip(ids, times, strict=True)
         proven = [i < evidence.first_new and count >= PROVEN for i, count in pairs]
@@ -262,12 +268,54 @@ class Detections(NamedTuple):
         more = {ids[j]: times[j] + 1 for j in seen if times[j] < PROVEN}
         shown = {**self.shown, **more} if more else self.shown
         evidence = evidence.after(fewer, view.mapped)
-        return cost, Detections(counts, left, shown, evidence)
+        return cost, Detections(counts, left, shown, evidence, self.path)
 
-    def chance_to_miss(self, view: MapView, longest: float) -> Array:
-        """Return the probability that a scan does not show a landmark, shape (n,)."""
-        none, chance = np.zeros(0, dtype=np.int64), np.ones(len(view.ids))
-        is_telling, counts = np.zeros(len(chance), dtype=np.bool_), self.counts.copy()
+    def with_pose(self, scan: int, view: MapView, longest: float) -> Detections:
+        """Remember the pose of a scan, unless the robot has hardly moved."""
+        for x, y in self.path[-1:, 1:3].tolist():
+            if math.hypot(view.mean[0] - x, view.mean[1] - y) < longest / RINGS:
+                return self
+        row = [scan, *view.mean[:3], *view.covariance[:3, :3].ravel()]
+        return self._replace(path=np.vstack([self.path, row]))
+
+    def cost_of_new(
+        self, view: MapView, first_scans: Mapping[int, int], longest: float
+    ) -> float:
+        """Return the cost of new landmarks that no scan before their first has shown.
+
+        Parameters
+        ----------
+        view : MapView
+            The map, with the new landmarks.
+        first_scans : mapping of int to int
+            Number of the first scan that shows each.
+        longest : float
+            Longest range read so far [m].
+        """
+        cost = 0.0
+        for i, scan in first_scans.items():
+            if i in view.ids:
+                c, chance = 3 + 2 * view.ids.index(i), 1.0
+                then = MapView(np.zeros(5), np.zeros((5, 5)), (i,))
+                then.mean[3:] = view.mean[c : c + 2]
+                then.covariance[3:, 3:] = view.covariance[c : c + 2, c : c + 2]
+                path = self.path[self.path[:, 0] < scan]
+                gaps = np.hypot(*(path[:, 1:3] - then.mean[3:]).T)
+                spread = path[:, 4] + path[:, 8] + np.trace(then.covariance)
+                for row in path[gaps < longest + 2 * np.sqrt(np.maximum(spread, 0))]:
+                    then.mean[:3] = row[1:4]
+                    then.covariance[:3, :3] = row[4:].reshape(3, 3)
+                    chance = float(self.chance_to_miss(then, longest, chance)[0])
+                cost -= 2 * math.log(HIDDEN + (1 - HIDDEN) * chance)
+        return cost
+
+    def chance_to_miss(self, view: MapView, longest: float, prior: float = 1) -> Array:
+        """Return the probability that a scan shows none of its landmarks, shape (n,).
+
+        ``prior`` is the probability that the scans before it have shown none.
+        """
+        none, chance = np.zeros(0, dtype=np.int64), prior * np.ones(len(view.ids))
+        is_telling, counts = np.zeros(len(chance), dtype=np.bool_), self.detected.copy()
         _count(view[:2], (none, none), is_telling, longest, counts, chance)
         return chance
 

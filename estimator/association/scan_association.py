@@ -76,6 +76,8 @@ class ScanAssociation:
         self.ambiguous_rows: list[int] = []
         #: Landmarks that some row may belong to, so that they are not missing.
         self.explained: set[int] = set()
+        #: Cost of the landmarks that it confirms, once the filter has taken the scan.
+        self.price = 0.0
 
     def candidates_after(self, view: MapView) -> Candidates:
         """Return the candidates after the scan, given the belief after it."""
@@ -84,11 +86,15 @@ class ScanAssociation:
         new = [k for k, (i, label) in rows if i is None and not 0 <= label < known]
         density = self._density.after(self._readings, new, len(self.confirmed))
         heading = view.covariance[2, 2], len(view.mapped) > 0
-        evidence = self.detections.evidence.with_heading(*heading)
-        others = len(self.labels) - len(new)
+        lost = self.detections.lost.with_heading(*heading)
         strange = sum(label >= known for label in self.labels)
-        evidence = evidence.with_readings(strange, others, self._density)
-        detections = self.detections._replace(evidence=evidence)
+        lost = lost.with_readings(strange, len(self.labels) - len(new), self._density)
+        detections = self.detections._replace(lost=lost)
+        if self._policy.association == "hypotheses":
+            longest, labels = self._density.longest, self.confirmed.items()
+            first_scans = {i: label >> LABEL_BITS for i, label in labels}
+            self.price = detections.cost_of_new(view, first_scans, longest)
+            detections = detections.with_pose(self.scan, view, longest)
         changed = self._tentative, self._waiting, self._next_id, self.scan + 1
         return Candidates(*changed, density, detections)
 
@@ -190,22 +196,20 @@ class Candidates:
     #: Of readings that belong to no landmark of the map.
     density: UnexplainedDensity = field(default_factory=UnexplainedDensity)
     #: Which landmarks the scans have shown.
-    detections: Detections = field(default_factory=Detections.none)
+    detections: Detections = field(default_factory=Detections)
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all, as arrays."""
-        counts, missed, shown, evidence = self.detections
         waiting = [(i, scan) for i, scans in self.waiting.items() for scan in scans]
         found = {
             **vars(self),
             **self.tentative._asdict(),
+            **self.detections._asdict(),
             "waiting": waiting,
             "density": self.density[:5],
             "unexplained": self.density.cells,
-            "detected": counts,
-            "missed": list(missed.items()),
-            "shown": list(shown.items()),
-            "lost": evidence,
+            "missed": list(self.detections.missed.items()),
+            "shown": list(self.detections.shown.items()),
         }
         return saved_states.write(found, CANDIDATES)
 
@@ -218,9 +222,9 @@ class Candidates:
             waiting.setdefault(landmark_id, []).append(scan)
         missed = {int(i): left for i, left in saved["missed"].tolist()}
         shown = dict(saved["shown"].tolist())
-        evidence = LostEvidence(*saved["lost"].tolist())
-        evidence = evidence._replace(first_new=int(evidence.first_new))
-        most_lost = max(evidence.lasting, evidence.unknown, evidence.unexplained)
+        lost = LostEvidence(*saved["lost"].tolist())
+        lost = lost._replace(first_new=int(lost.first_new))
+        most_lost = max(lost.lasting, lost.unknown, lost.unexplained)
         density, C = saved["density"], saved["covariances"]
         likely = saved_states.is_semidefinite((C + C.transpose(0, 2, 1)) / 2)
         seen, expected, returned = saved["detected"]
@@ -232,15 +236,15 @@ class Candidates:
             ("unexplained", ">= 0", saved["unexplained"].min() >= 0),
             ("detected", ">= 0, each count at most the one it is part of", is_share),
             ("missed", "probabilities", [0 <= left <= 1 for left in missed.values()]),
-            ("lost", ">= 0", min(evidence) >= 0),
-            ("lost", "at most the largest so far", most_lost <= evidence.largest),
+            ("lost", ">= 0", min(lost) >= 0),
+            ("lost", "at most the largest so far", most_lost <= lost.largest),
         ):
             if not np.all(is_so):
                 raise ValueError(f"state['tentative.{name}'] must be {wanted}")
         tentative = TentativeLandmarks(*(saved[key] for key in TENTATIVE))
         counts = int(saved["next_id"]), int(saved["scan"])
         new = UnexplainedDensity(*density.tolist())._replace(cells=saved["unexplained"])
-        detections = Detections(saved["detected"], missed, shown, evidence)
+        detections = Detections(saved["detected"], missed, shown, lost, saved["path"])
         return cls(tentative, waiting, *counts, new, detections)
 
 
@@ -256,6 +260,7 @@ CANDIDATES: saved_states.Table = {
     "missed": (saved_states.NUMBERS, -1, 2),
     "shown": (saved_states.WHOLE, -1, 2),
     "lost": (saved_states.NUMBERS, 8),
+    "path": (saved_states.NUMBERS, -1, 13),
 }
 
 #: −2 ln of the likelihood of an association, up to a constant, and its completion.

@@ -30,7 +30,7 @@ from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
 from ..interface import MapView
 from ..models.bearing_range import locate_landmark, predict_measurement, wrap_angle
-from ..models.rigid_motion import rotation
+from ..models.rigid_motion import as_covariance, rotation
 from ..support import saved_states
 from .scan_assignments import Noise
 
@@ -125,11 +125,10 @@ class TentativeLandmarks(NamedTuple):
         nu[0] = wrap_angle(float(nu[0]))
         S = H @ C @ H.T + np.diag(noise.variances(reading[1:])[0])
         gain = np.linalg.solve(S, H @ C).T
-        corrected = C - gain @ H @ C
         unlikelihood = nu @ np.linalg.solve(S, nu) + np.log(np.linalg.det(S))
         after = TentativeLandmarks._make(part.copy() for part in self)
         after.places[which] += gain @ nu
-        after.covariances[which] = (corrected + corrected.T) / 2
+        after.covariances[which] = as_covariance(C - gain @ H @ C)
         after.seen[which] |= np.uint64(1)
         after.odds[which] -= unlikelihood / 2 + np.log(2 * np.pi * density)
         return after

@@ -299,7 +299,8 @@ class HypothesisSlam:
             taken = [k for k in range(len(slams)) if k not in errors]
             if not taken:
                 raise errors[0]
-            kept = [Hypothesis(costs[k], slams[k]) for k in taken]
+            kept = [Hypothesis(costs[k] + plans[k].price, slams[k]) for k in taken]
+            kept.sort(key=lambda hypothesis: hypothesis.cost)
             return self._take_over(distinct(kept, self._policy.hypotheses))
 
         try:

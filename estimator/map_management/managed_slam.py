@@ -150,7 +150,7 @@ class ManagedSlam:
     @property
     def lost_score(self) -> float:
         """Evidence that the run is lost, see `LostEvidence` [-]; 0 at the start."""
-        return self.candidates.detections.evidence.largest
+        return self.candidates.detections.lost.largest
 
     @property
     def probably_lost(self) -> bool:

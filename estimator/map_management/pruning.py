@@ -308,8 +308,7 @@ class LandmarkRecords(Restorable):
             The first four fields of :class:`Noise`.  A plain tuple reaches a kernel
             faster.
         """
-        slots = self._slots
-        rows = np.array([-1 if i is None else slots[i] for i in ids], dtype=np.int64)
+        rows = np.array([-1 if i is None else self._slots[i] for i in ids], np.int64)
         _add_sightings(self.renewed(), rows, readings, heading, noise)
 
     def renewed(self) -> tuple[IntArray, Array]:

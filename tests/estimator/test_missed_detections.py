@@ -65,13 +65,13 @@ def plain_count(view, slots, explained, detections):
     expected, joint = predicted_readings(
         view.mean, view.covariance, np.arange(len(view.ids))
     )
-    seen, tries, returned = detections.counts
+    seen, tries, returned = detections.detected
     ring = (seen.sum(axis=0) + 1) / (tries.sum(axis=0) + 2)
     sector = (seen.sum(axis=1) + 1) / (tries.sum(axis=1) + 2)
     shares = (seen + 2 * np.minimum(sector[:, None], ring)) / (tries + 2)
     shares = np.minimum(shares, SUREST)
     cost, missed, fewer = 0.0, {}, 0.0
-    after = Detections(detections.counts.copy(), missed, {}, LostEvidence())
+    after = Detections(detections.detected.copy(), missed, {}, LostEvidence())
     hidden = HIDDEN_EACH * max(returned.sum() ** 0.5 - LIMIT, 0.0) ** 2
     hidden /= seen.sum() + NO_RETURNS
     for j, (bearing, distance) in enumerate(expected):
@@ -83,9 +83,9 @@ def plain_count(view, slots, explained, detections):
         before = detections.missed.get(j, 1.0)
         if is_sure:
             is_back = j in slots and before < HIDDEN
-            after.counts[:, a % SECTORS, b] += j in slots, 1, is_back
+            after.detected[:, a % SECTORS, b] += j in slots, 1, is_back
         is_telling = (
-            detections.shown.get(j, 0) >= PROVEN and j < detections.evidence.first_new
+            detections.shown.get(j, 0) >= PROVEN and j < detections.lost.first_new
         )
         if is_sure and is_telling and j in slots:
             fewer += np.log(FEWER)
@@ -104,8 +104,8 @@ def plain_count(view, slots, explained, detections):
             (HIDDEN + (1 - HIDDEN) * left) / (HIDDEN + (1 - HIDDEN) * before)
         )
         missed[j] = left
-    evidence = evidence_after(detections.evidence, fewer, len(view.ids))
-    return cost, after._replace(evidence=evidence)
+    evidence = evidence_after(detections.lost, fewer, len(view.ids))
+    return cost, after._replace(lost=evidence)
 
 
 def evidence_after(known, more, landmarks):
@@ -140,11 +140,11 @@ def test_missed_landmarks_cost_what_the_dense_equations_say():
         cost, after = before.after(view, slots, explained, LONGEST)
         expected_cost, expected = plain_count(view, slots, explained, before)
         assert cost == pytest.approx(expected_cost, rel=1e-9)
-        assert after.evidence == pytest.approx(expected.evidence, rel=1e-9)
-        evidence.append(after.evidence.present - before.evidence.present)
+        assert after.lost == pytest.approx(expected.lost, rel=1e-9)
+        evidence.append(after.lost.present - before.lost.present)
         more = {j: min(shown.get(j, 0) + (j in slots), PROVEN) for j in range(8)}
         assert {j: after.shown.get(j, 0) for j in range(8)} == more
-        np.testing.assert_array_equal(after.counts, expected.counts)
+        np.testing.assert_array_equal(after.detected, expected.detected)
         for j in set(range(8)) - set(slots.tolist()):
             left = expected.missed.get(j, before.missed.get(j, 1.0))
             assert after.missed.get(j, 1.0) == pytest.approx(left, rel=1e-9)
@@ -156,10 +156,44 @@ def test_missed_landmarks_cost_what_the_dense_equations_say():
     assert len(set(evidence)) > 50
 
 
+def test_a_new_landmark_costs_what_the_scans_before_its_first_should_have_shown():
+    rng, costs = np.random.default_rng(5), []
+    for _ in range(40):
+        counts = np.sort(rng.integers(0, 30, (3, SECTORS, RINGS)), axis=0)
+        counts = counts[[1, 2, 0]].astype(float)  # returned ≤ seen ≤ expected
+        detections, views = Detections()._replace(detected=counts), []
+        for scan in range(6):
+            views.append(random_view(rng, landmarks=0))
+            views[-1].mean[0] = 2.0 * scan
+            detections = detections.with_pose(scan, views[-1], LONGEST)
+        view, first = random_view(rng), int(rng.integers(7))
+        expected, missed = 0.0, {}
+        for earlier in views[:first]:
+            both = np.zeros((5, 5))
+            both[:3, :3], both[3:, 3:] = earlier.covariance, view.covariance[5:7, 5:7]
+            then = MapView(np.append(earlier.mean, view.mean[5:7]), both, (0,))
+            known = detections._replace(missed=missed)
+            cost, after = plain_count(then, NONE, NONE, known)
+            expected, missed = expected + cost, {**missed, **after.missed}
+        cost = detections.cost_of_new(view, {1: first, 99: first}, LONGEST)
+        assert cost == pytest.approx(expected, rel=1e-9, abs=1e-9)
+        costs.append(cost)
+    assert sum(cost > 1 for cost in costs) > 10
+    assert max(costs) > 5
+
+
+def test_a_robot_that_hardly_moves_remembers_one_pose():
+    view, detections = MapView(np.zeros(3), np.eye(3), ()), Detections()
+    for scan, x in enumerate((0.0, 0.7, 0.8, 1.5, 1.5)):  # a ring has 0.75 m
+        moved = view._replace(mean=np.array([x, 0.0, 0.1]))
+        detections = detections.with_pose(scan, moved, LONGEST)
+    assert detections.path[:, :4].tolist() == [[0, 0, 0, 0.1], [2, 0.8, 0, 0.1]]
+
+
 def cost_of_misses(place, std, scans):
     """Return what each of some scans costs that do not show a landmark."""
     mean, covariance = np.append(np.zeros(3), place), np.diag([0, 0, 0, std, std]) ** 2
-    view, detections, costs = MapView(mean, covariance, (0,)), Detections.none(), []
+    view, detections, costs = MapView(mean, covariance, (0,)), Detections(), []
     for _ in range(scans):
         cost, detections = detections.after(view, np.array([-1]), NONE, LONGEST)
         costs.append(cost)
@@ -280,23 +314,23 @@ def test_the_alarm_is_that_of_the_reported_hypothesis():
 
 def test_a_landmark_of_clutter_raises_no_alarm():
     view = MapView(np.array([0, 0, 0, 3.0, 0.5, -2, 1]), 1e-6 * np.eye(7), (0, 1))
-    detections = Detections.none()
+    detections = Detections()
     for slot in [[0]] * 80:  # landmark 1 is never shown
         _, detections = detections.after(view, np.array(slot), NONE, LONGEST)
-    assert detections.evidence.largest == 0
+    assert detections.lost.largest == 0
 
 
 def after_scans(places, scans):
     """Return the evidence after scans (slots shown, slots explained, times)."""
     mean = np.append(np.zeros(3), places)
-    detections = Detections.none()
+    detections = Detections()
     for ids, slots, explained, times in scans:
         size = 3 + 2 * len(ids)
         view = MapView(mean[:size], 1e-6 * np.eye(size), tuple(ids))
         rows = np.array(slots, np.int64), np.array(explained, np.int64)
         for _ in range(times):
             _, detections = detections.after(view, *rows, LONGEST)
-    return detections.evidence
+    return detections.lost
 
 
 def test_a_landmark_beside_a_reading_is_not_missed():
@@ -329,8 +363,8 @@ def test_landmarks_that_a_lost_run_maps_anew_do_not_clear_it():
 def test_a_mapped_landmark_outside_the_view_is_not_newer_than_the_view():
     mean = np.array([0, 0, 0, 3.31, 0.66])
     view = MapView(mean, 1e-6 * np.eye(5), (0,), whole=(0, 5))
-    _, after = Detections.none().after(view, np.array([0]), NONE, LONGEST)
-    assert after.evidence.first_new == 6
+    _, after = Detections().after(view, np.array([0]), NONE, LONGEST)
+    assert after.lost.first_new == 6
 
 
 @pytest.mark.parametrize(("hides", "is_alarmed"), [(False, True), (True, False)])
@@ -356,7 +390,7 @@ def test_four_returns_do_not_show_that_something_hides_landmarks():
         counts[2, 0, :2] = returned / 2
         telling = {0: 0.1}, {0: PROVEN}, LostEvidence(first_new=1)
         _, after = Detections(counts, *telling).after(view, np.array([-1]), NONE, 6.0)
-        present.append(after.evidence.present)
+        present.append(after.lost.present)
     assert present[0] == present[1] > present[2] > 0
 
 
@@ -370,20 +404,20 @@ def test_a_landmark_at_the_edge_of_the_view_is_no_evidence():
         mean = np.array([0, 0, 0, ring * LONGEST / RINGS, 0.5])
         view = MapView(mean, 1e-6 * np.eye(5), (0,))
         _, after = before.after(view, np.array([-1]), NONE, LONGEST)
-        evidence.append(after.evidence.present)
+        evidence.append(after.lost.present)
     assert evidence[0] > 2
     assert evidence[1] < 0.1
 
 
 def test_the_alarm_stays_once_the_map_is_seen_again():
     view = MapView(np.array([0, 0, 0, 3.0, 0.5]), 1e-6 * np.eye(5), (0,))
-    detections, scores = Detections.none(), []
+    detections, scores = Detections(), []
     for slot in [0] * 40 + [-1] * 16 + [0] * 40:
         _, detections = detections.after(view, np.array([slot]), NONE, LONGEST)
-        scores.append(detections.evidence.lasting)
+        scores.append(detections.lost.lasting)
     assert scores[39] == scores[-1] == 0
     assert scores[55] > LOST_SCORE
-    assert detections.evidence.largest == max(scores)
+    assert detections.lost.largest == max(scores)
 
 
 def with_headings(stds, has_map=True):
@@ -564,7 +598,7 @@ def test_a_single_wrong_range_does_not_stretch_the_cells(scan, wrong):
     assert other.landmark_ids == clean.landmark_ids
     np.testing.assert_array_equal(other.belief().mean, clean.belief().mean)
     shares = [
-        detections.counts[0].sum(axis=0) / detections.counts[1].sum(axis=0)
+        detections.detected[0].sum(axis=0) / detections.detected[1].sum(axis=0)
         for detections in (s.candidates.detections for s in (clean, other))
     ]
     np.testing.assert_allclose(*shares, atol=0.05)
@@ -578,4 +612,4 @@ def test_a_saved_state_whose_evidence_exceeds_its_largest_is_refused(place):
     with pytest.raises(ValueError, match="at most the largest so far"):
         Candidates.from_state_dict(state)
     state["lost"][2] = 4.0
-    assert Candidates.from_state_dict(state).detections.evidence[place] == 4.0
+    assert Candidates.from_state_dict(state).detections.lost[place] == 4.0
