@@ -198,18 +198,16 @@ def odometry_between(
     grid = np.round(np.arange(0, end, ODOMETRY_STEP), TIME_DIGITS)
     times = np.unique([*grid, *others, end])
     path = [np.interp(times, stamps, column) for column in travelled.T]
-    rows = np.stack(
-        [times, *np.diff(path, axis=1, prepend=0), np.diff(times, prepend=0)]
-    )
-    return [slamlog.OdometryRow(*row) for row in rows.T.tolist()]
+    dt, *steps = np.diff([times, *path], axis=1, prepend=0)
+    rows = np.column_stack([times, *steps, dt])
+    return [slamlog.OdometryRow(*row) for row in rows.tolist()]
 
 
 def _resample(truth: Array, end: float) -> Array:
     """Interpolate the true path on a grid within the time of the odometry."""
     times = np.round(np.arange(0, end + TRUTH_STEP / 2, TRUTH_STEP), TIME_DIGITS)
     poses = poses_at(times, truth)
-    is_known = np.isfinite(poses).all(axis=1)
-    return np.column_stack([times, poses])[is_known]
+    return np.column_stack([times, poses])[np.isfinite(poses).all(axis=1)]
 
 
 def _timed_table(path: Path, form: str) -> Array:
@@ -233,9 +231,7 @@ def _lines(path: Path, form: str) -> list[log_lines.LogLine]:
     """Read the lines without comments; each has as many fields as the form."""
     if not path.is_file():
         raise slamlog.LogError(f"{path.parent}: expected {path.name}, got no such file")
-    lines = [
-        line for line in log_lines.read_lines(path) if not line.text.startswith("#")
-    ]
+    lines = [x for x in log_lines.read_lines(path) if not x.text.startswith("#")]
     for line in lines:
         line.check_count(line.text.split(), (len(form.split()),), form)
     if not lines:
