@@ -43,11 +43,12 @@ q = Π (1 − P_D) since its last sighting, shows that something had hidden it a
 the map was right.  If k of n sightings so far were such ones, a miss counts with the
 probability that nothing hides the landmark::
 
-    q / (q + 5 k' / (n + 100)),    k' = max(0, √k − 2)²
+    q / (q + 5 k' / (n + 100)),    k' = max(0, √k − 3)²
 
-k' is a lower limit of what k tends to, since a few landmarks seem to be seen again in
-lost runs, too.  The 5 allows for sightings that begin no absence, since nothing is
-near, and for hidden landmarks that are never seen again.
+k' is a lower limit of what k tends to, since up to nine such sightings occur in lost
+runs, too, where readings are given to wrong landmarks.  The 5 allows for sightings that
+begin no absence, since nothing is near, and for hidden landmarks that are never seen
+again.
 
 Something near may hide all landmarks for a few scans.  So the alarm follows g slowly,
 until g falls::
@@ -118,8 +119,8 @@ FEWER = 0.5
 #: Landmarks hidden for each one seen again, and sightings that count as none of these.
 HIDDEN_EACH, NO_RETURNS = 5, 100
 
-#: The root of a count is at most this far from the root of its mean, for most counts.
-LIMIT = 2.0
+#: Subtracted from the root of the returns: up to nine of them prove nothing.
+LIMIT = 3.0
 
 #: A change of the evidence counts in full after about so many scans.
 SCANS = 5

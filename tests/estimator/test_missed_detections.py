@@ -382,12 +382,12 @@ def test_misses_count_little_where_hidden_landmarks_return(hides, is_alarmed):
     assert (score > LOST_SCORE) == is_alarmed
 
 
-def test_four_returns_do_not_show_that_something_hides_landmarks():
+def test_nine_returns_do_not_show_that_something_hides_landmarks():
     view = MapView(np.array([0, 0, 0, 3.31, 0.66]), 1e-6 * np.eye(5), (0,))
     present = []
-    for returned in (0, 4, 30):
+    for returned in (0, 9, 60):
         counts = detected(30, 30, 0)
-        counts[2, 0, :2] = returned / 2
+        counts[2, 0, :3] = returned / 3
         telling = {0: 0.1}, {0: PROVEN}, LostEvidence(first_new=1)
         _, after = Detections(counts, *telling).after(view, np.array([-1]), NONE, 6.0)
         present.append(after.lost.present)
