@@ -598,6 +598,16 @@ class ScanRecord(NamedTuple):
         return factor
 
 
+def nis_of(parts: Parts) -> float:
+    """Return the NIS of the last scan."""
+    return float(parts.values[NIS])
+
+
+def numbers_of(parts: Parts) -> int:
+    """Return how many numbers the readings in use hold."""
+    return int(parts.numbers[IN_USE]) * int(parts.values[gain.NUMBERS_READ])
+
+
 class ScanReport(UpdateReport):
     """The results of a scan, read from the filter's memory until it changes."""
 
@@ -608,9 +618,12 @@ class ScanReport(UpdateReport):
 
     def detach(self) -> None:
         """Copy the results, since the memory is about to change or to be replaced."""
-        if not self.is_detached:
-            _ = self.nis, self.degrees_of_freedom, self._record
-            del self.__dict__["_parts"]
+        found = self.__dict__
+        if "_parts" in found:
+            parts = found["_parts"]
+            found["nis"], found["degrees_of_freedom"] = nis_of(parts), numbers_of(parts)
+            found["_record"] = found.get("_record") or ScanRecord.copied(parts)
+            del found["_parts"]
 
     @property
     def is_detached(self) -> bool:
@@ -630,7 +643,7 @@ class ScanReport(UpdateReport):
     @cached_property
     def nis(self) -> float:
         """νᵀ S⁻¹ ν, χ² distributed when the filter is consistent."""
-        return float(self._parts.values[NIS])
+        return nis_of(self._parts)
 
     @property
     def factor(self) -> Callable[[], Array]:
@@ -644,8 +657,7 @@ class ScanReport(UpdateReport):
     @cached_property
     def degrees_of_freedom(self) -> int:
         """Of the NIS: how many numbers the associated readings have."""
-        parts = self._parts
-        return int(parts.numbers[IN_USE]) * int(parts.values[gain.NUMBERS_READ])
+        return numbers_of(self._parts)
 
     @property
     def associated_ids(self) -> tuple[int, ...]:
@@ -678,11 +690,14 @@ class ScanReport(UpdateReport):
         return self._record.rows[:, gain.INNOVATION].reshape(-1, 2)
 
     def _with_outcome(self, value: int) -> tuple[int, ...]:
-        return tuple([i for i, found in self._outcomes if found == value])
+        return tuple(self._by_outcome.get(value, ()))
 
     @cached_property
-    def _outcomes(self) -> list[tuple[int, int]]:
-        return self._entries(gain.OUTCOME)
+    def _by_outcome(self) -> dict[int, list[int]]:
+        groups: dict[int, list[int]] = {}
+        for i, outcome in self._entries(gain.OUTCOME):
+            groups.setdefault(outcome, []).append(i)
+        return groups
 
     def _entries(self, row: int) -> list[tuple[int, int]]:
         """Return the landmark of each reading, and its entry in a row of the ledger."""
