@@ -240,7 +240,8 @@ class GaussianMap:
 
     def take_in(self, update: UpdateKernel, readings: Array, ids: IntArray) -> int:
         """Update the map with a scan, as `update_map`; return the status."""
-        self._detach_report()
+        if (last := self._last()) is not None:  # without another call
+            last.detach()
         status = update(self.block, readings, ids)
         if status == NO_ROOM:
             self.make_room(len(ids))
@@ -249,7 +250,8 @@ class GaussianMap:
 
     def report(self) -> ScanReport:
         """Return the report of the scan that has just been taken in."""
-        report = ScanReport(self.parts)
+        report = ScanReport.__new__(ScanReport)  # in half the time of an __init__
+        report.__dict__["_parts"] = self.parts  # a frozen dataclass refuses setattr
         self._last = ref(report)
         return report
 
@@ -612,9 +614,6 @@ class ScanReport(UpdateReport):
     """The results of a scan, read from the filter's memory until it changes."""
 
     _parts: Parts
-
-    def __init__(self, parts: Parts) -> None:
-        self.__dict__["_parts"] = parts  # a frozen dataclass refuses setattr
 
     def detach(self) -> None:
         """Copy the results, since the memory is about to change or to be replaced."""

@@ -260,7 +260,8 @@ def find_motion(motion: str | Motion) -> Motion:
         ) from None
 
 
-class MotionNoise(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class MotionNoise:
     """A drive with the variances of its noise, and whether there is noise at rest."""
 
     #: (σx², σy², σα²) per step of dt = 1, shape (3,) [m², m², rad²].

@@ -29,7 +29,6 @@ SMALL = 2**24
 _CONTAINER = Path("/sys/fs/cgroup")
 CACHE_LINE = 64  # [bytes]
 
-_PAIR = (2,)
 _FLOAT64, _INT64 = np.dtype(np.float64), np.dtype(np.int64)
 
 
@@ -93,7 +92,8 @@ def scan(
         type(measurements) is np.ndarray
         and measurements.dtype is _FLOAT64
         and measurements.flags.carray
-        and measurements.shape[1:] == _PAIR
+        and measurements.ndim == 2
+        and measurements.shape[1] == 2
     ):
         return measurements
     readings = as_floats("measurements", measurements)
