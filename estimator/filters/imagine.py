@@ -123,7 +123,7 @@ def imagine(
     min_range = float(sensor.min_range)
     settings = tuple(view), min_range, dropout, filters.motion_values, rules
     plans_each, steps = driven.shape[1:3]
-    ending = _checked_horizons([steps] if horizons is None else horizons, steps)
+    ending = _checked_horizons(horizons, steps)
     results = Imagined(
         np.full((count, plans_each, steps, 3), np.nan),
         np.full((count, plans_each, steps, 3, 3), np.nan),
@@ -183,8 +183,10 @@ def _checked_plans(plans: ArrayLike, count: int) -> Array:
     return np.ascontiguousarray(np.broadcast_to(given, (count, *given.shape[-3:])))
 
 
-def _checked_horizons(horizons: ArrayLike, steps: int) -> IntArray:
-    """Return increasing numbers of steps (H,)."""
+def _checked_horizons(horizons: ArrayLike | None, steps: int) -> IntArray:
+    """Return increasing numbers of steps (H,), by default that of all steps."""
+    if horizons is None:
+        return np.array([steps])
     given = np.asarray(horizons)
     if given.ndim != 1 or not given.size or given.dtype.kind not in "iu":
         raise ValueError(f"horizons must be whole numbers of steps, got {horizons!r}")
