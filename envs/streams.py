@@ -44,8 +44,10 @@ def episode_keys(generators: Sequence[np.random.Generator]) -> WordArray:
     >>> bool((keys == episode_keys([rng])).all())
     True
     """
-    keys = [rng.bit_generator.random_raw(2) for rng in generators]
-    return np.array(keys, dtype=np.uint64).reshape(-1, 2)
+    keys = np.empty((len(generators), 2), dtype=np.uint64)
+    for world, rng in enumerate(generators):
+        keys[world] = rng.bit_generator.random_raw(2)
+    return keys
 
 
 def drawn_scenarios(scenario: Scenario, keys: WordArray) -> list[Scenario]:
@@ -83,12 +85,9 @@ class EpisodeStarts:
 
     def poses(self, keys: WordArray) -> tuple[Array, Array]:
         """Return true and estimated start poses, each of shape (K, 3) [m, m, rad]."""
-        drawn = np.empty((len(keys), 3))
         steps = np.zeros(len(keys), dtype=np.int64)
-        draw_normals(keys, steps, START, drawn)
-        drawn = drawn * self._std + self._pose
-        centre = np.empty(drawn.shape)
-        centre[:] = self._pose
+        drawn, centre = np.empty((2, len(keys), 3))
+        _draw_poses(keys, steps, self._pose, self._std, drawn, centre)
         return (drawn, centre) if self._draws_truth else (centre, drawn)
 
     def landmarks(self, keys: WordArray) -> ComplexArray:
@@ -112,6 +111,23 @@ class EpisodeStarts:
         else:
             out[:] = place_landmarks(layout, np.random.default_rng(0))  # draws nothing
         return out.view(np.complex128)[..., 0]
+
+
+@jit_in_place
+def _draw_poses(
+    keys: WordArray,
+    steps: IntArray,
+    pose: Array,
+    std: Array,
+    drawn: Array,
+    centre: Array,
+) -> None:
+    """Draw poses, (K, 3), around a pose (3,) with deviations (3,), and repeat it."""
+    draw_normals(keys, steps, START, drawn)
+    for row in range(len(drawn)):
+        for i in range(3):
+            drawn[row, i] = drawn[row, i] * std[i] + pose[i]
+            centre[row, i] = pose[i]
 
 
 @jit_in_place
