@@ -600,16 +600,6 @@ class ScanRecord(NamedTuple):
         return factor
 
 
-def nis_of(parts: Parts) -> float:
-    """Return the NIS of the last scan."""
-    return float(parts.values[NIS])
-
-
-def numbers_of(parts: Parts) -> int:
-    """Return how many numbers the readings in use hold."""
-    return int(parts.numbers[IN_USE]) * int(parts.values[gain.NUMBERS_READ])
-
-
 class ScanReport(UpdateReport):
     """The results of a scan, read from the filter's memory until it changes."""
 
@@ -617,11 +607,11 @@ class ScanReport(UpdateReport):
 
     def detach(self) -> None:
         """Copy the results, since the memory is about to change or to be replaced."""
-        found = self.__dict__
-        if "_parts" in found:
-            parts = found["_parts"]
-            found["nis"], found["degrees_of_freedom"] = nis_of(parts), numbers_of(parts)
-            found["_record"] = found.get("_record") or ScanRecord.copied(parts)
+        if not self.is_detached:
+            found, own = self.__dict__, vars(ScanReport)
+            for name in ("nis", "degrees_of_freedom", "_record"):
+                if name not in found:  # without the lock of a cached property
+                    found[name] = own[name].func(self)
             del found["_parts"]
 
     @property
@@ -642,7 +632,7 @@ class ScanReport(UpdateReport):
     @cached_property
     def nis(self) -> float:
         """νᵀ S⁻¹ ν, χ² distributed when the filter is consistent."""
-        return nis_of(self._parts)
+        return float(self._parts.values[NIS])
 
     @property
     def factor(self) -> Callable[[], Array]:
@@ -656,7 +646,8 @@ class ScanReport(UpdateReport):
     @cached_property
     def degrees_of_freedom(self) -> int:
         """Of the NIS: how many numbers the associated readings have."""
-        return numbers_of(self._parts)
+        parts = self._parts
+        return int(parts.numbers[IN_USE]) * int(parts.values[gain.NUMBERS_READ])
 
     @property
     def associated_ids(self) -> tuple[int, ...]:
