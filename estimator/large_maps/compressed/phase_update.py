@@ -174,8 +174,7 @@ def blocks_in_a_step(width: int, *, hurried: bool) -> int:
     >>> [blocks_in_a_step(width, hurried=False) for width in (272, 1088, 6120)]
     [1, 2, 11]
     """
-    blocks = width // BLOCK
-    return max(1, blocks if hurried else blocks // SPREAD)
+    return max(1, width // BLOCK // (1 if hurried else SPREAD))
 
 
 class Exchanged(NamedTuple):
