@@ -194,7 +194,8 @@ class LostEvidence(NamedTuple):
         is_unknown = has_map and variance - self.surest > UNKNOWN
         unknown = self.unknown + MOST_OF_SCAN / 2 if is_unknown else 0.0
         largest, surest = max(self.largest, unknown), min(self.surest, variance)
-        return self._replace(largest=largest, surest=surest, unknown=unknown)
+        sums = self.present, self.lasting, largest  # `_replace` takes twice the time
+        return LostEvidence(*sums, self.first_new, surest, unknown, *self[6:])
 
     def with_readings(
         self, strange: int, explained: int, before: UnexplainedDensity
@@ -206,7 +207,8 @@ class LostEvidence(NamedTuple):
         unexplained = max(0.0, self.unexplained + min(ratio, MOST_OF_SCAN / 2) / 2)
         total = MEMORY * self.explained + explained
         largest = max(self.largest, unexplained)
-        return self._replace(largest=largest, unexplained=unexplained, explained=total)
+        sums = self.present, self.lasting, largest
+        return LostEvidence(*sums, *self[3:6], unexplained, total)
 
 
 class Detections(NamedTuple):

@@ -8,9 +8,8 @@ accepted the scan.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -81,13 +80,13 @@ class ScanAssociation:
 
     def candidates_after(self, view: MapView) -> Candidates:
         """Return the candidates after the scan, given the belief after it."""
-        rows = enumerate(zip(self.row_ids, self.labels, strict=True))
         known = self.scan << LABEL_BITS  # lower labels are those of earlier scans
-        new = [k for k, (i, label) in rows if i is None and not 0 <= label < known]
+        new = [row for row, i in enumerate(self.row_ids) if i is None]
+        new = [row for row in new if not 0 <= self.labels[row] < known]
         density = self._density.after(self._readings, new, len(self.confirmed))
         heading = view.covariance[2, 2], len(view.mapped) > 0
         lost = self.detections.lost.with_heading(*heading)
-        strange = sum(label >= known for label in self.labels)
+        strange = sum([label >= known for label in self.labels])
         lost = lost.with_readings(strange, len(self.labels) - len(new), self._density)
         detections = self.detections._replace(lost=lost)
         if self._policy.association == "hypotheses":
@@ -181,28 +180,27 @@ class ScanAssociation:
         self._next_id = max(self._next_id, landmark_id + 1)
 
 
-@dataclass(frozen=True)
-class Candidates:
+class Candidates(NamedTuple):
     """Landmarks that are not in the map yet, and the next identity to assign."""
 
     #: Landmarks without an identity.
-    tentative: TentativeLandmarks = field(default_factory=TentativeLandmarks)
+    tentative: TentativeLandmarks = TentativeLandmarks()
     #: Given identities that are not trusted yet, and the scans that showed them.
-    waiting: Mapping[int, Sequence[int]] = field(default_factory=dict)
+    waiting: Mapping[int, Sequence[int]] = {}  # never changed in place
     #: Above all identities so far.
     next_id: int = 0
     #: Number of scans so far.
     scan: int = 0
     #: Of readings that belong to no landmark of the map.
-    density: UnexplainedDensity = field(default_factory=UnexplainedDensity)
+    density: UnexplainedDensity = UnexplainedDensity()
     #: Which landmarks the scans have shown.
-    detections: Detections = field(default_factory=Detections)
+    detections: Detections = Detections()
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all, as arrays."""
         waiting = [(i, scan) for i, scans in self.waiting.items() for scan in scans]
         found = {
-            **vars(self),
+            **self._asdict(),
             **self.tentative._asdict(),
             **self.detections._asdict(),
             "waiting": waiting,
@@ -281,8 +279,8 @@ def associate(
     is of interest.  Readings closer than the sensor's least range have no usable
     bearing: they are ambiguous.
     """
-    usable, noise = readings[:, 1] >= sensor.min_range, sensor.noise
-    used = readings if usable.all() else readings[usable]
+    usable = [distance >= sensor.min_range for distance in readings[:, 1].tolist()]
+    used, noise = readings if all(usable) else readings[usable], sensor.noise
     density = _unexplained_density(policy, candidates, used, noise)
     found = assign_scan(policy, view, used, noise, density, ceiling=ceiling)
 
@@ -290,9 +288,10 @@ def associate(
         association = ScanAssociation(policy, candidates, readings)
         association.detections = detections
         association.explained = {view.ids[slot] for slot in found.explained.tolist()}
-        whole = np.full(len(readings), AMBIGUOUS)
-        whole[usable] = slots
-        association.assign(whole, view, noise)
+        if used is not readings:
+            of_used, slots = slots, np.full(len(readings), AMBIGUOUS)
+            slots[usable] = of_used
+        association.assign(slots, view, noise)
         return association
 
     options = []

@@ -8,7 +8,6 @@ is confirmed.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -183,7 +182,7 @@ class ManagedSlam:
         if len(candidates.tentative.seen):
             variance = noise.over(displacement, dt)
             moved = candidates.tentative.moved(displacement, variance)
-            candidates = replace(candidates, tentative=moved)
+            candidates = candidates._replace(tentative=moved)
 
         def follow(_: object) -> None:
             self._editor.expire()
