@@ -182,7 +182,7 @@ class Exchanged(NamedTuple):
 
     own: IntArray  # ascending columns of the old local landmarks, shape (a - 3,)
     order: IntArray  # their rows in the old belief of the filter
-    needed: IntArray  # rows of this of which Φ S is needed
+    needed: IntArray  # its rows whose Φ S is needed
     left: int  # how many of these, the first, belong to new landmarks that leave
     new: IntArray  # ascending columns of the landmarks to store
     places: IntArray  # their rows among those needed
