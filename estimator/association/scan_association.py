@@ -75,6 +75,7 @@ class ScanAssociation:
         self.ambiguous_rows: list[int] = []
         #: Landmarks that some row may belong to, so that they are not missing.
         self.explained: set[int] = set()
+        self._is_assigned = False
         #: Cost of the landmarks that it confirms, once the filter has taken the scan.
         self.price = 0.0
 
@@ -88,8 +89,9 @@ class ScanAssociation:
         lost = self.detections.lost.with_heading(*heading)
         strange = sum([label >= known for label in self.labels])
         lost = lost.with_readings(strange, len(self.labels) - len(new), self._density)
-        detections = self.detections._replace(lost=lost)
-        if self._policy.association == "hypotheses":
+        detected, missed, shown, _, path = self.detections
+        detections = Detections(detected, missed, shown, lost, path)
+        if self._is_assigned and self._policy.association == "hypotheses":
             longest, labels = self._density.longest, self.confirmed.items()
             first_scans = {i: label >> LABEL_BITS for i, label in labels}
             self.price = detections.cost_of_new(view, first_scans, longest)
@@ -102,6 +104,7 @@ class ScanAssociation:
 
         Rows that no landmark explains may belong to a tentative one.
         """
+        self._is_assigned = True
         marks = slots.tolist()
         self.row_ids = [view.ids[slot] if slot >= 0 else None for slot in marks]
         self.ambiguous_rows = [k for k, slot in enumerate(marks) if slot == AMBIGUOUS]
