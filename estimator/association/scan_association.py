@@ -89,13 +89,12 @@ class ScanAssociation:
         lost = self.detections.lost.with_heading(*heading)
         strange = sum([label >= known for label in self.labels])
         lost = lost.with_readings(strange, len(self.labels) - len(new), self._density)
-        detected, missed, shown, _, path = self.detections
-        detections = Detections(detected, missed, shown, lost, path)
+        detections = Detections(*self.detections[:3], lost, self.detections.path)
         if self._is_assigned and self._policy.association == "hypotheses":
-            longest, labels = self._density.longest, self.confirmed.items()
-            first_scans = {i: label >> LABEL_BITS for i, label in labels}
-            self.price = detections.cost_of_new(view, first_scans, longest)
-            detections = detections.with_pose(self.scan, view, longest)
+            # A landmark that one scan confirms has no label, and costs nothing.
+            firsts = {i: label >> LABEL_BITS for i, label in self.confirmed.items()}
+            self.price = detections.cost_of_new(view, firsts, self._density.longest)
+            detections = detections.with_pose(self.scan, view, self._density.longest)
         changed = self._tentative, self._waiting, self._next_id, self.scan + 1
         return Candidates(*changed, density, detections)
 

@@ -182,12 +182,49 @@ def test_a_new_landmark_costs_what_the_scans_before_its_first_should_have_shown(
     assert max(costs) > 5
 
 
+@pytest.mark.parametrize(("confirm", "dear"), [((1, 1), []), ((3, 8), [8])])
+def test_only_scans_before_the_first_sighting_make_a_landmark_dear(confirm, dear):
+    slam = make_estimator(
+        "invariant",
+        motion_std=(0.01, 0.0, 0.01),
+        measurement_std=(0.02, 0.05),
+        management={"association": "hypotheses", "confirm": confirm},
+    ).best
+    prices = []
+    for scan in range(12):  # each remembers a pose
+        readings = scan_at(np.array([scan - 6.0, 0.0, 0.0]))[: 5 if scan >= 6 else 4]
+        _, complete = slam.alternatives(readings)[0]
+        plan = complete()
+        slam.take(readings, lambda plan=plan: plan)
+        slam.predict((1.0, 0.0))
+        prices.append(plan.price)
+    assert np.flatnonzero(np.array(prices) > 1).tolist() == dear
+    assert np.count_nonzero(prices) == len(dear)
+    assert len(slam.landmark_ids) == 5
+
+
 def test_a_robot_that_hardly_moves_remembers_one_pose():
     view, detections = MapView(np.zeros(3), np.eye(3), ()), Detections()
     for scan, x in enumerate((0.0, 0.7, 0.8, 1.5, 1.5)):  # a ring has 0.75 m
         moved = view._replace(mean=np.array([x, 0.0, 0.1]))
         detections = detections.with_pose(scan, moved, LONGEST)
     assert detections.path[:, :4].tolist() == [[0, 0, 0, 0.1], [2, 0.8, 0, 0.1]]
+
+
+def test_a_saved_state_holds_the_poses_of_earlier_scans():
+    slam, kept = circling("hypotheses", steps=20), of_a_circle("hypotheses")
+    kept.load_state_dict(slam.state_dict())
+    paths = [one.best.candidates.detections.path for one in (slam, kept)]
+    assert len(paths[0]) > 1
+    np.testing.assert_array_equal(*paths)
+
+
+def test_a_scan_with_identities_remembers_no_pose():
+    slam = of_a_circle("hypotheses")
+    for x in range(6):
+        slam.update(scan_at(np.array([x, 0.0, 0.0])), range(5))
+        slam.predict((1.0, 0.0))
+    assert len(slam.best.candidates.detections.path) == 0
 
 
 def cost_of_misses(place, std, scans):
