@@ -431,6 +431,18 @@ def test_nine_returns_do_not_show_that_something_hides_landmarks():
     assert present[0] == present[1] > present[2] > 0
 
 
+@pytest.mark.parametrize(("returned", "weight"), [(0, 1), (60, 0)])
+def test_a_landmark_missed_so_often_that_its_odds_are_0_is_weighed(returned, weight):
+    view = MapView(np.array([0, 0, 0, 3.31, 0.66]), 1e-6 * np.eye(5), (0,))
+    counts = detected(30, 60, 0)
+    counts[2, 0, :3] = returned / 3
+    before = Detections(counts, {0: 0.0}, {0: PROVEN}, LostEvidence(first_new=1))
+    _, after = before.after(view, np.array([-1]), NONE, LONGEST)
+    ratio = (1 - FEWER / 2) / (1 - 1 / 2)  # P_D is a half
+    assert after.missed == {0: 0.0}
+    assert after.lost.present == pytest.approx(weight * np.log(ratio), abs=1e-9)
+
+
 def test_a_landmark_at_the_edge_of_the_view_is_no_evidence():
     expected = np.full((SECTORS, RINGS), 30.0)
     seen = np.where(np.arange(RINGS) < 4, expected, 0.0)
