@@ -116,7 +116,7 @@ WIDEST = np.pi / 4
 #: ρ: detection rate of a lost run, relative to that of its map.
 FEWER = 0.5
 
-#: Landmarks hidden for each one seen again, and sightings that count as none of these.
+#: Landmarks hidden for each return; sightings without one that are assumed at first.
 HIDDEN_EACH, NO_RETURNS = 5, 100
 
 #: Subtracted from the root of the returns: up to nine of them prove nothing.
