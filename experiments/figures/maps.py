@@ -382,8 +382,9 @@ def pose_stride(trace: RunTrace) -> int:
     if len(trace.t) <= _MOST_POSES:
         return 1
     low, high = map_limits(trace)
-    areas = 9 * np.pi * np.sqrt(np.linalg.det(trace.pose_covariances[:, :2, :2]))
-    fitting = _COVERED * np.prod(high - low) / max(np.nanmean(areas), 1e-12)
+    (xx, xy), (_, yy) = trace.pose_covariances[:, :2, :2].transpose(1, 2, 0)
+    areas = 9 * np.pi * np.sqrt(np.fmax(xx * yy - xy**2, 0.0))  # 0 where unknown
+    fitting = _COVERED * np.prod(high - low) / max(areas.mean(), 1e-12)
     return -(-len(trace.t) // int(np.clip(fitting, _FEWEST_POSES, _MOST_POSES)))
 
 

@@ -22,7 +22,13 @@ from slamgym.experiments.figures import (
     truth_figure,
 )
 from slamgym.experiments.figures.accuracy import correlations, nis_band
-from slamgym.experiments.figures.maps import FIRST, LATER, PREDICTED, UPDATED
+from slamgym.experiments.figures.maps import (
+    FIRST,
+    LATER,
+    PREDICTED,
+    UPDATED,
+    pose_stride,
+)
 from slamgym.experiments.figures.style import draw_file, lay_out, new_figure
 
 
@@ -227,6 +233,13 @@ def test_a_long_run_draws_fewer_poses_where_their_ellipses_are_large():
         len(ellipses_of(map_figure(t), UPDATED).get_widths()) for t in (large, trace)
     )
     assert 12 <= few < many / 2
+
+
+def test_a_long_run_may_have_ellipses_without_an_area():
+    trace = make_trace(steps=299)
+    flat = np.ones((3, 3)) - 1e-9 * np.eye(3)  # its determinant is below 0
+    covariances = np.broadcast_to(flat, trace.pose_covariances.shape)
+    assert pose_stride(replace(trace, pose_covariances=covariances)) == 5
 
 
 def test_view_is_the_same_at_every_step_and_holds_the_whole_run():
