@@ -306,26 +306,6 @@ def test_an_interrupt_applies_no_downdate_twice(monkeypatch):
         assert_same_bits(other.belief(), slam.belief())
 
 
-def test_a_downdate_without_memory_is_still_to_be_applied(monkeypatch):
-    stored, columns = DeferredCovariance(), np.arange(4)
-    stored.make_room(1)
-    root = np.random.default_rng(0).standard_normal((stored.width, 50))
-    stored.defer(Downdate(root, np.ones(50), []))
-    before = stored.marginal(columns)
-
-    def refuse(*_):
-        raise MemoryError
-
-    with monkeypatch.context() as patched:
-        patched.setattr(DeferredCovariance, "_apply", refuse)
-        with pytest.raises(MemoryError):
-            stored.work(50)
-    np.testing.assert_array_equal(stored.marginal(columns), before)
-    stored.work(50)
-    assert not stored.pending_rank
-    np.testing.assert_allclose(stored.marginal(columns), before)
-
-
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
 def test_a_change_of_the_local_map_is_spread_over_steps(base, monkeypatch):
     """After a long phase, no step exchanges more than a quarter of the blocks.

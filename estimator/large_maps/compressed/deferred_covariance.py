@@ -19,7 +19,7 @@ from ..multifrontal import symmetric
 
 # Rows of one block: 68 landmarks.
 #
-# Rows whose lengths are multiples of a high power of two would compete for the same few
+# Rows whose lengths are multiples of a power of two would compete for the same few
 # places of the processor's caches.
 BLOCK = 136
 # Smallest rank to apply; smaller downdates wait: memory limits thin products.
@@ -167,16 +167,15 @@ class DeferredCovariance:
         self._credit += rank * (self.width * (self.width + BLOCK) / 2)
         while self._begin():
             root, signs, _ = self._pending[0]
-            last, count = self._done, len(root) // BLOCK
-            for block in self._blocks[last:count]:
+            first, count = self._done, len(root) // BLOCK
+            for block in self._blocks[first:count]:
                 cost = len(signs) * block.size
                 if cost > 2 * self._credit:
                     break
                 self._credit -= cost
-                last += 1
-            self._apply(range(self._done, last))
-            self._done = last
-            if last < count:
+                self._done += 1
+            self._apply(range(first, self._done))
+            if self._done < count:
                 return
             self._pending.pop(0)
             self._under_way, self._done = False, 0
