@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ...jit import njit_allocating, specialised
+from ...jit import njit_allocating, njit_internal, specialised
 from ..kernels import kalman_gain as gain
 from ..kernels.kalman_gain import BeliefArrays, Rules, Workspace
 from ..kernels.scan_update import (
@@ -76,7 +76,7 @@ def predict_through_points(
             covariance[i, j] = covariance[j, i] = cross[i, j] / (2 * points)
 
 
-@njit_allocating
+@njit_internal
 def update_through_points(
     arrays: tuple[Array, Array, Array],
     size: int,

@@ -55,14 +55,14 @@ def jit_in_place(function: Kernel) -> Kernel:
 def njit_internal(function: Kernel) -> Kernel:
     """Compile a function that only kernels call, in about half the time.
 
-    As :func:`jit_in_place`, it allocates no arrays, returns none and calls no kernel
-    that returns any.  Python can call its ``py_func``.
+    It neither allocates arrays nor returns any, as :func:`jit_in_place`.  Python can
+    call its ``py_func``.
     """
     return _compile(function, callable_from_python=False, counted=False)
 
 
 def njit_allocating(function: Kernel) -> Kernel:
-    """Compile an internal function that allocates, returns or is given back arrays."""
+    """Compile an internal function that allocates arrays or returns some."""
     return _compile(function, callable_from_python=False)
 
 
@@ -357,14 +357,12 @@ class KernelCache:
         Raises
         ------
         TypeError
-            If the kernel does not count references, but returns an array, whose memory
-            a caller would free, or gets one from a kernel that counts them, which
-            nobody would free.
+            If the kernel returns an array without counting references: a caller that
+            counts them would free its memory.
         """
-        uncounted = not self._kernel.targetoptions["_nrt"]
-        if uncounted and any("array" in str(each) for each in _handed_on(result)):
-            self._kernel._reset_overloads()  # another call is refused, too
-            raise TypeError(f"{self._kernel} hands on arrays: use njit_allocating")
+        returned = str(result.signature.return_type)
+        if "array" in returned and not self._kernel.targetoptions["_nrt"]:
+            raise TypeError(f"{self._kernel} returns {returned}: use njit_allocating")
         if self._fingerprint is None:
             return
         if result.library.has_dynamic_globals or result.lifted:
@@ -378,17 +376,6 @@ class KernelCache:
         function = self._kernel.py_func
         readable = f"{function.__module__}.{function.__name__}".rpartition("slamgym.")
         return f"{readable[2]}-{hashlib.sha256(key).hexdigest()[:32]}.nbc"
-
-
-def _handed_on(result: Any) -> Iterator[Any]:
-    """Return the types of what a kernel returns, and of what others return to it."""
-    yield result.signature.return_type
-    types_of = result.type_annotation
-    for call, signature in types_of.calltypes.items():
-        if getattr(call, "op", None) != "call":
-            continue
-        if isinstance(types_of.typemap[call.func.name], types.Dispatcher):
-            yield signature.return_type
 
 
 def _read(file: Path) -> bytes | None:
