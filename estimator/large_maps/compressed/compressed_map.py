@@ -105,7 +105,8 @@ class CompressedMap:
             subtract(block, self._combine(root, strip).T, signs)
             covariance[np.ix_(outside, outside)] = symmetric(block)
             del block  # frees memory before the belief takes its copy
-        return Belief(mean, covariance, tuple(ids), self.filter.frame)
+        frame = self.filter.frame
+        return Belief(mean, covariance, tuple(ids), frame)
 
     def ids_near(self, pose: Belief, within: float) -> list[int]:
         """Return the local landmarks and all that may lie within a distance [m].

@@ -184,7 +184,8 @@ class DeferredCovariance:
     def marginal(self, columns: IntArray) -> Array:
         """Return the covariance (c, c) of some columns; exactly symmetric."""
         covariance = np.empty((len(columns), len(columns)))
-        for k in set((columns // BLOCK).tolist()):
+        holding = set((columns // BLOCK).tolist())
+        for k in holding:
             read_marginal(self._blocks[k], k * BLOCK, columns, covariance)
         applied = columns < self._done * BLOCK
         for index, (root, signs, _) in enumerate(self._pending):

@@ -174,7 +174,8 @@ def blocks_in_a_step(width: int, *, hurried: bool) -> int:
     >>> [blocks_in_a_step(width, hurried=False) for width in (272, 1088, 6120)]
     [1, 2, 11]
     """
-    return max(1, width // BLOCK // (1 if hurried else SPREAD))
+    blocks = width // BLOCK
+    return max(1, blocks if hurried else blocks // SPREAD)
 
 
 class Exchanged(NamedTuple):
