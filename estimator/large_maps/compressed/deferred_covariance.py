@@ -278,9 +278,7 @@ class DeferredCovariance:
 
         root, signs, applied = self._pending[0]
         first = max(blocks.start, len(applied))
-        weighted = root[first * BLOCK : blocks.stop * BLOCK]
-        if (signs < 0).any():
-            weighted = weighted * signs
+        weighted = root[first * BLOCK : blocks.stop * BLOCK] * signs
         calls = []
         for k, block in enumerate(self._blocks[first : blocks.stop]):
             own = weighted[k * BLOCK : (k + 1) * BLOCK]
