@@ -49,8 +49,9 @@ class CompressedMap:
         self.local: dict[int, None] = {}  # the local landmarks, in their order
         self._stored = 0  # how many of these, the first, have rows in `deferred`
         self._virtual = 0
-        # The last change of the local map, as long as it takes.
-        self._handover: phase_update.Handover | None = None
+        self._handover: phase_update.Handover | None = (
+            None  # the last change of the local map
+        )
         self._strip = np.zeros((0, 0))  # covariance of local and all other coordinates
         self._origin = self.filter.map.mean[:2].copy()  # start of the phase
 
@@ -317,7 +318,7 @@ class CompressedMap:
         return phase_update.combine(coefficients, strip, self.is_invariant)
 
     def _phase(self) -> phase_update.Phase:
-        return phase_update.Phase(*self.filter.map.used, 3 + 2 * self._virtual)
+        return phase_update.end_phase(self.filter, self._virtual)
 
     def _columns(self, ids: Sequence[int]) -> IntArray:
         """Return the columns of landmarks in the map's arrays."""

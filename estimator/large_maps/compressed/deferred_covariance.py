@@ -26,6 +26,7 @@ BLOCK = 136
 WORTHWHILE = 40
 # Larger pending ranks must not wait for the exchange of rows.
 LARGEST_BACKLOG = 400
+_EVERY_ROW = np.arange(BLOCK)
 
 
 class Downdate(NamedTuple):
@@ -136,8 +137,13 @@ class DeferredCovariance:
         """
         bounds = _bounds(columns, blocks)
         for k, start, end in zip(blocks, bounds, bounds[1:], strict=False):
-            own = columns[:end]
-            write_rows(self._blocks[k], k * BLOCK, own, start, rows, places)
+            block, first, others = self._blocks[k], k * BLOCK, _EVERY_ROW
+            if end > start:
+                own = rows[places[start:end], : first + BLOCK]
+                block[columns[start:end] - first] = own
+            if end - start > BLOCK // 4:  # most are written already
+                others = np.delete(_EVERY_ROW, columns[start:end] - first)
+            write_columns(block, first, others, columns[:end], rows, places)
 
     def forget(self, columns: IntArray) -> None:
         """Drop the pending downdates of rows that are about to be put."""
@@ -386,18 +392,19 @@ def read_marginal(
 
 
 @jit
-def write_rows(
+def write_columns(
     block: Array,
     first: int,
+    own: IntArray,
     columns: IntArray,
-    start: int,
     rows: Array,
     places: IntArray,
 ) -> None:
-    """Store what a block holds of the rows at ``places``, as :func:`read_rows`."""
-    for j in range(start, len(columns)):
-        block[columns[j] - first] = rows[places[j], : first + len(block)]
-    for i in range(len(block)):
+    """Copy the rows at ``places``, from column ``first`` on, into some columns.
+
+    Only the rows ``own`` of the block change.
+    """
+    for i in own:
         for j in range(len(columns)):
             block[i, columns[j]] = rows[places[j], first + i]
 

@@ -48,8 +48,8 @@ class Phase(NamedTuple):
     """
 
     mean: Array  # (size,)
+    reference: Array  # linearisation points, for filters that fix them
     covariance: Array  # (size, size)
-    reference: Array  # (size,) linearisation points, for filters that fix them
     first: int  # row of the first local landmark, 3 + e
 
     def gain(self, rows: IntArray) -> Array:
@@ -100,6 +100,12 @@ def begin_phase(
         array[:3], array[3 + virtual : size] = head, tail
     fill_extended(parts.covariance, gaussian.covariance[:3, :3], rows, virtual, step)
     gaussian.hold(None, ids, block=block)
+
+
+def end_phase(slam: EkfSlam, virtual: int) -> Phase:
+    """Return the belief of a filter that ran on an extended state."""
+    mean, covariance, reference = slam.map.used
+    return Phase(mean, reference, covariance, 3 + 2 * virtual)
 
 
 def combine(coefficients: Array, strip: Array, invariant: bool) -> Array:
