@@ -316,7 +316,7 @@ def _move(
             row[j] += turned * turn[j]
 
 
-@njit_allocating
+@njit_internal
 def _fix(P: Array, size: int, axis: int, lever: float, variance: float) -> None:
     """Take in a reading of x, y or θ: of ξ along the axis, and `lever` times ξ_θ."""
     if variance == np.inf:
