@@ -23,8 +23,6 @@ from slamgym.jit import (
     code_fingerprint,
     fma,
     jit,
-    jit_in_place,
-    njit_allocating,
     njit_apart,
     njit_internal,
 )
@@ -432,51 +430,3 @@ def test_fingerprints_are_quick():
     for kernel in kernels:
         code_fingerprint(kernel)
     assert time.process_time() - began < 1  # 0.1 s
-
-
-@njit_internal
-def last_of(rows):
-    part = rows[1:]
-    return part[-1, 0]
-
-
-@njit_allocating
-def lower_part(rows):
-    return rows[1:]
-
-
-@njit_internal
-def uncounted_parts(rows):
-    return rows[:1], rows[1:]
-
-
-@jit
-def through_views(rows):
-    return last_of(rows) + lower_part(rows)[0, 0] + last_of(lower_part(rows))
-
-
-@jit
-def through_uncounted_views(rows):
-    return uncounted_parts(rows)[1][0, 0]
-
-
-@jit_in_place
-def allocates(rows):
-    return np.zeros(len(rows)).sum()
-
-
-def test_references_to_arrays_are_neither_lost_nor_kept():
-    rows = np.arange(6.0).reshape(3, 2)
-    before = sys.getrefcount(rows)
-    assert [through_views(rows) for _ in range(5)] == [10.0] * 5
-    assert sys.getrefcount(rows) == before
-
-
-def test_kernel_without_counted_references_returns_no_array():
-    with pytest.raises(Exception, match="use njit_allocating"):
-        through_uncounted_views(np.zeros((3, 2)))
-
-
-def test_kernel_in_place_allocates_nothing():
-    with pytest.raises(Exception, match="zeros"):
-        allocates(np.zeros((3, 2)))
