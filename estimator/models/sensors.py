@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST_RANGE_GROWTH, Array
-from ...jit import njit_allocating, njit_inlined, specialised
+from ...jit import njit_inlined, njit_internal, specialised
 from ...suggestions import closest, imported
 from ..support import argument_checks
 from . import bearing_range
@@ -465,9 +465,9 @@ def kernel_parts(sensor: Sensor) -> Mapping[Kernel, Kernel]:
 
     See :mod:`.bearing_range` for what each of them returns.
     """
-    h, std, (first, second) = njit_allocating(sensor.h), sensor.std, sensor.wraps
-    std, is_single, places = njit_allocating(std), sensor.size == 1, sensor.places
-    inverse = njit_allocating(sensor.inverse or _nowhere)
+    h, std, (first, second) = njit_internal(sensor.h), sensor.std, sensor.wraps
+    std, is_single, places = njit_internal(std), sensor.size == 1, sensor.places
+    inverse = njit_internal(sensor.inverse or _nowhere)
 
     def expected(dx: float, dy: float, heading: float) -> Numbers:
         cos, sin = np.cos(heading), np.sin(heading)

@@ -43,26 +43,11 @@ def jit(function: Kernel) -> Kernel:
     return _compile(function, callable_from_python=True)
 
 
-def jit_in_place(function: Kernel) -> Kernel:
-    """Compile a kernel that changes only the arrays of its arguments.
-
-    It may not allocate arrays.  Without counting references to them, a call takes less
-    time, and so does every view of an array.
-    """
-    return _compile(function, callable_from_python=True, counted=False)
-
-
 def njit_internal(function: Kernel) -> Kernel:
     """Compile a function that only kernels call, in about half the time.
 
-    It neither allocates arrays nor returns any, as :func:`jit_in_place`.  Python can
-    call its ``py_func``.
+    Python can call its ``py_func``.
     """
-    return _compile(function, callable_from_python=False, counted=False)
-
-
-def njit_allocating(function: Kernel) -> Kernel:
-    """Compile an internal function that allocates arrays or returns some."""
     return _compile(function, callable_from_python=False)
 
 
@@ -81,7 +66,7 @@ def njit_apart(function: Kernel) -> Kernel:
     Its loops then run on whole vector registers at once.  Otherwise they first compare
     the addresses of all arrays, which takes longer than the loop over a small map.
     """
-    return _compile(function, callable_from_python=False, apart=True, counted=False)
+    return _compile(function, callable_from_python=False, apart=True)
 
 
 def njit_inlined(function: Kernel) -> Kernel:
@@ -102,7 +87,6 @@ def _compile(
     callable_from_python: bool,
     reordered: bool = False,
     apart: bool = False,
-    counted: bool = True,
 ) -> Kernel:
     options: dict[str, Any] = {
         "error_model": "numpy",
@@ -111,7 +95,6 @@ def _compile(
         "no_cpython_wrapper": not callable_from_python,
         "fastmath": {"reassoc", "nsz", "contract"} if reordered else False,
         "noalias": apart,
-        "_nrt": counted,
     }
     return cast("Kernel", _kept(njit(**options)(function)))
 
@@ -352,17 +335,7 @@ class KernelCache:
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """Keep the compiled code for the types of a call.
-
-        Raises
-        ------
-        TypeError
-            If the kernel returns an array without counting references: a caller that
-            counts them would free its memory.
-        """
-        returned = str(result.signature.return_type)
-        if "array" in returned and not self._kernel.targetoptions["_nrt"]:
-            raise TypeError(f"{self._kernel} returns {returned}: use njit_allocating")
+        """Keep the compiled code for the types of a call."""
         if self._fingerprint is None:
             return
         if result.library.has_dynamic_globals or result.lifted:
