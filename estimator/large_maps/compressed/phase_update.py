@@ -177,7 +177,7 @@ def blocks_in_a_step(width: int, *, hurried: bool) -> int:
 
     Examples
     --------
-    >>> [blocks_in_a_step(width, hurried=False) for width in (272, 1088, 6120)]
+    >>> [blocks_in_a_step(width, hurried=False) for width in (256, 1024, 6016)]
     [1, 2, 11]
     """
     blocks = width // BLOCK
