@@ -47,7 +47,6 @@ class CompressedMap:
         self._references = np.zeros(0)
         self.deferred = DeferredCovariance()
         self.local: dict[int, None] = {}  # the local landmarks, in their order
-        self._stored = 0  # how many of these, the first, have rows in `deferred`
         self._virtual = 0
         self._handover: phase_update.Handover | None = (
             None  # the last change of the local map
@@ -89,7 +88,7 @@ class CompressedMap:
         covariance = np.zeros((len(mean), len(mean)))
         is_local = np.array([i in order for i in ids], dtype=bool)
         inside = np.r_[0:3, 3 + pairs(np.flatnonzero(is_local))]
-        local = np.r_[0:3, now.first + pairs([order[i] for i in ids if i in order])]
+        local = np.r_[0:3, 3 + pairs([order[i] for i in ids if i in order])]
         mean[inside] = now.mean[local]
         covariance[np.ix_(inside, inside)] = now.covariance[np.ix_(local, local)]
         if not is_local.all():
@@ -98,7 +97,7 @@ class CompressedMap:
             columns = self._columns([i for i in ids if i not in order])
             strip = np.ascontiguousarray(self._strip[:, columns])
             mean[outside] = self._points[columns] + self._combine(now.shift, strip)[0]
-            cross = self._combine(now.gain(local), strip)
+            cross = self._combine(now.gain[local], strip)
             covariance[np.ix_(inside, outside)] = cross
             covariance[np.ix_(outside, inside)] = cross.T
             root, signs = phase_update.roots(now.loss, self.is_invariant)
@@ -149,26 +148,23 @@ class CompressedMap:
         self._points, self._references = self._points.copy(), self._references.copy()
         if not whole:
             self._points += self._combine(now.shift, self._strip)[0]
-        self._points[own] = now.mean[now.first :]
-        self._references[own] = now.reference[now.first :]
+        self._points[own] = now.mean[3:]
+        self._references[own] = now.reference[3:]
         ahead = now.mean[:2] + (now.mean[:2] - self._origin) / 2  # likely direction
         points = self._points.reshape(-1, 2)
         chosen = choose_local(ahead, required, self.slots, points, size)
         self._origin = now.mean[:2].copy()
-        rows, self.local = phase_update.exchanged_rows(
-            self.slots, self.local, chosen, self._stored, now.first
+        rows, self.local = phase_update.exchanged_rows(self.slots, self.local, chosen)
+        self._handover, covariance = phase_update.begin_handover(
+            self.deferred,
+            self._strip,
+            now,
+            rows,
+            invariant=self.is_invariant,
+            hurried=hurried,
         )
-        blocks = phase_update.blocks_in_a_step(self.deferred.width, hurried=hurried)
-        self._handover = phase_update.Handover(
-            now, self._strip, rows, self.is_invariant, blocks
-        )
-        self.deferred.forget(rows.new)
-        columns = self._columns(list(self.local))
-        if hurried:
-            self._handover.advance(self.deferred, blocks)
-            self._begin(columns, self._handover.next_strip[:, columns])
-        else:
-            self._begin(columns, self._handover.beginning(self.deferred))
+        self._strip = self._handover.next_strip
+        self._begin(covariance)
 
     def work(self, rank: int, age: int, *, hurried: bool) -> None:
         """Do a part of the deferred work.
@@ -176,8 +172,8 @@ class CompressedMap:
         Parameters
         ----------
         rank : int
-            That of a full update: the work is a share of its downdate.  If hurried, it
-            is the whole, or as much as is deferred in this step.
+            That of a full update: the work is at most its downdate, and only a share
+            of it unless hurried.
         age : int
             Steps since the local map changed, including this one.
         hurried : bool
@@ -186,10 +182,8 @@ class CompressedMap:
         width = self.deferred.width
         share = phase_update.blocks_in_a_step(width, hurried=hurried)
         if hurried or (age - 3) * share * BLOCK >= width:
-            before = self.deferred.pending_rank
             self.finish_handover()
-            added = self.deferred.pending_rank - before
-            self.deferred.work(max(rank, added) if hurried else rank * SHARE)
+            self.deferred.work(rank if hurried else rank * SHARE)
         elif self._handover is not None and age > 1:
             self._handover.advance(self.deferred, (age - 2) * share)
 
@@ -198,7 +192,6 @@ class CompressedMap:
         if self._handover is not None:
             self._handover.advance(self.deferred, self.deferred.width // BLOCK)
             self.deferred.defer(self._handover.lost)
-            self._strip = self._handover.next_strip
             self._handover = None
 
     @property
@@ -218,8 +211,8 @@ class CompressedMap:
     def state_dict(self, numbers: Sequence[int]) -> dict[str, Any]:
         """Return copies of the whole state as arrays, with numbers of the caller."""
         self.finish_handover()
-        new = [self.slots[i] for i in list(self.local)[self._stored :]]
-        invalid = pairs([*new, *self.free])  # arrays hold rests of these
+        near = [self.slots[i] for i in self.local]
+        invalid = pairs([*near, *self.free])  # arrays hold rests of these
         local = with_prefix("local", self.filter.state_dict(), "_")
         found = {
             "landmark_ids": list(self.slots),
@@ -228,7 +221,7 @@ class CompressedMap:
             "references": self._references,
             "strip": self._strip,
             "origin": self._origin,
-            "counts": [self._virtual, self._stored, *numbers, *self.free],
+            "numbers": [self._virtual, *numbers, *self.free],
         }
         state = {"base": local.pop("local_estimator")}
         state |= saved_states.write(found, STATE)
@@ -255,13 +248,13 @@ class CompressedMap:
         self.deferred.load_state_dict(without_prefix(state, "far", "_"))
         width = self.deferred.width
         saved = saved_states.read(state, STATE, w=width)
-        ids, slots, counts = (
-            list(map(int, saved[key])) for key in ("landmark_ids", "slots", "counts")
+        ids, slots, numbers = (
+            list(map(int, saved[key])) for key in ("landmark_ids", "slots", "numbers")
         )
-        _check_slots(slots, counts, len(ids), len(local_ids))
+        _check_slots(slots, numbers, len(ids), len(local_ids))
         local = saved_states.read(without_prefix(state, "local", "_"), LOCAL)
-        self._virtual, self._stored, *numbers = counts[:COUNTERS]
-        self.free = counts[COUNTERS:]
+        self._virtual, *counters = numbers[:COUNTERS]
+        self.free = numbers[COUNTERS:]
         self.slots = dict(zip(ids, slots, strict=True))
         self.local = dict.fromkeys(local_ids[self._virtual :])
         self._points, self._references = saved["points"], saved["references"]
@@ -278,20 +271,18 @@ class CompressedMap:
         if not self.local.keys() <= self.slots.keys():
             raise ValueError("state['local_landmark_ids'] must be among landmark_ids")
         self.filter.restore(local)
-        return numbers
+        return counters
 
     def _drop(self, ids: Sequence[int]) -> None:
         gone = set(ids)
         self.free = self.free + [self.slots[i] for i in ids]
         self.slots = {i: slot for i, slot in self.slots.items() if i not in gone}
-        stored = list(self.local)[: self._stored]
-        self._stored = len(stored) - len(gone.intersection(stored))
         self.local = {i: None for i in self.local if i not in gone}
 
-    def _begin(self, columns: IntArray, rows: Array) -> None:
+    def _begin(self, rows: Array) -> None:
         """Load the local map with these covariance rows (a, a - 3) into the filter."""
+        columns = self._columns(list(self.local))
         whole = len(self.local) == len(self.slots)
-        self._stored = 0 if whole else len(self.local)
         self._virtual = (
             0 if whole else phase_update.virtual_landmarks(len(rows), self.is_invariant)
         )
@@ -420,18 +411,17 @@ STATE: saved_states.Table = {
     "references": (saved_states.NUMBERS, "w"),
     "strip": (saved_states.NUMBERS, -1, "w"),
     "origin": (saved_states.NUMBERS, 2),
-    "counts": (saved_states.COUNTS, -1),
+    "numbers": (saved_states.COUNTS, -1),
 }
 LOCAL: saved_states.Table = {
     **MAP_STATE,
     "covariance": (saved_states.SYMMETRIC, "3+2n", "3+2n"),
 }
-# Numbers before the free slots: virtual landmarks, stored ones, extra ones, age, rest.
-COUNTERS = 5
+COUNTERS = 4  # numbers before the free slots: virtual landmarks, extra ones, age, rest
 
 
 def _check_slots(
-    slots: list[int], counts: list[int], landmarks: int, local: int
+    slots: list[int], numbers: list[int], landmarks: int, local: int
 ) -> None:
     """Refuse places of landmarks that do not fit their number."""
     if landmarks != len(slots):
@@ -439,14 +429,14 @@ def _check_slots(
             f"state['slots'] must have one entry for each of {landmarks} landmarks, "
             f"got {len(slots)}"
         )
-    if len(counts) < COUNTERS or counts[0] + counts[1] > local:
+    if len(numbers) < COUNTERS or numbers[0] > local:
         raise ValueError(
-            f"state['counts'] must be at least {COUNTERS}, the first two of them "
-            f"together at most {local}, got {counts}"
+            f"state['numbers'] must be at least {COUNTERS}, the first of them at most "
+            f"{local}, got {numbers}"
         )
-    free = counts[COUNTERS:]
+    free = numbers[COUNTERS:]
     if sorted(slots + free) != list(range(len(slots + free))):
         raise ValueError(
-            "state['slots'] and the free ones in state['counts'] must be 0, 1, … "
+            "state['slots'] and the free ones in state['numbers'] must be 0, 1, … "
             f"without repetition, got {slots} and {free}"
         )

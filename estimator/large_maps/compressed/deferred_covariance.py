@@ -5,7 +5,6 @@ applied later; the compiled functions below copy rows and columns.
 """
 
 from collections.abc import Mapping
-from itertools import starmap
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,11 +16,8 @@ from ...support.argument_checks import refuse_beyond_memory
 from ...support.undo import Undo, contents
 from ..multifrontal import symmetric
 
-# Rows of one block: 68 landmarks.
-#
-# Rows whose lengths are multiples of a power of two would compete for the same few
-# places of the processor's caches.
-BLOCK = 136
+# Rows of one block: 64 landmarks.
+BLOCK = 128
 # Smallest rank to apply; smaller downdates wait: memory limits thin products.
 WORTHWHILE = 40
 # Larger pending ranks must not wait for the exchange of rows.
@@ -34,20 +30,20 @@ class Downdate(NamedTuple):
 
     root: Array  # W, shape (width, rank)
     signs: Array  # s, shape (rank,), each 1 or -1
-    applied: list[int]  # one number for each block that has changed already
 
 
 class DeferredCovariance:
     """Lower half of a growing covariance, in blocks of rows, with pending downdates.
 
-    Block k holds rows 136 k to 136 (k + 1) of P, as far as the diagonal.  This takes
+    Block k holds rows 128 k to 128 (k + 1) of P, as far as the diagonal.  This takes
     half the memory of a square and grows without a copy.  Every block is contiguous, so
     that BLAS changes it in place::
 
         P = stored − W diag(s) Wᵀ
 
     W is small.  Reading subtracts its product, and :meth:`work` applies it to one block
-    after the other.  The rows of a new landmark are invalid until they are put.  Rows
+    after the other.  A local map may read the rows of its landmarks and update its
+    copy; the stored rows of these landmarks are invalid until it puts them back.  Rows
     are read and put block by block, between which :meth:`work` must not be called.
     """
 
@@ -56,7 +52,7 @@ class DeferredCovariance:
         self._pending: list[Downdate] = []
         self._under_way = False  # whether the first downdate is being applied
         self._done = 0  # number of blocks to which it has been applied
-        self._credit = 0.0  # multiplications granted, less those made
+        self._credit = 0.0  # multiplications granted and not yet used
 
     @property
     def width(self) -> int:
@@ -108,17 +104,20 @@ class DeferredCovariance:
         """
         bounds = _bounds(columns, blocks)
         for k, start, end in zip(blocks, bounds, bounds[1:], strict=False):
-            read_rows(self._blocks[k], k * BLOCK, columns[:end], start, rows)
-        applied = self._done  # blocks; only the first downdate has been begun
-        for root, signs, _ in [*self._pending, coming]:
+            block, first = self._blocks[k], k * BLOCK
+            if end > start:
+                rows[start:end, : first + BLOCK] = block[columns[start:end] - first]
+            read_columns(block, first, columns[:start], rows)
+        for index, (root, signs) in enumerate([*self._pending, coming]):
+            applied = self._done if index == 0 else 0  # only the first has been begun
             left = range(max(blocks.start, applied), blocks.stop)
-            applied, first, last = 0, left.start * BLOCK, left.stop * BLOCK
-            if last <= first:
-                continue
-            start, end = columns.searchsorted((first, last)).tolist()
-            weights, before = rows_of(root, columns[:end]) * signs, root[:last]
-            rows[start:end, : len(before)] -= weights[start:] @ before.T
-            if start:
+            first, last = left.start * BLOCK, left.stop * BLOCK
+            if last > first:
+                start, end = _bounds(columns, range(left.start, left.stop))[
+                    :: len(left)
+                ]
+                weights, before = rows_of(root, columns[:end]) * signs, root[:last]
+                rows[start:end, : len(before)] -= weights[start:] @ before.T
                 rows[:start, first : len(before)] -= weights[:start] @ before[first:].T
 
     def put(
@@ -147,14 +146,13 @@ class DeferredCovariance:
 
     def forget(self, columns: IntArray) -> None:
         """Drop the pending downdates of rows that are about to be put."""
-        for root, _, _ in self._pending:
+        for root, _ in self._pending:
             root[columns[columns < len(root)]] = 0.0
 
     def checkpoint(self) -> Undo:
-        """Return what takes back later calls, but for changes of the blocks.
+        """Return what takes back later calls.
 
-        Rows that have been put are invalid again.  A downdate that is applied remains
-        so, and :meth:`work` does not repeat it.
+        The stored rows of local landmarks are invalid, and remain so.
         """
         return contents(self)
 
@@ -167,25 +165,21 @@ class DeferredCovariance:
     def work(self, rank: float) -> None:
         """Apply pending downdates, for the cost of one full downdate of this rank.
 
-        Blocks are changed as a whole; what this costs too little or too much is kept
-        for the next call.
+        Blocks are changed as a whole; unused cost is kept for the next call.
         """
         self._credit += rank * (self.width * (self.width + BLOCK) / 2)
         while self._begin():
-            root, signs, _ = self._pending[0]
-            first, count = self._done, len(root) // BLOCK
-            for block in self._blocks[first:count]:
-                cost = len(signs) * block.size
-                if cost > 2 * self._credit:
-                    break
-                self._credit -= cost
-                self._done += 1
-            self._apply(range(first, self._done))
-            if self._done < count:
+            root, signs = self._pending[0]
+            cost = len(signs) * self._blocks[self._done].size
+            if cost > self._credit:
                 return
-            self._pending.pop(0)
-            self._under_way, self._done = False, 0
-        self._credit = min(self._credit, 0.0)
+            self._apply(self._done)
+            self._credit -= cost
+            self._done += 1
+            if self._done * BLOCK >= len(root):
+                self._pending.pop(0)
+                self._under_way, self._done = False, 0
+        self._credit = 0.0
 
     def marginal(self, columns: IntArray) -> Array:
         """Return the covariance (c, c) of some columns; exactly symmetric."""
@@ -194,7 +188,7 @@ class DeferredCovariance:
         for k in holding:
             read_marginal(self._blocks[k], k * BLOCK, columns, covariance)
         applied = columns < self._done * BLOCK
-        for index, (root, signs, _) in enumerate(self._pending):
+        for index, (root, signs) in enumerate(self._pending):
             rows = rows_of(root, columns)
             change = (rows * signs) @ rows.T
             if index == 0 and self._done:
@@ -247,17 +241,17 @@ class DeferredCovariance:
         saved = saved_states.read(state, PENDING, "far_", w=BLOCK * count)
         pending = _downdates(saved)
         under_way, done, credit = progress = saved["progress"].tolist()
-        if done not in range(count + 1) or under_way not in (0, min(1, len(pending))):
+        if not (
+            under_way in (0, 1) and done in range(count + 1) and credit >= 0
+        ) or under_way > len(pending):
             raise ValueError(
                 f"state['far_progress'] must be 0 or 1, at most {count} blocks and a "
-                f"credit, got {progress}"
+                f"credit >= 0, got {progress}"
             )
         ends = BLOCK**2 * np.cumsum(np.arange(1, count + 1))
         parts = np.split(flat, ends)[:count]
         self._blocks = [part.reshape(BLOCK, -1).copy() for part in parts]
         self._pending = pending
-        if pending:
-            pending[0].applied.extend(range(int(done)))
         self._under_way, self._done, self._credit = bool(under_way), int(done), credit
 
     def _enumerate(self) -> list[tuple[int, Array]]:
@@ -268,32 +262,31 @@ class DeferredCovariance:
         """Return whether a downdate is under way; join the pending ones to start it."""
         if not self._under_way and self.pending_rank >= WORTHWHILE:
             width = max(len(downdate.root) for downdate in self._pending)
-            root, last = np.empty((width, self.pending_rank)), 0
+            root = np.zeros((width, self.pending_rank))
+            last = 0
             for downdate in self._pending:
                 first, last = last, last + len(downdate.signs)
                 root[: len(downdate.root), first:last] = downdate.root
-                root[len(downdate.root) :, first:last] = 0.0
             signs = np.concatenate([downdate.signs for downdate in self._pending])
-            self._pending = [Downdate(root, signs, self._pending[0].applied)]
+            self._pending = [Downdate(root, signs)]
             self._under_way, self._done = True, 0
         return self._under_way
 
-    def _apply(self, blocks: range) -> None:
-        """Apply the downdate under way to some blocks, in place, unless it has been."""
+    def _apply(self, k: int) -> None:
+        """Apply the downdate under way to a copy of one block, which replaces it."""
         from scipy.linalg.blas import dgemm  # noqa: PLC0415 (slow to import)
 
-        root, signs, applied = self._pending[0]
-        first = max(blocks.start, len(applied))
-        weighted = root[first * BLOCK : blocks.stop * BLOCK] * signs
-        calls = []
-        for k, block in enumerate(self._blocks[first : blocks.stop]):
-            own = weighted[k * BLOCK : (k + 1) * BLOCK]
-            # The transposes are contiguous in Fortran order: dgemm copies none of them.
-            factors = root[: block.shape[1]].T, own.T
-            calls.append((-1.0, *factors, 1.0, block.T, True, False, True))
-        # No line of Python runs between the change of a block and the note of it: an
-        # interrupt finds neither or both.
-        applied.extend(map(len, starmap(dgemm, calls)))
+        root, signs = self._pending[0]
+        first, last = k * BLOCK, (k + 1) * BLOCK
+        # The transposes are contiguous in Fortran order: dgemm copies none of them.
+        self._blocks[k] = dgemm(
+            -1.0,
+            root[:last].T,
+            (root[first:last] * signs).T,
+            1.0,
+            self._blocks[k].T,
+            trans_a=True,
+        ).T
 
 
 def stored_bytes(landmarks: int) -> int:
@@ -330,9 +323,7 @@ def _downdates(saved: Mapping[str, Any]) -> list[Downdate]:
         raise ValueError("state['far_pending_signs'] must be 1 or -1")
     ends = np.cumsum(shapes[:, 1]).tolist()
     return [
-        Downdate(
-            root[:rows, end - rank : end].copy(), signs[end - rank : end].copy(), []
-        )
+        Downdate(root[:rows, end - rank : end].copy(), signs[end - rank : end].copy())
         for (rows, rank), end in zip(shapes.tolist(), ends, strict=True)
     ]
 
@@ -360,19 +351,14 @@ def subtract(covariance: Array, root: Array, signs: Array) -> None:
 
 
 @jit
-def read_rows(
-    block: Array, first: int, columns: IntArray, start: int, rows: Array
-) -> None:
-    """Copy what a block holds of the rows (c, width) of some columns.
+def read_columns(block: Array, first: int, columns: IntArray, rows: Array) -> None:
+    """Copy some columns of a block into rows (c, width), from column ``first`` on.
 
-    The first ``start`` are columns of the block, and the others are among its rows.
-    Columns are copied row by row, because neighbours share a cache line.
+    The copy runs row by row, because neighbours share a cache line.
     """
     for i in range(len(block)):
-        for j in range(start):
+        for j in range(len(columns)):
             rows[j, first + i] = block[i, columns[j]]
-    for j in range(start, len(columns)):
-        rows[j, : first + len(block)] = block[columns[j] - first]
 
 
 @jit

@@ -11,7 +11,6 @@ covariance [P_aa Φ; Φᵀ −Ψ] and mean (x_a, y), the phase changes the rest 
 
     x_b ← x_b + Sᵀ y,   P_ab ← Φ S,   P_bb ← P_bb − Sᵀ Ψ S
 
-This holds for local landmarks, too: x_b may contain them as they were at the beginning.
 (Guivant and Nebot, 2001, in the form of an augmented state.)
 
 In the invariant frame a correction also rotates and shears points,
@@ -30,7 +29,7 @@ import numpy as np
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
 from ...filters.gaussian_map import parts_of
-from ..multifrontal import pairs
+from ..multifrontal import pairs, symmetric
 from .deferred_covariance import (
     BLOCK,
     DeferredCovariance,
@@ -41,31 +40,14 @@ from .deferred_covariance import (
 
 
 class Phase(NamedTuple):
-    """The belief of the filter at the end of a phase, (x_a, y) in its own order.
+    """The parts of the filter's belief at the end of a phase."""
 
-    The pose comes first, then y, then the local landmarks.  The arrays are views of the
-    filter's memory, which the next phase does not use.
-    """
-
-    mean: Array  # (size,)
-    reference: Array  # linearisation points, for filters that fix them
-    covariance: Array  # (size, size)
-    first: int  # row of the first local landmark, 3 + e
-
-    def gain(self, rows: IntArray) -> Array:
-        """Return rows of Φ, shape (k, e)."""
-        chosen: Array = self.covariance[rows, 3 : self.first]
-        return chosen
-
-    @property
-    def loss(self) -> Array:
-        """Ψ, shape (e, e)."""
-        return -self.covariance[3 : self.first, 3 : self.first]
-
-    @property
-    def shift(self) -> Array:
-        """The mean of y, shape (1, e)."""
-        return self.mean[None, 3 : self.first]
+    mean: Array  # (a,) of pose and local landmarks
+    reference: Array  # (a,) their linearisation points, for filters that fix them
+    covariance: Array  # P_aa, (a, a)
+    gain: Array  # Φ, (a, e)
+    loss: Array  # Ψ, (e, e)
+    shift: Array  # y, (1, e)
 
 
 def virtual_landmarks(coordinates: int, invariant: bool) -> int:
@@ -103,9 +85,29 @@ def begin_phase(
 
 
 def end_phase(slam: EkfSlam, virtual: int) -> Phase:
-    """Return the belief of a filter that ran on an extended state."""
-    mean, covariance, reference = slam.map.used
-    return Phase(mean, reference, covariance, 3 + 2 * virtual)
+    """Split the belief of a filter that ran on an extended state; return copies.
+
+    Without an extension the covariance is a view: the local map may be large.
+    """
+    size, rest = slam.map.size, 3 + 2 * virtual
+    mean, covariance = slam.map.mean[:size], slam.map.covariance[:size, :size]
+    if not virtual:
+        reference, nothing = slam.map.reference[:size].copy(), np.empty((size, 0))
+        none = np.empty((1, 0))
+        return Phase(mean.copy(), reference, covariance, nothing, none[:0], none)
+    rows = np.concatenate([covariance[:3], covariance[rest:]])
+    return Phase(
+        _without(mean, rest),
+        _without(slam.map.reference[:size], rest),
+        np.concatenate([rows[:, :3], rows[:, rest:]], axis=1),
+        rows[:, 3:rest].copy(),
+        -covariance[3:rest, 3:rest],
+        mean[None, 3:rest].copy(),
+    )
+
+
+def _without(vector: Array, rest: int) -> Array:
+    return np.concatenate([vector[:3], vector[rest:]])
 
 
 def combine(coefficients: Array, strip: Array, invariant: bool) -> Array:
@@ -143,9 +145,10 @@ def _by_pivots(loss: Array) -> tuple[Array, Array]:
     """Pivoted Cholesky decomposition of a semidefinite matrix."""
     from scipy.linalg.lapack import dpstrf  # noqa: PLC0415 (slow to import)
 
-    factor, pivots, rank, _ = dpstrf(loss, lower=True)
+    used = np.flatnonzero(loss.diagonal())
+    factor, pivots, rank, _ = dpstrf(loss[used[:, None], used], lower=True)
     root = np.zeros((rank, len(loss)))
-    unpivot(factor.T, pivots - 1, root)
+    unpivot(factor.T, used[pivots - 1], root)
     return root, np.ones(rank)
 
 
@@ -163,11 +166,11 @@ def _by_eigenvalues(part: Array) -> tuple[Array, Array]:
 # --------------------------------------------------------------------------------------
 # A change of the local map, spread over several steps.
 #
-# The rows of the landmarks that are new to the map are stored, those of the landmarks
-# that enter are read, and Φ S becomes the strip of the new local map.  The new phase
-# needs none of this before it ends: it begins with the covariance of its own landmarks
-# alone.  Ψ is therefore factored in the step after the change, and the exchange
-# proceeds block by block in the steps that follow.
+# The rows of the landmarks that leave go back to the stored covariance, those of the
+# landmarks that enter are read, and Φ S becomes the strip of the new local map.  The
+# new phase needs none of this before it ends: it begins with the covariance of its own
+# landmarks alone.  Ψ is therefore factored in the step after the change, and the
+# exchange proceeds block by block in the steps that follow.
 
 SPREAD = 4  # steps that an exchange takes in a large map
 
@@ -187,21 +190,15 @@ def blocks_in_a_step(width: int, *, hurried: bool) -> int:
 class Exchanged(NamedTuple):
     """The rows of a change of the local map."""
 
-    own: IntArray  # ascending columns of the old local landmarks, shape (a - 3,)
-    order: IntArray  # their rows in the old belief of the filter
-    needed: IntArray  # its rows whose Φ S is needed
-    left: int  # how many of these, the first, belong to new landmarks that leave
-    new: IntArray  # ascending columns of the landmarks to store
-    places: IntArray  # their rows among those needed
+    own: IntArray  # columns of the old local landmarks, shape (a - 3,)
+    kept: IntArray  # rows of the pose and of landmarks that stay, in the old local map
+    leaving: IntArray  # ascending columns of the landmarks that leave
+    places: IntArray  # their rows in the old local map
     entering: IntArray  # ascending columns of the landmarks that enter
 
 
 def exchanged_rows(
-    slots: Mapping[int, int],
-    local: Iterable[int],
-    chosen: Collection[int],
-    stored: int,
-    first: int,
+    slots: Mapping[int, int], local: Iterable[int], chosen: Collection[int]
 ) -> tuple[Exchanged, dict[int, None]]:
     """Return the rows of a change of the local map, and its landmarks in their order.
 
@@ -211,28 +208,17 @@ def exchanged_rows(
         Place of each landmark in the map's arrays.
     local, chosen : collection of int
         The old and the new local landmarks.
-    stored : int
-        How many old ones, the first, are in the stored covariance.
-    first : int
-        Row of the first old one in the belief of the filter.
     """
     old = list(local)
     staying = [k for k, i in enumerate(old) if i in chosen]
-    leaving = [k for k in range(stored, len(old)) if old[k] not in chosen]
-    left, before = 2 * len(leaving), set(old)
+    places = {slots[i]: k for k, i in enumerate(old) if i not in chosen}
+    leaving, before = sorted(places), set(old)
     entering = sorted((i for i in chosen if i not in before), key=slots.__getitem__)
-    own = pairs([slots[i] for i in old])
-    order = own.argsort()
-    place = {k: 2 * row for row, k in enumerate(leaving)}
-    place |= {k: left + 3 + 2 * row for row, k in enumerate(staying)}
-    new = sorted(range(stored, len(old)), key=lambda k: slots[old[k]])
     rows = Exchanged(
-        own[order],
-        first + order,
-        np.concatenate([first + pairs(leaving), (0, 1, 2), first + pairs(staying)]),
-        left,
-        pairs([slots[old[k]] for k in new]),
-        np.array([place[k] + c for k in new for c in (0, 1)], dtype=np.int64),
+        pairs([slots[i] for i in old]),
+        np.r_[0:3, 3 + pairs(staying)],
+        pairs(leaving),
+        3 + pairs([places[slot] for slot in leaving]),
         pairs([slots[i] for i in entering]),
     )
     return rows, dict.fromkeys([old[k] for k in staying] + entering)
@@ -249,23 +235,15 @@ class Handover:
     old: Phase  # the end of the old phase
     strip: Array  # S of the old phase, shape (s, width)
     rows: Exchanged
+    next_strip: Array  # S of the new phase, shape (s', width), to be filled
     invariant: bool
     group: int  # number of blocks that are exchanged at a time
     done: int = 0  # number of blocks that have been exchanged
     is_factored: bool = False  # whether what follows is known
     lost: Downdate = field(init=False, repr=False)  # to be deferred at the end
-    _root: Array = field(init=False, repr=False)  # Uᵀ, (r, e)
-    _values: Array = field(init=False, repr=False)  # rows of P, (left + s', width)
-
-    def __post_init__(self) -> None:
-        """Make room for the new strip and for the rows to store."""
-        size = len(self.rows.needed) + len(self.rows.entering)
-        self._values = np.empty((size, self.strip.shape[1]))
-
-    @property
-    def next_strip(self) -> Array:
-        """S of the new phase, shape (s', width), as far as it has been exchanged."""
-        return self._values[self.rows.left :]
+    _coefficients: Array = field(init=False, repr=False)  # Φ above Uᵀ, (a + r, e)
+    _values: Array = field(init=False, repr=False)
+    _order: IntArray = field(init=False, repr=False)
 
     def advance(self, stored: DeferredCovariance, blocks: int) -> None:
         """Exchange groups of blocks until ``blocks`` are done, or all.
@@ -280,49 +258,77 @@ class Handover:
             self._exchange(stored, range(self.done, last))
             self.done = last
 
-    def beginning(self, stored: DeferredCovariance) -> Array:
-        """Return the covariance with which a new phase begins, shape (a', a' - 3).
-
-        It is that of pose and new local landmarks, without the columns of the pose, and
-        does not need the new strip.
-        """
-        kept, entering = self.rows.needed[self.rows.left :], self.rows.entering
-        S = np.ascontiguousarray(self.strip[:, entering])
-        block, P = stored.marginal(entering), self.old.covariance
-        lost = np.ascontiguousarray(combine(self.old.loss, S, self.invariant).T)
-        block -= combine(lost, S, self.invariant)  # Sᵀ Ψ S
-        across = combine(self.old.gain(kept), S, self.invariant)
-        return np.block([[P[np.ix_(kept, kept[3:])], across], [across[3:].T, block]])
-
     @property
     def nbytes(self) -> int:
-        """Memory that the exchange holds, without the old strip [bytes]."""
-        arrays = [self._values, self.old.covariance]
+        """Memory that the exchange holds [bytes]."""
+        arrays = [self.strip, self.old.covariance, self.old.gain, self.old.loss]
         if self.is_factored:
-            arrays += [self._root, self.lost.root]
+            arrays += [self._coefficients, self._values, self.lost.root]
         return sum(array.nbytes for array in arrays)
 
     def _factor(self, width: int) -> None:
-        self._root, signs = roots(self.old.loss, self.invariant)
-        self.lost = Downdate(np.empty((width, len(signs))), signs, [])
+        root, signs = np.empty((0, self.old.gain.shape[1])), np.empty(0)
+        if len(self.old.loss):
+            root, signs = roots(self.old.loss, self.invariant)
+        self._coefficients = np.concatenate([self.old.gain, root])
+        self._values = np.zeros((len(self.old.mean), width))
+        self._order = np.argsort(self.rows.own)
+        self.lost = Downdate(np.zeros((width, len(signs))), signs)
         self.is_factored = True
 
     def _exchange(self, stored: DeferredCovariance, blocks: range) -> None:
-        here = slice(blocks.start * BLOCK, blocks.stop * BLOCK)
-        rows, values, S = self.rows, self._values, self.strip[:, here]
-        needed = self.old.gain(rows.needed)
-        values[: len(needed), here] = combine(needed, S, self.invariant)
-        if self.invariant:
-            self.lost.root[here] = combine(self._root, S, self.invariant).T
-        else:  # without a copy
-            np.matmul(S.T, self._root[:, : len(S)].T, out=self.lost.root[here])
-        own = _within(rows.own, here)
-        inside = self.old.covariance[rows.needed[:, None], rows.order[own]]
-        values[: len(needed), rows.own[own]] = inside
-        if len(rows.new):
-            self.lost.root[rows.new[_within(rows.new, here)]] = 0.0
-            stored.put(blocks, rows.new, values, rows.places)
-        stored.read(blocks, rows.entering, values[len(needed) :], self.lost)
+        here, a = slice(blocks.start * BLOCK, blocks.stop * BLOCK), len(self._values)
+        if self._coefficients.size:
+            part = combine(self._coefficients, self.strip[:, here], self.invariant)
+            self._values[:, here] = part[:a]
+            self.lost.root[here] = part[a:].T
+        own = self._order[_within(self.rows.own[self._order], here)]
+        self._values[:, self.rows.own[own]] = self.old.covariance[:, 3 + own]
+        self.lost.root[self.rows.leaving[_within(self.rows.leaving, here)]] = 0.0
+        stored.put(blocks, self.rows.leaving, self._values, self.rows.places)
+        count = len(self.rows.kept)
+        self.next_strip[:count, here] = self._values[self.rows.kept, here]
+        stored.read(blocks, self.rows.entering, self.next_strip[count:], self.lost)
+
+
+def begin_handover(
+    stored: DeferredCovariance,
+    strip: Array,
+    now: Phase,
+    rows: Exchanged,
+    *,
+    invariant: bool,
+    hurried: bool,
+) -> tuple[Handover, Array]:
+    """Begin a handover; also return the covariance with which a new phase begins.
+
+    Parameters
+    ----------
+    stored : DeferredCovariance
+    strip : ndarray, shape (s, width)
+        S of the old phase.
+    now : Phase
+        The end of the old phase.
+    rows : Exchanged
+    invariant, hurried : bool
+
+    Returns
+    -------
+    handover : Handover
+    covariance : ndarray, shape (a', a' - 3)
+        Of pose and new local landmarks, without the columns of the pose.
+    """
+    entering = np.ascontiguousarray(strip[:, rows.entering])
+    block = stored.marginal(rows.entering)
+    lost = np.ascontiguousarray(combine(now.loss, entering, invariant).T)
+    block -= combine(lost, entering, invariant)  # Sᵀ Ψ S
+    stored.forget(rows.leaving)
+    next_strip = np.empty((len(rows.kept) + len(rows.entering), stored.width))
+    group = blocks_in_a_step(stored.width, hurried=hurried)
+    handover = Handover(now, strip, rows, next_strip, invariant, group)
+    across = combine(now.gain[rows.kept], entering, invariant)
+    inside = now.covariance[np.ix_(rows.kept, rows.kept[3:])]
+    return handover, np.block([[inside, across], [across[3:].T, symmetric(block)]])
 
 
 def _within(columns: IntArray, here: slice) -> slice:
