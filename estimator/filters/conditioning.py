@@ -396,7 +396,7 @@ def coincide(
     Raises
     ------
     numpy.linalg.LinAlgError
-        If S is not positive definite.
+        If S is not positive definite, or in the invariant frame no turn is found.
 
     Examples
     --------
@@ -438,6 +438,8 @@ def _turned_shift(
         before, turn = turn, float(-gains[:, 2] @ white)
         if abs(turn - before) <= TURN_TOLERANCE:
             break
+    if not abs(turn) < 2 * np.pi:  # where V(−t)⁻¹ does not exist
+        raise np.linalg.LinAlgError("the landmarks are too far apart to coincide")
     return np.asarray(-gains.T @ white)
 
 

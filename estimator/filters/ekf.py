@@ -101,7 +101,8 @@ class MapFilter(ObservesPoses):
         ValueError
             If one is not in the map, or they are the same.
         numpy.linalg.LinAlgError
-            If their distance has no uncertainty; nothing is merged.
+            If their distance has no uncertainty, or is far beyond it; nothing is
+            merged.
         """
         self.merge_pairs([(kept, gone)])
 
@@ -113,7 +114,7 @@ class MapFilter(ObservesPoses):
         ValueError
             If a landmark is not in the map, or in two pairs.
         numpy.linalg.LinAlgError
-            If a distance has no uncertainty; nothing is merged.
+            If a distance has no uncertainty, or is far beyond it; nothing is merged.
         """
         kept, gone = landmark_pairs(pairs, self.slots)
         (mean, P, reference), slots = self.map.used, self.map.slots

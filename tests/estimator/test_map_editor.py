@@ -157,6 +157,21 @@ def test_merged_landmarks_have_one_place_and_one_covariance():
     np.testing.assert_allclose(P[3:5], P[5:7], atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["invariant", "submaps"])
+def test_landmarks_too_far_apart_for_any_turn_stay_two(name):
+    noise = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.05, 0.1)}
+    slam = make_estimator(name, **noise)
+    slam.update([(0.0, 1.0), (1.0, 1000.0)], [4, 5])
+    slam.predict((0.0, 0.0))
+    before = slam.belief()
+    with pytest.raises(np.linalg.LinAlgError, match="too far apart"):
+        slam.merge(5, 4)
+    after = slam.belief()
+    assert after.landmark_ids == before.landmark_ids
+    np.testing.assert_array_equal(after.mean, before.mean)
+    slam.load_state_dict(slam.state_dict())
+
+
 def test_what_cannot_differ_cannot_be_merged():
     mean, P = random_map(5)
     P[5:7] = P[3:5]
