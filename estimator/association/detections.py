@@ -226,7 +226,7 @@ class Detections(NamedTuple):
     True
     """
 
-    #: Landmarks seen, expected, and returned after misses of odds below ε: shape
+    #: Landmarks seen, expected, and seen again after misses less likely than ε, shape
     #: (3, SECTORS, RINGS).
     detected: Array = np.zeros((3, SECTORS, RINGS))
     #: For landmarks that may have been in view since they were last seen, the
@@ -296,20 +296,19 @@ class Detections(NamedTuple):
             Longest range read so far [m].
         """
         cost = 0.0
-        for i, scan in first_scans.items():
-            if i in view.ids:
-                c, chance = 3 + 2 * view.ids.index(i), 1.0
-                then = MapView(np.zeros(5), np.zeros((5, 5)), (i,))
-                then.mean[3:] = view.mean[c : c + 2]
-                then.covariance[3:, 3:] = view.covariance[c : c + 2, c : c + 2]
-                path = self.path[self.path[:, 0] < scan]
-                gaps = np.hypot(*(path[:, 1:3] - then.mean[3:]).T)
-                spread = path[:, 4] + path[:, 8] + np.trace(then.covariance)
-                for row in path[gaps < longest + 2 * np.sqrt(np.maximum(spread, 0))]:
-                    then.mean[:3] = row[1:4]
-                    then.covariance[:3, :3] = row[4:].reshape(3, 3)
-                    chance = float(self.chance_to_miss(then, longest, chance)[0])
-                cost -= 2 * math.log(HIDDEN + (1 - HIDDEN) * chance)
+        for i in [i for i in first_scans if i in view.ids]:
+            c, chance = 3 + 2 * view.ids.index(i), 1.0
+            then = MapView(np.zeros(5), np.zeros((5, 5)), (i,))
+            then.mean[3:] = view.mean[c : c + 2]
+            then.covariance[3:, 3:] = view.covariance[c : c + 2, c : c + 2]
+            path = self.path[self.path[:, 0] < first_scans[i]]
+            gaps = np.hypot(*(path[:, 1:3] - then.mean[3:]).T)
+            spread = path[:, 4] + path[:, 8] + np.trace(then.covariance)
+            for row in path[gaps < longest + 2 * np.sqrt(np.maximum(spread, 0))]:
+                then.mean[:3] = row[1:4]
+                then.covariance[:3, :3] = row[4:].reshape(3, 3)
+                chance = float(self.chance_to_miss(then, longest, chance)[0])
+            cost -= 2 * math.log(HIDDEN + (1 - HIDDEN) * chance)
         return cost
 
     def chance_to_miss(self, view: MapView, longest: float, prior: float = 1) -> Array:

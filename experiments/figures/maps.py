@@ -154,7 +154,8 @@ class _MapParts(NamedTuple):
 
     def show(self, step: int) -> None:
         self.picture.show(step)
-        for artist, text in zip(self.titles, _title(self.trace, step), strict=True):
+        titles = _title(self.trace, step, self.picture.stride)
+        for artist, text in zip(self.titles, titles, strict=True):
             artist.set_text(text)
 
 
@@ -167,15 +168,14 @@ def _map_parts(trace: RunTrace, walls: Walls) -> _MapParts:
     picture = MapPicture(axes, trace)
     keys = picture.legend_keys() + draw_walls(axes, walls)
     style.legend(figure, keys, columns=3)
-    titles = style.write_title(axes, *_title(trace, 0))
+    titles = style.write_title(axes, *_title(trace, 0, picture.stride))
     figure.draw_without_rendering()  # equal axes need a second layout
     return _MapParts(figure, picture, titles, trace)
 
 
-def _title(trace: RunTrace, step: int) -> tuple[str, str]:
+def _title(trace: RunTrace, step: int, stride: int) -> tuple[str, str]:
     """Return title and subtitle: the step, and the size of the landmarks' ellipses."""
     now = trace.map_at(step)
-    stride = pose_stride(trace)
     thinned = f"  ·  1 pose in {stride} drawn" if stride > 1 else ""
     radius = 3 * np.sqrt(np.linalg.eigvalsh(now.covariances)[:, -1])
     size = f", 3σ within {radius.max():.2g} m" if len(now.ids) else ""
@@ -286,6 +286,8 @@ class MapPicture:
     def __init__(self, axes: Axes, trace: RunTrace, *, scale: float = 1.0) -> None:
         self._trace = trace
         self._axes = axes
+        #: Steps between two drawn ellipses of the pose.
+        self.stride = pose_stride(trace)
         self._first_steps = trace.first_steps()
         self._truth = self._add_truth(scale)
         self._artists = self._add_artists(scale)
@@ -298,7 +300,7 @@ class MapPicture:
     def show(self, step: int) -> None:
         """Draw the run up to and including a step."""
         artists, trace = self._artists, self._trace
-        steps = np.append(np.arange(0, step, pose_stride(trace)), step)
+        steps = np.append(np.arange(0, step, self.stride), step)
         artists.path.set_data(*trace.poses[: step + 1, :2].T)
         scene.set_ellipses(
             artists.predicted,
