@@ -85,10 +85,16 @@ class OneLineErrors(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""
+        _remaining.clear()
         try:
             return super().invoke(ctx)
-        except KeyboardInterrupt as error:
-            raise InterruptedRunError from error
+        except BaseException as error:
+            cause: BaseException | None = error
+            while cause and not isinstance(cause, KeyboardInterrupt):
+                cause = cause.__context__  # another error in the clean-up hides it
+            if cause is None:
+                raise
+            raise InterruptedRunError(*_remaining[-1:]) from cause
 
 
 class TerminationError(KeyboardInterrupt):
@@ -185,7 +191,6 @@ def ending_in_time(line: threading.Lock) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    _remaining.clear()
     reader, writer = socket.socketpair()
     writer.setblocking(False)
     former = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
@@ -350,11 +355,8 @@ class BadInputError(ValueError):
 def interruptible(message: str) -> Iterator[None]:
     """Report Ctrl-C and SIGTERM in the block with a message about what remains."""
     _remaining.append(message)
-    try:
-        yield
-    except KeyboardInterrupt as error:  # the message stays, for `ending_in_time`
-        raise InterruptedRunError(message) from error
-    _remaining.remove(message)
+    yield
+    _remaining.remove(message)  # it stays if the block is interrupted
 
 
 # --------------------------------------------------------------------------------------

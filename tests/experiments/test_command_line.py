@@ -538,6 +538,20 @@ def test_ctrl_c_leaves_the_older_output_as_it_was(log, without_pictures, monkeyp
     assert message == "interrupted; nothing was written"
 
 
+def test_an_error_in_a_clean_up_does_not_hide_the_interrupt(
+    log, without_pictures, monkeypatch
+):
+    def interrupt(log, path):
+        try:
+            raise KeyboardInterrupt
+        finally:
+            raise ValueError("the cluster is closed")
+
+    monkeypatch.setattr(run_files, "write_slamlog", interrupt)
+    message = refused("replay", log, "--out", "out", code=130)
+    assert message == "interrupted; nothing was written"
+
+
 def test_a_bug_is_one_line_too(log, monkeypatch):
     def stumble(folder, trace, **_):
         raise KeyError("oops")

@@ -24,7 +24,7 @@ from slamgym.envs.controllers import CONTROLLERS
 from slamgym.experiments.command_line import program
 from slamgym.experiments.command_line.generate import generate as generate_command
 from slamgym.experiments.command_line.options import Options
-from slamgym.experiments.command_line.program import InterruptedRunError
+from slamgym.experiments.command_line.program import InterruptedRunError, main
 from slamgym.experiments.jobs import claimed
 from slamgym.experiments.logs.slamlog import write_slamlog
 from slamgym.experiments.trajectories import driven_episodes, generate
@@ -658,5 +658,6 @@ def test_an_interrupted_command_says_that_whole_shards_stay(tmp_path, monkeypatc
         raise KeyboardInterrupt
 
     monkeypatch.setattr(driven_episodes, "drive_episodes", interrupt)
+    arguments = ["generate", "loop", "--episodes", "2", "--out", f"{tmp_path}/out"]
     with pytest.raises(InterruptedRunError, match=r"whole shards stay in .*out"):
-        command(tmp_path / "out")
+        main(arguments, standalone_mode=False)

@@ -162,8 +162,8 @@ def test_workers_of_any_kind_end_with_their_job(here, command, made, number):
     processes = psutil.Process(child.pid).children(recursive=True)
     os.kill(child.pid, number)
     message = message_at_the_end(child, here)
-    assert child.exitcode == CODES[number]
     assert f"slamgym: interrupted; {message_of(command)}" in message
+    assert child.exitcode == CODES[number]
     assert "Traceback" not in message
     _, alive = psutil.wait_procs(processes, timeout=10)
     assert alive == []
