@@ -23,7 +23,7 @@ from ..envs import LandmarkWorldEnv
 from ..envs.rendering import RENDER_MODES
 from ..envs.vector import LandmarkWorldVectorEnv
 from ..estimator.filters.batch import BatchBeliefs, BatchStorage
-from ..jit import jit
+from ..jit import jit_in_place
 from ..restorable import Restorable
 from ..sim_configs import Scenario
 from .active_slam_task import ActiveSlamTask, AssociationRecord, split_settings
@@ -480,7 +480,7 @@ def matched_rmse(beliefs: BatchStorage, landmarks: ComplexArray) -> Array:
     return errors
 
 
-@jit
+@jit_in_place
 def _write_rmse(means: Array, slots: IntArray, true: ComplexArray, rmse: Array) -> None:
     for b in range(len(means)):
         squares, mapped = 0.0, 0

@@ -14,7 +14,7 @@ import numpy as np
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.kernels.imagine import View, is_hidden, is_in_view
 from ..estimator.kernels.kalman_gain import half_log_det, largest_variance
-from ..jit import fma, jit, njit_internal, njit_reordered
+from ..jit import fma, jit, jit_in_place, njit_allocating, njit_internal, njit_reordered
 from .belief_features import FeatureArrays, Rectangle, write_belief_features
 
 CELLS = 8.0  # that weigh as much as one landmark
@@ -76,7 +76,7 @@ class Scratch(NamedTuple):
     matrix: Array  # (2N, 2N)
 
 
-@jit
+@jit_in_place
 def advance(
     chosen: BoolArray,
     moving: BoolArray,
@@ -155,7 +155,7 @@ def judge_landmarks(
     return mapped
 
 
-@njit_internal
+@njit_allocating
 def map_uncertainty(
     covariance: Array, mapped: int, landmarks: int, rules: Rules, scratch: Scratch
 ) -> float:

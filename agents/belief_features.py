@@ -27,7 +27,7 @@ from ..estimator.filters.batch import BatchStorage
 from ..estimator.filters.ekf import EkfSlam
 from ..estimator.kernels.kalman_gain import largest_variance
 from ..estimator.models.bearing_range import wrap_angle_jit
-from ..jit import jit, njit_internal
+from ..jit import jit_in_place, njit_internal
 from ..sim_configs import Scenario
 from ..sim_configs.landmarks_and_controls import possible_positions
 from .estimator_choice import BeliefOfMap
@@ -349,7 +349,7 @@ def write_belief_features(
         map_std[b, i] = on_log_scale_jit(root_jit(largest_variance(P, x)))
 
 
-@jit
+@jit_in_place
 def write_features(
     means: Array,
     covariances: Array,

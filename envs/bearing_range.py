@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import Array, BoolArray, ComplexArray, IntArray
-from ..jit import fma, jit, njit_internal
+from ..jit import fma, jit_in_place, njit_internal
 from ..sim_configs import Scenario
 from ..suggestions import imported
 from .noise_streams import SensorNoise, SensorSettings
@@ -117,7 +117,7 @@ class BearingRangeSensor:
         return measurements, mask
 
 
-@jit
+@jit_in_place
 def _relate(
     landmarks: ComplexArray, frame: Array, relative: ComplexArray, places: Array
 ) -> None:
@@ -142,7 +142,7 @@ def _relate(
             places[0, world, i], places[1, world, i] = y, x
 
 
-@jit
+@jit_in_place
 def _disturb(  # noqa: PLR0917 (numba takes arrays more quickly than tuples of them)
     places: Array,
     readings: Array,
@@ -323,7 +323,7 @@ class LineOfSight:
         return blocked
 
 
-@jit
+@jit_in_place
 def _find_blocked(
     landmarks: ComplexArray, frame: Array, walls: Array, blocked: BoolArray
 ) -> None:

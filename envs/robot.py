@@ -34,7 +34,7 @@ import numpy as np
 import pymunk
 
 from ..arrays import Array, BoolArray, ComplexArray, IndexArray, IntArray
-from ..jit import jit, njit_internal
+from ..jit import jit_in_place, njit_internal
 from ..restorable import Restorable, State
 from ..sim_configs import Scenario
 from .drives import Drive, drive_of
@@ -412,7 +412,7 @@ class UnicycleBodies(Restorable):
         self.frame = frame
 
 
-@jit
+@jit_in_place
 def _move(  # noqa: PLR0917 (numba takes arrays more quickly than tuples of them)
     frame: Array,
     moving: BoolArray,

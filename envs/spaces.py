@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array, BoolArray, IntArray
-from ..jit import jit
+from ..jit import jit_in_place
 from ..sim_configs import Scenario
 from ..sim_configs.landmarks_and_controls import possible_positions
 from ..sim_configs.scenario_files import widest_scenario
@@ -191,7 +191,7 @@ def commands_of(
     return array
 
 
-@jit
+@jit_in_place
 def _begin_step(
     actions: Array, limits: Array, dt: float, moving: BoolArray, steps: IntArray
 ) -> int:

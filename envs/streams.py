@@ -12,7 +12,13 @@ from math import log, sqrt
 import numpy as np
 
 from ..arrays import Array, ComplexArray, IntArray, WordArray
-from ..jit import add_words, jit, multiply_words, njit_internal
+from ..jit import (
+    add_words,
+    jit_in_place,
+    multiply_words,
+    njit_allocating,
+    njit_internal,
+)
 from ..sim_configs import Scenario, place_landmarks
 from ..sim_configs.landmarks_and_controls import TRIES_PER_LANDMARK, RandomLayout
 from ..sim_configs.scenario import RANGES
@@ -107,7 +113,7 @@ class EpisodeStarts:
         return out.view(np.complex128)[..., 0]
 
 
-@jit
+@jit_in_place
 def _draw_poses(
     keys: WordArray,
     steps: IntArray,
@@ -124,7 +130,7 @@ def _draw_poses(
             centre[row, i] = pose[i]
 
 
-@jit
+@jit_in_place
 def draw_normals(keys: WordArray, steps: IntArray, stream: int, out: Array) -> None:
     """Fill an array with standard normal numbers, row k from step ``steps[k]``.
 
@@ -142,7 +148,7 @@ def draw_normals(keys: WordArray, steps: IntArray, stream: int, out: Array) -> N
     make_normal(out.reshape(-1))
 
 
-@jit
+@jit_in_place
 def draw_uniforms(keys: WordArray, steps: IntArray, stream: int, out: Array) -> None:
     """Fill an array, (K, W), with uniform numbers in [0, 1); see `draw_normals`."""
     _fill(keys, steps, stream, out, False)
@@ -164,7 +170,7 @@ def _fill(
                     column += 1
 
 
-@jit
+@jit_in_place
 def throw_darts(
     keys: WordArray,
     stream: int,
@@ -253,7 +259,7 @@ def shifted(word: Word) -> float:
     return (np.int64(word >> _TO_NORMAL) + 0.5) * 2.0**-52 - 0.5
 
 
-@njit_internal
+@njit_allocating
 def make_normal(numbers: Array) -> None:
     """Turn uniform numbers q of `shifted`, (n,), into z = Φ⁻¹(1/2 + q); |z| < 8.3.
 

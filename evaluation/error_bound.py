@@ -34,7 +34,7 @@ from ..estimator.models.sensors import (
     former_noise,
 )
 from ..estimator.support import argument_checks
-from ..jit import jit, njit_internal
+from ..jit import jit, njit_allocating, njit_internal
 
 
 class PosteriorBound(NamedTuple):
@@ -294,7 +294,7 @@ def _follow(
         out[2][t] = out[0][t] + lever
 
 
-@njit_internal
+@njit_allocating
 def _move(
     poses: Array, points: Array, t: int, noise: Array, entry: Array, P: Array, size: int
 ) -> None:
@@ -316,7 +316,7 @@ def _move(
             row[j] += turned * turn[j]
 
 
-@njit_internal
+@njit_allocating
 def _fix(P: Array, size: int, axis: int, lever: float, variance: float) -> None:
     """Take in a reading of x, y or θ: of ξ along the axis, and `lever` times ξ_θ."""
     if variance == np.inf:
@@ -332,7 +332,7 @@ def _fix(P: Array, size: int, axis: int, lever: float, variance: float) -> None:
             P[i, j] -= row[i] * row[j] / total
 
 
-@njit_internal
+@njit_allocating
 def _read(
     P: Array, size: int, due: Array, m: int, c: int, gx: float, gy: float, noise: float
 ) -> None:

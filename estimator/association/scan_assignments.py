@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from ...arrays import Array, IntArray
-from ...jit import jit, njit_internal
+from ...jit import jit, jit_in_place, njit_allocating
 from ..interface import MapView
 from ..kernels.assignment_search import (
     UNPAIRED,
@@ -176,7 +176,7 @@ def assign_jointly(
     return kept, near
 
 
-@njit_internal
+@njit_allocating
 def _is_superfluous(
     of_scan: tuple[Any, ...], better: IntArray, marks: IntArray, slots: IntArray
 ) -> bool:
@@ -333,7 +333,7 @@ class Sensor(NamedTuple):
         return cls(noise, options.get("min_range", 1e-3))
 
 
-@jit
+@jit_in_place
 def likely_variances_jit(
     noise: Noise, measured: float, expected: float, spread: float
 ) -> tuple[float, float]:
@@ -419,7 +419,7 @@ def innovation_distances(
     return fit
 
 
-@jit
+@jit_in_place
 def _compare(
     mean: Array,
     covariance: Array,

@@ -16,7 +16,7 @@ from weakref import ref
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ...jit import jit, njit_internal
+from ...jit import jit_in_place, njit_inlined, njit_internal
 from ..interface import Belief, MapView, UpdateReport, columns_of
 from ..kernels import kalman_gain as gain
 from ..kernels.kalman_gain import BeliefArrays, Rules, Workspace, new_workspace
@@ -385,10 +385,10 @@ def parts_of(block: Array) -> Parts:
     )
 
 
-parts_jit = njit_internal(parts_of)
+parts_jit = njit_inlined(parts_of)
 
 
-@jit
+@jit_in_place
 def update_map(block: Array, readings: Array, ids: IntArray) -> int:
     """Update the belief of a filter with one scan, in place.
 
@@ -437,7 +437,7 @@ def update_map(block: Array, readings: Array, ids: IntArray) -> int:
     return int(status)
 
 
-@jit
+@jit_in_place
 def complete(block: Array) -> None:
     """Copy the lower half of the covariance into the upper, if it is out of date."""
     parts = parts_jit(block)
@@ -488,7 +488,7 @@ def hash_of(landmark_id: int) -> int:
     return (low * 0x278DDE6D + high * 0x1F123BB5) >> 20
 
 
-@jit
+@jit_in_place
 def move_pose(
     block: Array, forward: float, sideways: float, turn: float, weight: float
 ) -> None:

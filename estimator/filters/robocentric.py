@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
-from ...jit import jit, njit_internal
+from ...jit import jit_in_place, njit_internal
 from ..interface import Belief, MapView
 from ..kernels.scan_update import DONE
 from ..models.rigid_motion import as_covariance
@@ -28,7 +28,7 @@ RESERVED = (-(2**63), 1 - 2**63)  # ids of these two places
 TAKEN = -5  # status of an update with one of these ids
 
 
-@jit
+@jit_in_place
 def update_and_move(block: Array, readings: Array, ids: IntArray) -> int:
     """Update a map with a scan as `update_map`, then move the frame to the robot."""
     for landmark_id in ids:
@@ -131,7 +131,7 @@ class RobocentricEkfSlam(EkfSlam):
         return tuple(self.map.slots)[len(RESERVED) :]
 
 
-@jit
+@jit_in_place
 def move_frame(mean: Array, covariance: Array, size: int) -> None:
     """Move the frame to the robot: x ← f(x), P ← T P Tᵀ, in O(size²).
 

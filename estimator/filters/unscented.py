@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ...jit import njit_internal, specialised
+from ...jit import njit_allocating, specialised
 from ..kernels import kalman_gain as gain
 from ..kernels.kalman_gain import BeliefArrays, Rules, Workspace
 from ..kernels.scan_update import (
@@ -27,7 +27,7 @@ from .ekf import EkfSlam
 from .gaussian_map import move_pose, update_map
 
 
-@njit_internal
+@njit_allocating
 def symmetric_root(covariance: Array, size: int, points: int) -> Array:
     """Return √points times the symmetric root of P, read from its lower half."""
     values, vectors = np.linalg.eigh(covariance[:size, :size])
@@ -35,7 +35,7 @@ def symmetric_root(covariance: Array, size: int, points: int) -> Array:
     return root
 
 
-@njit_internal
+@njit_allocating
 def predict_through_points(
     mean: Array,
     covariance: Array,
@@ -76,7 +76,7 @@ def predict_through_points(
             covariance[i, j] = covariance[j, i] = cross[i, j] / (2 * points)
 
 
-@njit_internal
+@njit_allocating
 def update_through_points(
     arrays: tuple[Array, Array, Array],
     size: int,
@@ -102,7 +102,7 @@ def update_through_points(
     return DONE, used, squared_norm(rows, used)
 
 
-@njit_internal
+@njit_allocating
 def look_from_points(
     mean: Array, root: Array, rules: Rules, rows: Array, ledger: IntArray, count: int
 ) -> tuple[Array, int]:
@@ -148,7 +148,7 @@ def look_from_points(
     return spread, used
 
 
-@njit_internal
+@njit_allocating
 def condition(
     belief: BeliefArrays, root: Array, spread: Array, rows: Array, columns: IntArray
 ) -> int:
@@ -197,7 +197,7 @@ def condition(
     return -1
 
 
-@njit_internal
+@njit_allocating
 def record(L: Array, system: Array, columns: IntArray) -> None:
     """Leave L where a report looks for H Aᵀ, with H that selects a column."""
     for i in range(len(L)):

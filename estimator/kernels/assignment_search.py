@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
-from ...jit import jit, njit_apart, njit_inlined, njit_internal
+from ...jit import jit, njit_allocating, njit_apart, njit_inlined, njit_internal
 from ..models.bearing_range import (
     expected_reading_jit,
     reading_slopes_jit,
@@ -39,7 +39,7 @@ from ..models.bearing_range import (
 )
 
 
-@njit_internal
+@njit_allocating
 def _candidates(feasible: BoolArray) -> tuple[IntArray, IntArray]:
     """List the landmarks that each reading may belong to, and count them."""
     listed = np.zeros(feasible.shape, np.int64)
@@ -52,7 +52,7 @@ def _candidates(feasible: BoolArray) -> tuple[IntArray, IntArray]:
     return listed, counts
 
 
-@njit_internal
+@njit_allocating
 def _decision_order(feasible: BoolArray, innovations: Array) -> IntArray:
     """Return the readings with the fewest landmarks first.
 
@@ -78,7 +78,7 @@ def _decision_order(feasible: BoolArray, innovations: Array) -> IntArray:
     return order
 
 
-@njit_internal
+@njit_allocating
 def _needed(feasible: BoolArray, order: IntArray) -> tuple[IntArray, IntArray]:
     """Sort the landmarks by when they are needed last, the latest first.
 
@@ -439,7 +439,7 @@ def _subtract(C: Array, gains: Array, count: int, after: Array) -> None:
             after[a + 1, b] = C[a + 1, b] - m0 * gains[0, b] - m1 * gains[1, b]
 
 
-@njit_internal
+@njit_allocating
 def condition_on_all(
     problem: Problem, marks: IntArray, shifts: Array, joints: Array
 ) -> int:
@@ -466,7 +466,7 @@ def condition_on_all(
     return here
 
 
-@njit_internal
+@njit_allocating
 def least_distances(problem: Problem, marks: IntArray) -> Array:
     """Return the least νᵀ S⁻¹ ν of each unpaired reading to a landmark without one.
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
-from ...jit import jit, njit_internal
+from ...jit import jit, jit_in_place, njit_allocating, njit_internal
 from ..models.rigid_motion import predict
 from .kalman_gain import ADDED, LEDGER_HEIGHT, OUTCOME, SLOT
 from .scan_update import DONE, as_rules, update_belief, usable
@@ -129,7 +129,7 @@ def step_runs(
             failed_at[b] = 0
 
 
-@jit
+@jit_in_place
 def begin_runs(
     run_arrays: tuple[Any, ...], chosen: Bool, poses: Array, variances: Array
 ) -> None:
@@ -154,7 +154,7 @@ class StepRoom(NamedTuple):
     workspace: tuple[Any, ...]
 
 
-@njit_internal
+@njit_allocating
 def new_room(landmarks: int, workspace_arrays: tuple[Any, ...]) -> StepRoom:
     """Allocate room for scans of so many landmarks."""
     return StepRoom(

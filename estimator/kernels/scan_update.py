@@ -428,7 +428,7 @@ def relinearise(
     return -1
 
 
-@njit_internal
+@njit_inlined
 def second_system(rows: Array) -> Array:
     """Return the system of readings linearised again, where the rules iterate."""
     return rows[FIRST + (len(rows) - FIRST) // 2 :]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ...jit import jit
+from ...jit import jit_in_place
 from ...restorable import Restorable
 from ..association.scan_assignments import Noise
 from ..association.scan_association import ScanAssociation
@@ -370,7 +370,7 @@ RECORDS: saved_states.Table = {
 }
 
 
-@jit
+@jit_in_place
 def _add_sightings(
     counts: tuple[IntArray, Array],
     slots: IntArray,

@@ -23,7 +23,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ...arrays import Array, ComplexArray
-from ...jit import jit, njit_inlined, njit_internal
+from ...jit import jit_in_place, njit_inlined, njit_internal
 from .bearing_range import wrap_angle
 
 Real = Any  # a number, or an array of any shape
@@ -101,7 +101,7 @@ turn_coefficients_jit = njit_inlined(turn_coefficients)
 # Move of one belief by one odometry reading.
 
 
-@jit
+@jit_in_place
 def predict(
     mean: Array,
     covariance: Array,

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST_RANGE_GROWTH, Array
-from ...jit import njit_inlined, njit_internal, specialised
+from ...jit import jit, njit_allocating, njit_inlined, specialised
 from ...suggestions import closest, imported
 from ..support import argument_checks
 from . import bearing_range
@@ -463,11 +463,12 @@ def for_sensor(kernel: Any, sensor: Sensor) -> Any:
 def kernel_parts(sensor: Sensor) -> Mapping[Kernel, Kernel]:
     """Return a sensor's counterpart of each function in a kernel that is for readings.
 
-    See :mod:`.bearing_range` for what each of them returns.
+    See :mod:`.bearing_range` for what each of them returns.  They count references,
+    because functions of a user may return arrays.
     """
-    h, std, (first, second) = njit_internal(sensor.h), sensor.std, sensor.wraps
-    std, is_single, places = njit_internal(std), sensor.size == 1, sensor.places
-    inverse = njit_internal(sensor.inverse or _nowhere)
+    h, std, (first, second) = njit_allocating(sensor.h), sensor.std, sensor.wraps
+    std, is_single, places = njit_allocating(std), sensor.size == 1, sensor.places
+    inverse = njit_allocating(sensor.inverse or _nowhere)
 
     def expected(dx: float, dy: float, heading: float) -> Numbers:
         cos, sin = np.cos(heading), np.sin(heading)
@@ -519,12 +520,12 @@ def kernel_parts(sensor: Sensor) -> Mapping[Kernel, Kernel]:
         return places
 
     return {
-        bearing_range.expected_reading_jit: njit_inlined(expected),
-        bearing_range.pose_slopes_jit: njit_inlined(slopes),
+        bearing_range.expected_reading_jit: jit(expected),
+        bearing_range.pose_slopes_jit: jit(slopes),
         bearing_range.difference_jit: njit_inlined(difference),
-        bearing_range.read_distance_jit: njit_inlined(distance),
-        bearing_range.reading_variances_jit: njit_inlined(variances),
-        bearing_range.placed_jit: njit_inlined(placed),
+        bearing_range.read_distance_jit: jit(distance),
+        bearing_range.reading_variances_jit: jit(variances),
+        bearing_range.placed_jit: jit(placed),
         bearing_range.places_at_once_jit: njit_inlined(places_at_once),
     }
 

@@ -43,11 +43,26 @@ def jit(function: Kernel) -> Kernel:
     return _compile(function, callable_from_python=True)
 
 
+def jit_in_place(function: Kernel) -> Kernel:
+    """Compile a kernel that changes only the arrays of its arguments.
+
+    It may not allocate arrays.  Without counting references to them, a call takes less
+    time, and so does every view of an array.
+    """
+    return _compile(function, callable_from_python=True, counted=False)
+
+
 def njit_internal(function: Kernel) -> Kernel:
     """Compile a function that only kernels call, in about half the time.
 
-    Python can call its ``py_func``.
+    As :func:`jit_in_place`, it allocates no arrays, returns none and calls no kernel
+    that returns any.  Python can call its ``py_func``.
     """
+    return _compile(function, callable_from_python=False, counted=False)
+
+
+def njit_allocating(function: Kernel) -> Kernel:
+    """Compile an internal function that allocates, returns or is given back arrays."""
     return _compile(function, callable_from_python=False)
 
 
@@ -66,7 +81,7 @@ def njit_apart(function: Kernel) -> Kernel:
     Its loops then run on whole vector registers at once.  Otherwise they first compare
     the addresses of all arrays, which takes longer than the loop over a small map.
     """
-    return _compile(function, callable_from_python=False, apart=True)
+    return _compile(function, callable_from_python=False, apart=True, counted=False)
 
 
 def njit_inlined(function: Kernel) -> Kernel:
@@ -87,6 +102,7 @@ def _compile(
     callable_from_python: bool,
     reordered: bool = False,
     apart: bool = False,
+    counted: bool = True,
 ) -> Kernel:
     options: dict[str, Any] = {
         "error_model": "numpy",
@@ -95,6 +111,7 @@ def _compile(
         "no_cpython_wrapper": not callable_from_python,
         "fastmath": {"reassoc", "nsz", "contract"} if reordered else False,
         "noalias": apart,
+        "_nrt": counted,
     }
     return cast("Kernel", _kept(njit(**options)(function)))
 
@@ -335,7 +352,19 @@ class KernelCache:
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """Keep the compiled code for the types of a call."""
+        """Keep the compiled code for the types of a call.
+
+        Raises
+        ------
+        TypeError
+            If the kernel does not count references, but returns an array, whose memory
+            a caller would free, or gets one from a kernel that counts them, which
+            nobody would free.
+        """
+        uncounted = not self._kernel.targetoptions["_nrt"]
+        if uncounted and any("array" in str(each) for each in _handed_on(result)):
+            self._kernel._reset_overloads()  # another call is refused, too
+            raise TypeError(f"{self._kernel} hands on arrays: use njit_allocating")
         if self._fingerprint is None:
             return
         if result.library.has_dynamic_globals or result.lifted:
@@ -349,6 +378,17 @@ class KernelCache:
         function = self._kernel.py_func
         readable = f"{function.__module__}.{function.__name__}".rpartition("slamgym.")
         return f"{readable[2]}-{hashlib.sha256(key).hexdigest()[:32]}.nbc"
+
+
+def _handed_on(result: Any) -> Iterator[Any]:
+    """Return the types of what a kernel returns, and of what others return to it."""
+    yield result.signature.return_type
+    types_of = result.type_annotation
+    for call, signature in types_of.calltypes.items():
+        if getattr(call, "op", None) != "call":
+            continue
+        if isinstance(types_of.typemap[call.func.name], types.Dispatcher):
+            yield signature.return_type
 
 
 def _read(file: Path) -> bytes | None:

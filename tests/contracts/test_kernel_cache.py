@@ -1,11 +1,13 @@
 """Compiled kernels on disk: never stale, shared, and not needed."""
 
+import gc
 import os
 import shutil
 import subprocess
 import sys
 import textwrap
 import time
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from pkgutil import walk_packages
@@ -14,15 +16,20 @@ import forked
 import numpy as np
 import pytest
 from numba import _dispatcher
+from numba.core.runtime import _nrt_python
+from numba.core.runtime.nrt import rtsys
 
 import slamgym
 from slamgym import jit as kernel_cache
-from slamgym.estimator import list_peers
+from slamgym.estimator import list_estimators, list_peers, make_estimator
+from slamgym.estimator.models.sensors import POSITION
 from slamgym.jit import (
     UnknownValueError,
     code_fingerprint,
     fma,
     jit,
+    jit_in_place,
+    njit_allocating,
     njit_apart,
     njit_internal,
 )
@@ -430,3 +437,89 @@ def test_fingerprints_are_quick():
     for kernel in kernels:
         code_fingerprint(kernel)
     assert time.process_time() - began < 1  # 0.1 s
+
+
+@njit_internal
+def last_of(rows):
+    part = rows[1:]
+    return part[-1, 0]
+
+
+@njit_allocating
+def lower_part(rows):
+    return rows[1:]
+
+
+@njit_internal
+def uncounted_parts(rows):
+    return rows[:1], rows[1:]
+
+
+@jit
+def through_views(rows):
+    return last_of(rows) + lower_part(rows)[0, 0] + last_of(lower_part(rows))
+
+
+@jit
+def through_uncounted_views(rows):
+    return uncounted_parts(rows)[1][0, 0]
+
+
+@njit_allocating
+def copied(rows):
+    return rows.copy()
+
+
+@jit_in_place
+def keeps_a_copy(rows):
+    return copied(rows)[0, 0]
+
+
+@jit_in_place
+def allocates(rows):
+    return np.zeros(len(rows)).sum()
+
+
+def test_references_to_arrays_are_neither_lost_nor_kept():
+    rows = np.arange(6.0).reshape(3, 2)
+    before = sys.getrefcount(rows)
+    assert [through_views(rows) for _ in range(5)] == [10.0] * 5
+    assert sys.getrefcount(rows) == before
+
+
+@pytest.mark.parametrize("kernel", [through_uncounted_views, keeps_a_copy])
+def test_kernel_without_counted_references_hands_on_no_array(kernel):
+    for _ in range(2):  # the first call leaves nothing that the second one could use
+        with pytest.raises(Exception, match="use njit_allocating"):
+            kernel(np.zeros((3, 2)))
+
+
+def two_stds(noise, _):
+    return np.array(noise[:2])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        *({"name": name} for name in list_estimators()),
+        {"name": "ekf", "sensor": replace(POSITION, name="arrays", std=two_stds)},
+    ],
+    ids=lambda options: "-".join(map(str, options.values()))[:20],
+)
+def test_no_estimator_loses_an_array(options):
+    slam = make_estimator(motion_std=(0.1,) * 3, measurement_std=(0.1,) * 2, **options)
+    readings = np.array([[0.5, 2.0], [-1.0, 3.0]])
+    _nrt_python.memsys_enable_stats()
+    alive = []
+    for _ in range(6):
+        slam.predict((0.0, 0.0))
+        slam.update(readings, [1, 2])
+        gc.collect()
+        stats = rtsys.get_allocation_stats()
+        alive.append(stats.alloc - stats.free)
+    assert alive[-1] <= alive[1]
+
+
+def test_kernel_in_place_allocates_nothing():
+    with pytest.raises(Exception, match="zeros"):
+        allocates(np.zeros((3, 2)))
