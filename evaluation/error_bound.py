@@ -192,11 +192,12 @@ def _invariant_start(first: Array, std: Array) -> Array:
     return np.asarray(lever * std**2 @ lever.mT)
 
 
+_Run = tuple[Array, Array, BoolArray, Array, Array]
+_Bounds = tuple[Array, Array, Array]  # rows of a `PosteriorBound`
+
+
 def _of_one_run(
-    run: tuple[Array, Array, BoolArray, Array, Array],
-    noise: tuple[Array, Array],
-    start: Array,
-    out: tuple[Array, Array, Array],
+    run: _Run, noise: tuple[Array, Array], start: Array, out: _Bounds
 ) -> Array:
     """Fill in the bounds of a run, and return the covariance at its end.
 
@@ -209,19 +210,10 @@ def _of_one_run(
     P = np.zeros((3 + 2 * len(rows), 3 + 2 * len(rows)))
     P[:3, :3] = start
     most = int(visible.sum(axis=1).max(initial=0))  # readings of a scan
-    _follow(
-        poses,
-        landmarks[rows],
-        visible[:, rows],
-        np.argsort(rows),  # the order within a scan
-        dt,
-        fixes,
-        *noise,
-        np.empty((2, 2 * most, len(P))),
-        P,
-        out,
-    )
-    at = 3 + 2 * np.argsort(rows)
+    by_row = np.argsort(rows)  # the order within a scan
+    run = poses, landmarks[rows], visible[:, rows], dt, fixes
+    _follow(run, by_row, noise, np.empty((2, 2 * most, len(P))), P, out)
+    at = 3 + 2 * by_row
     columns = np.concatenate([np.arange(3), np.stack([at, at + 1], axis=1).ravel()])
     return np.asarray(P[np.ix_(columns, columns)])
 
@@ -240,17 +232,12 @@ def _about_centre(covariance: Array) -> float:
 
 @jit
 def _follow(
-    poses: Array,
-    landmarks: Array,
-    visible: BoolArray,
+    run: _Run,
     by_row: IntArray,
-    dt: Array,
-    fixes: Array,
-    motion: Array,
-    noise: Array,
+    noises: tuple[Array, Array],
     pending: Array,
     P: Array,
-    out: tuple[Array, Array, Array],
+    out: _Bounds,
 ) -> None:
     """Take the bound P of one run through all its scans, in place.
 
@@ -258,6 +245,7 @@ def _follow(
     read so far. Landmark i is the (i + 1)-th to be read. A scan is subtracted from P in
     one pass, from its pending rows and shares: P −= Σ share rowᵀ.
     """
+    (poses, landmarks, visible, dt, fixes), (motion, noise) = run, noises
     entry = np.zeros((len(P), 3))
     size = 3
     for t in range(len(poses)):

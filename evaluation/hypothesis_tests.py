@@ -278,8 +278,7 @@ def time_average_test(
     error_rate : float
         Probability of rejecting a consistent filter.
     """
-    ratios = one_per_run("averages", averages, 2) / degrees_of_freedom
-    mean, error = _mean_and_error(ratios)
+    ratios, mean, error = _ratios(averages, degrees_of_freedom)
     skewness, runs = _skewness(ratios), len(ratios)
     score = _unskew((mean - 1) / error, skewness, runs) if error else np.inf
     limit = stdtrit(runs - 1, 1 - error_rate / 2)
@@ -313,8 +312,7 @@ def bootstrap_test(
     resamples : int
         Number of resamples.
     """
-    ratios = one_per_run("averages", averages, 2) / degrees_of_freedom
-    mean, error = _mean_and_error(ratios)
+    ratios, mean, error = _ratios(averages, degrees_of_freedom)
     if len(ratios) < FEWEST_RESAMPLED or np.ptp(ratios) == 0:
         return HypothesisTest(mean, Band(-np.inf, np.inf), np.nan, error_rate)
     drawn = ratios[rng.integers(0, len(ratios), (resamples, len(ratios)))]
@@ -342,8 +340,7 @@ def equivalence_test(
         Probability of claiming consistency at the margin.  The interval leaves out
         twice this probability.
     """
-    ratios = one_per_run("averages", averages, 2) / degrees_of_freedom
-    mean, error = _mean_and_error(ratios)
+    ratios, mean, error = _ratios(averages, degrees_of_freedom)
     limit = stdtrit(len(ratios) - 1, 1 - error_rate)
     ends = _skew(np.array([limit, -limit]), _skewness(ratios), len(ratios))
     interval = to_band(mean - error * ends)
@@ -356,8 +353,11 @@ def equivalence_test(
     return EquivalenceTest(mean, interval, verdict, error_rate)
 
 
-def _mean_and_error(values: Array) -> tuple[float, float]:
-    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
+def _ratios(averages: Array, degrees_of_freedom: int) -> tuple[Array, float, float]:
+    """Return the ratio of each run, and their mean with its standard error."""
+    ratios = one_per_run("averages", averages, 2) / degrees_of_freedom
+    error = ratios.std(ddof=1) / np.sqrt(len(ratios))
+    return ratios, float(ratios.mean()), float(error)
 
 
 def _skewness(values: Array) -> float:

@@ -22,19 +22,8 @@ from ..estimator.models.bearing_range import wrap_angle
 from ..estimator.models.sensors import Sensor, former_noise, only_bearing_range
 from ..estimator.support import argument_checks
 
-_NOISE = {
-    "along": "motion noise",
-    "sideways": "motion noise",
-    "turn": "motion noise",
-    "bearing": "bearing noise",
-    "range": "range noise",
-}
-
-
 #: The five noises: εx, εy, εα of the motion, εβ, εr of the readings.
 CHANNELS = ("along", "sideways", "turn", "bearing", "range")
-
-
 _SYMBOLS = dict(zip(CHANNELS, ("σx", "σy", "σα", "σβ", "σr"), strict=True))
 _BIASES = {
     "along": "odometry scale",
@@ -141,8 +130,9 @@ def _size(channel: str, count: float, variance: float) -> Finding:
     below = chdtr(count - 1, (count - 1) * variance)
     above = chdtrc(count - 1, (count - 1) * variance)
     which = "too small" if variance > 1 else "too large"
+    of = channel if channel in ("bearing", "range") else "motion"
     return Finding(
-        f"{_NOISE[channel]} {which}",
+        f"{of} noise {which}",
         float(min(1.0, 2 * min(below, above))),
         abs(float(np.log(max(variance, 1e-12)))),
         abs(variance - 1) >= _LEAST_VARIANCE,
@@ -369,7 +359,6 @@ def _summed(noise: _Noise, count: int) -> Array:
     terms += [
         np.append(of, 0.0) for of in (noise.follows, noise.follows * w[1:] * w[:-1])
     ]
-    return np.stack(
-        [np.bincount(noise.runs, term[: len(w)], minlength=count) for term in terms],
-        axis=1,
+    return np.column_stack(
+        [np.bincount(noise.runs, term[: len(w)], minlength=count) for term in terms]
     )

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array
 from ..estimator.models.bearing_range import wrap_angle
+from ..estimator.models.rigid_motion import rotation
 from ..estimator.support.argument_checks import as_floats, shaped
 
 
@@ -27,9 +28,7 @@ class Alignment(NamedTuple):
 
     def apply(self, positions: Array) -> Array:
         """Move positions, shape (n, 2)."""
-        cos, sin = np.cos(self.angle), np.sin(self.angle)
-        rotation = np.array([[cos, -sin], [sin, cos]])
-        return np.asarray(positions @ rotation.T + self.translation)
+        return np.asarray(positions @ rotation(self.angle).T + self.translation)
 
 
 class PositionAccuracy(NamedTuple):
@@ -259,9 +258,8 @@ def poses_at(times: ArrayLike, ground_truth: ArrayLike) -> Array:
     if not len(path):
         return np.full((len(t), 3), np.nan)
     columns = (path[:, 1], path[:, 2], _unwrapped(path[:, 3]))
-    poses = np.stack(
-        [np.interp(t, path[:, 0], c, left=np.nan, right=np.nan) for c in columns],
-        axis=1,
+    poses = np.column_stack(
+        [np.interp(t, path[:, 0], c, left=np.nan, right=np.nan) for c in columns]
     )
     poses[:, 2] = wrap_angle(poses[:, 2])
     return poses
