@@ -61,19 +61,15 @@ def estimators(*, given: Options) -> None:
     from ...estimator.peers.catalogue import list_peers
     from ...estimator.registry import find_estimator, list_estimators
 
+    keys = "name", "library", "installed", "description"
     each = [
         (name, "slamgym", True, inspect.getdoc(find_estimator(name)) or "")
         for name in list_estimators()
     ]
     each += [(p.name, p.library, p.installed, p.description) for p in list_peers()]
     rows = [
-        {
-            "name": name,
-            "library": library,
-            "installed": installed,
-            "description": description.partition("\n")[0],
-        }
-        for name, library, installed, description in each
+        dict(zip(keys, (*facts, text.partition("\n")[0]), strict=True))
+        for *facts, text in each
     ]
     _show("estimators", rows, given.reporter())
 

@@ -179,7 +179,8 @@ def _compile(estimators: str, *, identities: bool) -> None:
 # --------------------------------------------------------------------------------------
 # The clusters that may do the work of a command: Dask and Ray.
 
-_HERE = "127.0.0.1"  # what starts here listens to this machine only
+#: What starts here listens to this machine only.
+_HERE = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
 _INTERVAL = 1.0  # between looks at the workers of a local cluster [s]
 
 
@@ -222,14 +223,7 @@ def _dask_client(scheduler: str | None, jobs: int | None) -> Any:
     client: Any = distributed.Client
     if scheduler is not None:
         return client(scheduler)
-    return _with_new_workers(
-        client(
-            n_workers=jobs,
-            threads_per_worker=1,
-            host=_HERE,
-            dashboard_address=f"{_HERE}:0",
-        )
-    )
+    return _with_new_workers(client(n_workers=jobs, threads_per_worker=1, **_HERE))
 
 
 @contextlib.contextmanager

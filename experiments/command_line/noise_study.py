@@ -16,7 +16,7 @@ from ...sim_configs.scenario_files import naming_file
 from ...suggestions import closest
 from .. import figures
 from . import options, program
-from .program import Reporter
+from .program import BadInputError, Reporter
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -184,9 +184,7 @@ def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
     texts += given.option_texts or []
     labels = [options.with_options(one, texts) for one in split_labels(given.estimator)]
     if change != "all" and change not in CHANGED:
-        raise program.BadInputError(
-            unknown_choice("--change", change, ("all", *CHANGED))
-        )
+        raise BadInputError(unknown_choice("--change", change, ("all", *CHANGED)))
     places = [place for place in CHANGED if change in ("all", place)]
     study = partial(noise_effects, world, ",".join(labels), runs, seed, jobs=given.jobs)
 
@@ -245,7 +243,7 @@ def _is_scenario(source: str) -> bool:
         return True
     if Path(source).exists():
         return False
-    raise program.BadInputError(
+    raise BadInputError(
         f"no log and no scenario '{source}'{closest(source, list_presets())} "
         f"(there are {', '.join(list_presets())})"
     )
@@ -259,6 +257,4 @@ def _refuse_without_effect(context: typer.Context, *kinds: str) -> None:
             if source is not None and source.name == "COMMANDLINE":
                 option = f"--{name.strip('_').replace('_', '-')}"
                 hint = program.way_to_set(option)
-                raise program.BadInputError(
-                    f"{option} is for the noise study of {kind}{hint}"
-                )
+                raise BadInputError(f"{option} is for the noise study of {kind}{hint}")

@@ -9,7 +9,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import partial, wraps
@@ -240,12 +240,7 @@ class Options:
         from ..logs.importers import read_log
 
         try:
-            log = read_log(
-                path,
-                robot=self.robot,
-                truth=self.truth,
-                noise_from_file=self.noise_from_file,
-            )
+            log = read_log(path, **self._given("robot", "truth", "noise_from_file"))
         except OSError as error:
             why, file = error.strerror or error, error.filename or path
             hint = ""
@@ -500,10 +495,7 @@ def _refuse_log(name: str) -> None:
 
 
 def note_noise(
-    log: "SlamLog",
-    settings: "FilterSettings",
-    given: Collection[str],
-    reporter: Reporter,
+    log: "SlamLog", settings: "FilterSettings", given: set[str], reporter: Reporter
 ) -> None:
     """Note the noise of a log's filter, without what the user gave."""
     names = ("motion_std", "measurement_std", "initial_pose_std")

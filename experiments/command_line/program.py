@@ -396,7 +396,9 @@ class Reporter:
         """Print the JSON object."""
         if self._as_json:
             text = json.dumps(summary, allow_nan=False, ensure_ascii=False)
-            if not _is_encodable(text):
+            try:
+                text.encode(sys.stdout.encoding or "utf-8")
+            except UnicodeEncodeError:
                 text = json.dumps(summary, allow_nan=False)
             sys.stdout.write(text + "\n")
 
@@ -471,15 +473,6 @@ class Reporter:
 
         with on_compilation(note):
             yield
-
-
-def _is_encodable(text: str) -> bool:
-    """Return whether standard output can write a text."""
-    try:
-        text.encode(sys.stdout.encoding or "utf-8")
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 class _Rate(bars.ProgressColumn):

@@ -461,14 +461,11 @@ def _interval(row: dict[str, Any]) -> str:
 
 
 def _noise_by_name(settings: dict[str, Any]) -> dict[str, float]:
-    sigmas = ("σx", "σy", "σα", "σβ", "σr")
-    noise = dict(
-        zip(sigmas, settings["motion_std"] + settings["measurement_std"], strict=True)
-    )
-    options = settings["options"]
-    noise["σr per metre"] = options.get("range_std_per_metre", 0.0)
-    noise["σβ in metres"] = options.get("bearing_std_metres", 0.0)
-    return noise
+    from ..noise_fitting.search import ENTRIES, noise_of
+    from ..runs.filter_settings import FilterSettings
+
+    noise = noise_of(FilterSettings("", **settings)).tolist()
+    return {name: std for (name, _), std in zip(ENTRIES, noise, strict=True)}
 
 
 def _at(run: dict[str, Any], path: tuple[str, ...]) -> Any:
