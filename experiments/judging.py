@@ -374,7 +374,7 @@ def _measured(
     trace = BatchTrace(
         moved, additive, np.zeros((count, steps)), np.zeros((count, steps), np.int64)
     )
-    filtered = FilteredRuns(trace, [None] * count, failures)
+    filtered = FilteredRuns(trace, [None] * count, failures, {})
     block = measure_runs(chunk.runs, filtered, chunk.bound, chunk.noise)
     block["readings"][:] = 0  # which of them corrected anything is not known
     for run, each in enumerate(files):

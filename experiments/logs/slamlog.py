@@ -122,6 +122,12 @@ class SlamLog:
         """The scans among its events."""
         return [event for event in self.events if isinstance(event, Scan)]
 
+    @property
+    def read_ids(self) -> set[int]:
+        """The landmarks that its readings name."""
+        named = (scan.landmark_ids for scan in self.scans)
+        return {i for ids in named if ids is not None for i in ids.tolist()}
+
 
 def read_slamlog(path: str | PathLike[str]) -> SlamLog:
     """Read a log in the format ``slamlog 1``.

@@ -4,7 +4,6 @@
 `noise_of_runs` the actual noise of the runs.
 """
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
@@ -46,9 +45,21 @@ class FilteredRuns(NamedTuple):
     #: Final beliefs; None for a run that failed.
     beliefs: list[interface.Belief | None]
     #: By the index of the run.
-    failures: Mapping[int, Failure]
+    failures: dict[int, Failure]
     #: About readings without identity, by the index of the run.
-    decisions: Mapping[int, RunDecisions] = {}
+    decisions: dict[int, RunDecisions]
+
+    @classmethod
+    def unknown(cls, runs: SimulatedRuns) -> "FilteredRuns":
+        """Return those of a filter that has not run yet."""
+        count, steps, _ = runs.visible.shape
+        trace = BatchTrace(
+            np.full((count, steps, 3), np.nan),
+            np.full((count, steps, 3, 3), np.nan),
+            np.full((count, steps), np.nan),
+            np.zeros((count, steps), dtype=np.int64),
+        )
+        return cls(trace, [None] * count, {}, {})
 
 
 def filter_runs(
@@ -74,18 +85,13 @@ def filter_runs(
     refuse_large_maps(runs, first, at_once=is_batch)
     if is_batch:
         return _in_a_batch(cast(EkfSlam, first), settings, runs, threads)
-    count, steps, _ = runs.visible.shape
-    trace = _empty_trace(count, steps)
-    beliefs: list[interface.Belief | None] = []
-    failures: dict[int, Failure] = {}
-    decisions: dict[int, RunDecisions] = {}
-    for run in range(count):
-        failure = _one_by_one(settings, runs, run, trace, beliefs, decisions)
+    found = FilteredRuns.unknown(runs)
+    for run in range(len(found.beliefs)):
+        failure = _one_by_one(settings, runs, run, found)
         if failure is not None:
-            _erase(trace, run, failure.step)
-            beliefs.append(None)
-            failures[run] = failure
-    return FilteredRuns(trace, beliefs, failures, decisions)
+            _erase(found.trace, run, failure.step)
+            found.failures[run] = failure
+    return found
 
 
 def _in_a_batch(
@@ -109,12 +115,11 @@ def _in_a_batch(
     failures = {}
     for run in np.flatnonzero(~finite.all(axis=1)).tolist():
         # the single filter repeats the run, for its message
-        again = _empty_trace(*runs.visible.shape[:2])
-        found = _one_by_one(settings, runs, run, again, [], {})
+        found = _one_by_one(settings, runs, run, FilteredRuns.unknown(runs))
         failures[run] = found or Failure(int(finite[run].argmin()), _NOT_FINITE)
         _erase(trace, run, failures[run].step)
         beliefs[run] = None
-    return FilteredRuns(trace, beliefs, failures)
+    return FilteredRuns(trace, beliefs, failures, {})
 
 
 def _run(batch: BatchSlam, runs: SimulatedRuns) -> BatchTrace:
@@ -156,15 +161,10 @@ def _renamed(belief: interface.Belief, runs: SimulatedRuns) -> interface.Belief:
 
 
 def _one_by_one(
-    settings: FilterSettings,
-    runs: SimulatedRuns,
-    run: int,
-    trace: BatchTrace,
-    beliefs: list[interface.Belief | None],
-    decisions: dict[int, RunDecisions],
+    settings: FilterSettings, runs: SimulatedRuns, run: int, found: FilteredRuns
 ) -> Failure | None:
     """Filter one run, fill its row of the trace, keep final belief and decisions."""
-    step = 0
+    step, trace = 0, found.trace
     try:
         slam = settings.make(runs.initial_poses[run])
         recorder = DecisionRecorder(slam)
@@ -185,9 +185,9 @@ def _one_by_one(
         return Failure(step, f"{type(error).__name__}: {error}")
     if not _is_finite_map(belief):
         return Failure(step, _MAP_NOT_FINITE)
-    beliefs.append(belief)
+    found.beliefs[run] = belief
     if runs.true_ids is not None and (made := recorder.result()) is not None:
-        decisions[run] = made
+        found.decisions[run] = made
     return None
 
 
@@ -229,15 +229,6 @@ def _finite(trace: BatchTrace, where: Any = ...) -> BoolArray:
 
 def _is_finite_map(belief: interface.Belief) -> bool:
     return bool(np.isfinite(belief.mean).all() and np.isfinite(belief.covariance).all())
-
-
-def _empty_trace(runs: int, steps: int) -> BatchTrace:
-    return BatchTrace(
-        np.full((runs, steps, 3), np.nan),
-        np.full((runs, steps, 3, 3), np.nan),
-        np.full((runs, steps), np.nan),
-        np.zeros((runs, steps), dtype=np.int64),
-    )
 
 
 def _erase(trace: BatchTrace, run: int, step: int) -> None:

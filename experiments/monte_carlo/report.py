@@ -120,9 +120,7 @@ def headline(summary: dict[str, Any]) -> str:
     entries = summary["estimators"]
     words = [entry["verdict"] for entry in entries.values()]
     if len(entries) <= _FEW:
-        said = "; ".join(
-            f"{label} {word}" for label, word in zip(entries, words, strict=True)
-        )
+        said = "; ".join(f"{k} {entry['verdict']}" for k, entry in entries.items())
     else:
         said = f"{words.count(CONSISTENT)} of {len(words)} estimators consistent"
     return f"{summary['scenario']}: {said}"

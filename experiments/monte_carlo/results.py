@@ -16,7 +16,7 @@ import os
 import platform
 import shutil
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -115,10 +115,9 @@ def add_to_results(path: Path, added: Mapping[str, Array]) -> None:
         shutil.copyfile(path, partial)
         with netCDF4.Dataset(partial, "a") as file:
             for name, values in added.items():
-                made = file.createVariable(
-                    name, "f8", _dims(run_measures.SMALL_NOISE[name])
-                )
-                made.long_name = run_measures.SMALL_NOISE[name].meaning
+                variable = run_measures.SMALL_NOISE[name]
+                made = file.createVariable(name, variable.kind, _dims(variable))
+                made.long_name = variable.meaning
                 made[:] = values
 
 
@@ -198,12 +197,7 @@ def provenance(command: str) -> dict[str, str]:
     return {"versions": json.dumps(found), "command": command, "comment": _FROM_TRUTH}
 
 
-def _fill(
-    arrays: MutableMapping[str, Any] | Mapping[str, Any],
-    job: Job,
-    blocks: Blocks,
-    runs: range,
-) -> None:
+def _fill(arrays: Mapping[str, Any], job: Job, blocks: Blocks, runs: range) -> None:
     variables = job.variables
     for span, parts in blocks:
         rows = slice(span.start - runs.start, span.stop - runs.start)
@@ -292,10 +286,7 @@ class BlockFolder(NamedTuple):
             file = self._files_from(runs.start)[-1]  # the longest
             with np.load(file, allow_pickle=False) as arrays:
                 parts = [
-                    {
-                        name: arrays[f"{number}/{name}"][: len(runs)]
-                        for name in job.variables
-                    }
+                    {k: arrays[f"{number}/{k}"][: len(runs)] for k in job.variables}
                     for number in range(len(job.estimators))
                 ]
             yield runs, parts

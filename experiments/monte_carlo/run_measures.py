@@ -444,20 +444,14 @@ def with_known_ids(
         Path errors (B,) [m], and the NEES of the pose (B, T) in both frames; nan in
         runs that fail.
     """
-    options = {k: v for k, v in settings.options.items() if k != "management"}
-    plain = replace(settings, options=options)
+    plain = settings.unmanaged()
     trace = filter_runs(plain, runs.identified(), threads=threads).trace
     gaps = trace.poses[:, :, :2] - runs.true_poses[:, :, :2]
     errors = np.sqrt((gaps**2).sum(axis=2).mean(axis=1))
     posed = runs.true_poses, trace.poses, trace.pose_covariances
     with np.errstate(all="ignore"):  # a diverged run may overflow
         scores = {
-            f"{KNOWN_IDS_NEES}_{frame}": np.array(
-                [
-                    nees.pose_nees(*of_run, frame=frame)
-                    for of_run in zip(*posed, strict=True)
-                ]
-            )
+            f"{KNOWN_IDS_NEES}_{frame}": nees.pose_nees(*posed, frame=frame)
             for frame in ERROR_FRAMES
         }
     return {KNOWN_IDS_ATE: errors, **scores}

@@ -587,12 +587,9 @@ def scores_of(dataset: xr.Dataset, label: str, frame: ErrorFrame) -> EstimatorSc
     flagged = results["failed"].values.astype(bool)
     good = ~(flagged | gaps.any(axis=1))
     at = np.where(flagged, results["failed_at"].values, gaps.argmax(axis=1))
+    runs, messages = dataset["run"].values, results["message"].values
     failures = [
-        FailedRun(
-            int(dataset["run"].values[row]),
-            int(at[row]),
-            str(results["message"].values[row]) or _NO_MESSAGE,
-        )
+        FailedRun(int(runs[row]), int(at[row]), str(messages[row]) or _NO_MESSAGE)
         for row in np.flatnonzero(~good)
     ]
     return EstimatorScores(label, first, good, tuple(failures), results)

@@ -167,8 +167,7 @@ def _fit_known(
 
 def _filter(log: slamlog.SlamLog, settings: FilterSettings) -> EkfSlam:
     """Return the filter at the start of the log, without landmark management."""
-    options = {k: v for k, v in settings.options.items() if k != "management"}
-    slam = replace(settings, options=options).make(log.start)
+    slam = settings.unmanaged().make(log.start)
     if not (isinstance(slam, EkfSlam) and can_batch(slam)):
         raise ValueError(
             f"the noise cannot be fitted with '{settings.estimator}': take a filter "

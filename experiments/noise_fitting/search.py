@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -155,13 +156,8 @@ def _in_metres(smooth: LogLikelihood, found: _Fit) -> _Fit:
 
 def _coarse_start(likelihood: LogLikelihood, start: Array, chosen: BoolArray) -> _Fit:
     """Return the most likely of some multiples of motion and of sensor noise."""
-    tried = np.array(
-        [
-            np.concatenate([start[:3] * a, start[3:] * b])
-            for a in FACTORS
-            for b in FACTORS
-        ]
-    )
+    factors = np.array(list(product(FACTORS, FACTORS)))
+    tried = start * np.repeat(factors, (3, len(start) - 3), axis=1)
     values = scoring.totals(likelihood.of(tried))
     if not np.isfinite(values).any():
         raise np.linalg.LinAlgError("the fit diverges: no noise explains the readings")
@@ -281,14 +277,8 @@ SMALL = 0.1  # share of its neighbours at which the search for a zero begins
 def noise_of(settings: FilterSettings) -> Array:
     """Return the noise of settings, shape (7,)."""
     options = settings.options
-    return np.array(
-        [
-            *settings.motion_std,
-            *settings.measurement_std,
-            options.get("range_std_per_metre", 0.0),
-            options.get("bearing_std_metres", 0.0),
-        ]
-    )
+    more = (options.get(k, 0.0) for k in ("range_std_per_metre", "bearing_std_metres"))
+    return np.array([*settings.motion_std, *settings.measurement_std, *more])
 
 
 def with_noise(settings: FilterSettings, noise: Array) -> FilterSettings:

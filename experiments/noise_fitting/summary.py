@@ -16,7 +16,7 @@ from ..runs.filter_settings import FilterSettings
 from ..runs.log_replay import Progress, replay
 from ..runs.summary import settings_table, summarise
 from ..runs.trace import finite
-from .fit import FACTORS, GATE_PROBABILITY, Fitted, NoiseFit, Whiteness
+from .fit import FACTORS, GATE_PROBABILITY, Fitted, NoiseFit
 
 STAGES = ("before", "fitted", "suggested")
 COMPARED = ("nis", "nees", "ate", "landmark_rmse", "readings")
@@ -107,9 +107,8 @@ def _of_the_readings(fit: NoiseFit, settings: FilterSettings) -> FilterSettings:
     """Leave out landmark management if the log has its associations."""
     if not fit.is_associated:
         return settings
-    options = {k: v for k, v in settings.options.items() if k != "management"}
-    gate = {"gate_probability": GATE_PROBABILITY}
-    return replace(settings, options=gate | options)
+    plain, gate = settings.unmanaged(), {"gate_probability": GATE_PROBABILITY}
+    return replace(plain, options={**gate, **plain.options})
 
 
 BAND = 1.96
@@ -134,22 +133,15 @@ def noise_fit_figure(fit: NoiseFit) -> Figure:
     axes = figure.subplots(2, len(stages), sharex=True, sharey=True, squeeze=False)
     for column, (name, stage) in enumerate(stages):
         for row, what in enumerate(("bearing", "range")):
-            _draw(
-                axes[row, column],
-                f"{what}, {name}",
-                fit.reading_times,
-                stage.innovations[:, row],
-                stage.whiteness[row],
-            )
+            _draw(axes[row, column], f"{what}, {name}", fit.reading_times, stage, row)
         axes[1, column].set_xlabel("time")
     for row in range(2):
         axes[row, 0].set_ylabel("innovation [σ]")
     return figure
 
 
-def _draw(
-    axes: Axes, title: str, times: Array, innovations: Array, white: Whiteness
-) -> None:
+def _draw(axes: Axes, title: str, times: Array, stage: Fitted, row: int) -> None:
+    innovations, white = stage.innovations[:, row], stage.whiteness[row]
     dress(axes)
     axes.axhspan(-BAND, BAND, color=TEAL, alpha=0.18, lw=0)
     known = np.isfinite(innovations)

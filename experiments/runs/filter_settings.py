@@ -124,6 +124,11 @@ class FilterSettings:
             self, motion_std=tuple(scaled[:3]), measurement_std=tuple(scaled[3:])
         )
 
+    def unmanaged(self) -> FilterSettings:
+        """Return the settings of the same filter without landmark management."""
+        options = {k: v for k, v in self.options.items() if k != "management"}
+        return replace(self, options=options)
+
 
 def settings_for(
     log: SlamLog,
@@ -449,9 +454,7 @@ def refuse_large_map(log: SlamLog, estimator: interface.SlamEstimator) -> None:
     MemoryError
         With the required and the available memory.
     """
-    named = [scan.landmark_ids for scan in log.scans if scan.landmark_ids is not None]
-    if named:
-        landmarks = len(np.unique(np.concatenate(named)))
+    if landmarks := len(log.read_ids):
         what = f"a map of the {landmarks} landmarks that {log.name} reads"
         _refuse_maps([landmarks], estimator, what, "take fewer steps, or landmarks")
 

@@ -8,7 +8,6 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
 from typing import Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
@@ -205,7 +204,7 @@ def _truth_source(
     landmarks = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
     if poses is None or not np.isfinite(poses).all():
         return _unwatched
-    if not landmarks.keys() >= set(chain(*(_ids(scan) or () for scan in log.scans))):
+    if not landmarks.keys() >= log.read_ids:
         return _unwatched
     return lambda step: estimator.observe_truth(poses[step], landmarks)
 
@@ -317,6 +316,7 @@ class RunRecorder:
         """Return the trace of the run; identities are those of its own landmarks."""
         belief = self.belief
         first = [self._first[i] for i in belief.landmark_ids]
+        covariances = np.array([P for _, P in first]).reshape(-1, 2, 2)
         first_covariance = self._first_covariance
         if first_covariance is None:
             first_covariance = self._covariances[_UPDATED, 0]
@@ -335,9 +335,7 @@ class RunRecorder:
             landmark_ids=np.array(belief.landmark_ids, dtype=np.int64),
             landmarks=belief.landmarks,
             first_landmarks=np.array([mean for mean, _ in first]).reshape(-1, 2),
-            first_landmark_covariances=np.array([P for _, P in first]).reshape(
-                -1, 2, 2
-            ),
+            first_landmark_covariances=covariances,
             landmark_history=self._history,
             true_landmarks=ground_truth.true_landmarks_of(
                 log, belief.landmark_ids, belief.landmarks, identities

@@ -19,7 +19,7 @@ from ...evaluation.association_scores import oracle_errors, places_of
 from ...evaluation.hypothesis_tests import chi_square_quantile
 from ...evaluation.trajectory_error import PositionAccuracy, position_accuracy
 from ..logs import ground_truth
-from ..logs.slamlog import Scan, SlamLog
+from ..logs.slamlog import SlamLog
 from .filter_settings import FilterSettings
 from .log_replay import Replay
 from .trace import RunTrace, TrueLandmarks, compare_association, finite
@@ -140,14 +140,8 @@ def never_placed(replay: Replay) -> list[int]:
     """List the landmarks that the readings of a log name, but the map never held."""
     if ground_truth.hides_identities(replay.log):
         return []
-    named = {
-        number
-        for scan in replay.log.scans
-        if scan.landmark_ids is not None
-        for number in scan.landmark_ids.tolist()
-    }
     held = {*replay.last_seen, *replay.trace.landmark_ids.tolist()}
-    return sorted(named - held)
+    return sorted(replay.log.read_ids - held)
 
 
 def landmark_table(trace: RunTrace) -> list[dict[str, Any]]:
@@ -166,9 +160,7 @@ def landmark_table(trace: RunTrace) -> list[dict[str, Any]]:
     """
     truth = trace.true_landmarks
     errors = trace.landmarks - (np.nan if truth is None else truth)
-    squared = nees.normalised_squared_error(
-        np.asarray(errors), np.asarray(trace.landmark_covariances)
-    )
+    squared = nees.normalised_squared_error(errors, trace.landmark_covariances)
     return [
         {
             "id": landmark_id,
@@ -256,10 +248,7 @@ def pose_nees(trace: RunTrace) -> Array:
         return np.full(len(trace.t), np.nan)
     with np.errstate(invalid="ignore"):  # nan if the truth is unknown
         return nees.pose_nees(
-            np.asarray(trace.true_poses, dtype=np.float64),
-            np.asarray(trace.poses, dtype=np.float64),
-            np.asarray(trace.pose_covariances, dtype=np.float64),
-            frame=trace.frame,
+            trace.true_poses, trace.poses, trace.pose_covariances, frame=trace.frame
         )
 
 
@@ -422,7 +411,7 @@ def abandoned_landmarks(replay: Replay) -> int:
     identities, or the sensor is another, no landmark is.
     """
     log, trace = replay.log, replay.trace
-    scans = [event for event in log.events if isinstance(event, Scan)]
+    scans = log.scans
     if not scans or not ground_truth.hides_identities(log) or "sensor" in log.header:
         return 0
     bearings, ranges = np.concatenate([scan.measurements for scan in scans]).T

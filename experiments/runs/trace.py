@@ -273,13 +273,8 @@ def compare_association(
         identities = run.identities()
     else:
         rows = mutual_nearest(truth.positions, landmarks)
-        identities = dict(
-            zip(
-                landmark_ids,
-                np.append(truth.ids, NO_LANDMARK)[rows].tolist(),
-                strict=True,
-            )
-        )
+        nearest = np.append(truth.ids, NO_LANDMARK)[rows].tolist()
+        identities = dict(zip(landmark_ids, nearest, strict=True))
     there, of = truth.positions[is_known], place[is_known]
     moved = alignment(identities, truth, landmark_ids, landmarks)
     return RunAssociation(
