@@ -311,12 +311,9 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         self.task = ActiveSlamTask(self.scenario, weights, num_envs, form)
         self.single_observation_space = self.task.observation_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
+        rows = self.scenario.landmarks.count
         self._filters = choose_filters(
-            estimator,
-            self.scenario,
-            num_envs,
-            self.scenario.landmarks.count,
-            estimator_options,
+            estimator, self.scenario, num_envs, rows, estimator_options
         )
         self._explorers = Explorers(self._filters, self.task)
 

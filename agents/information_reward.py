@@ -202,13 +202,13 @@ class InformationReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
         collision_cost: float = 0.0,
         effort_cost: float = 0.0,
     ) -> None:
+        factors = {
+            "gain": gain,
+            "collision_cost": collision_cost,
+            "effort_cost": effort_cost,
+        }
         RecordConstructorArgs.__init__(
-            self,
-            criterion=criterion,
-            prior_std=prior_std,
-            gain=gain,
-            collision_cost=collision_cost,
-            effort_cost=effort_cost,
+            self, criterion=criterion, prior_std=prior_std, **factors
         )
         super().__init__(env)
         check_criterion(criterion)
@@ -217,11 +217,7 @@ class InformationReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
                 "env must have a BeliefObservation among its wrappers, got "
                 f"{type(env).__name__}"
             )
-        for name, value in (
-            ("gain", gain),
-            ("collision_cost", collision_cost),
-            ("effort_cost", effort_cost),
-        ):
+        for name, value in factors.items():
             if not 0 <= value < math.inf:
                 raise ValueError(f"{name} must be finite and >= 0, got {value!r}")
         if prior_std is not None and not 0 < prior_std < math.inf:

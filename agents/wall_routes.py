@@ -326,8 +326,7 @@ class CoverageGrid:
 
     def clearance(self, points: Array) -> Array:
         """Return the distance of points (…, 2) from the nearest wall, to (…) [m]."""
-        places = points[..., 0] + 1j * points[..., 1]
-        return wall_clearance(places, *self._ends.T)
+        return wall_clearance(_numbers(points), *self._ends.T)
 
 
 class AgentKnowledge(NamedTuple):

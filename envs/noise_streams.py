@@ -236,10 +236,8 @@ class PoseSensors:
     def by_name(self, readings: Array) -> dict[str, Array]:
         """Return readings (…, 3) as ``gps`` (…, 2) and ``compass`` (…), if present."""
         found = {"gps": readings[..., :2], "compass": readings[..., 2]}
-        here = self.std[[0, 2]] > 0
-        return {
-            k: v for (k, v), is_here in zip(found.items(), here, strict=True) if is_here
-        }
+        here = zip(found, self.std[[0, 2]] > 0, strict=True)
+        return {name: found[name] for name, is_here in here if is_here}
 
 
 def _uniform(keys: WordArray, steps: IntArray, stream: int, width: int) -> Array:

@@ -41,11 +41,9 @@ def observation_space(scenario: Scenario) -> spaces.Dict:
     lowest, highest = (np.tile(ends, (rows, 1)) for ends in _ends(scenario, longest))
     odometry = np.array(_largest_odometry(scenario))
     return spaces.Dict(
-        {
-            "landmarks": spaces.Box(lowest, highest, dtype=np.float64),
-            "mask": spaces.Box(0, 1, (rows,), dtype=np.bool_),
-            "odometry": spaces.Box(-odometry, odometry, dtype=np.float64),
-        }
+        landmarks=spaces.Box(lowest, highest, dtype=np.float64),
+        mask=spaces.Box(0, 1, (rows,), dtype=np.bool_),
+        odometry=spaces.Box(-odometry, odometry, dtype=np.float64),
     )
 
 

@@ -115,19 +115,14 @@ class EpisodeStarts:
 
 @jit_in_place
 def _draw_poses(
-    keys: WordArray,
-    steps: IntArray,
-    pose: Array,
-    std: Array,
-    drawn: Array,
-    centre: Array,
+    keys: WordArray, steps: IntArray, pose: Array, std: Array, drawn: Array, mean: Array
 ) -> None:
     """Draw poses, (K, 3), around a pose (3,) with deviations (3,), and repeat it."""
     draw_normals(keys, steps, START, drawn)
     for row in range(len(drawn)):
         for i in range(3):
             drawn[row, i] = drawn[row, i] * std[i] + pose[i]
-            centre[row, i] = pose[i]
+            mean[row, i] = pose[i]
 
 
 @jit_in_place

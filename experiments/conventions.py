@@ -57,11 +57,7 @@ class _Fit(NamedTuple):
 
 
 def mistake_in(
-    truth: Array,
-    poses: Array,
-    covariances: Array,
-    starts: Array,
-    frame: str = "additive",
+    truth: Array, poses: Array, claims: Array, starts: Array, frame: str = "additive"
 ) -> str:
     """Return the convention that poses of B drives break as a sentence; empty if none.
 
@@ -69,8 +65,8 @@ def mistake_in(
     ----------
     truth, poses : ndarray, shape (B, T, 3)
         True and estimated (x, y, θ) [m, m, rad], as in the file.
-    covariances : ndarray, shape (B, T, 3, 3)
-        Of the estimates, as in the file.
+    claims : ndarray, shape (B, T, 3, 3)
+        Covariances of the estimates, as in the file.
     starts : ndarray, shape (B, 3)
         Poses at which the drives start according to their files.
     frame : {"additive", "invariant", "left"}
@@ -96,19 +92,19 @@ def mistake_in(
 
     def at(shift: int) -> tuple[Array, Array]:
         taken = np.ix_(drives, steps + shift)
-        return poses[taken], covariances[taken]
+        return poses[taken], claims[taken]
 
     exact = truth[np.ix_(drives, steps)]
     shifts = [shift for shift in range(-reach, reach + 1) if shift]
     by_pose = list(_pose_readings(*at(0), starts[drives], {k: at(k) for k in shifts}))
     read = [list(_readings(*each, frame)) for each in by_pose]
-    (declared, *claims), others = read[0], read[1:]
+    (declared, *its_own), others = read[0], read[1:]
     before = _fit(exact, declared)
     if before.is_honest:
         return ""
     found = None
     if len(drives) >= FEWEST_DRIVES:
-        groups = claims, [r for own in others for r in own[:2]]
+        groups = its_own, [r for own in others for r in own[:2]]
         both = [r for own in others if _gain(exact, own[0], before) for r in own[2:]]
         for group in (*groups, both):
             found = found or _honest(exact, group, before)

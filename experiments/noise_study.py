@@ -31,15 +31,13 @@ from .figures.style import GREY, INK, dress, legend, new_figure, write_title
 from .logs.ground_truth import path_accuracy
 from .logs.slamlog import SlamLog
 from .runs.filter_settings import SIGMAS, FilterSettings, settings_for
-from .runs.log_replay import Replay, replay
+from .runs.log_replay import Progress, Replay, replay
 from .runs.summary import map_accuracy, nees_summary, nis_summary, rmse_table
 from .runs.trace import RunTrace, finite, mean, root_mean_square, standard_error
 
 if TYPE_CHECKING:
     from .monte_carlo.figures import EstimatorLook
     from .monte_carlo.verdict import EstimatorScores
-
-Progress = Callable[[int, int], object]
 
 _UNITS = dict(zip(SIGMAS, ("m", "m", "rad", "rad", "m"), strict=True))
 
@@ -227,7 +225,7 @@ def noise_effects(
     changed: Iterable[Changed] = CHANGED,
     jobs: int | None = None,
     backend: str | None = None,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> list[NoiseEffect]:
     """Run a Monte Carlo for each change of each noise, all on the same random numbers.
 

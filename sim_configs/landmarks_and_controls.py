@@ -258,6 +258,9 @@ def possible_positions(layout: LandmarkLayout) -> Array:
 
 # --------------------------------------------------------------------------------------
 # Control sequences.
+#
+# Their ``cycle(dt)`` computes one cycle for steps of dt [s]: commands (d, α) [m, rad],
+# one row per step, shape (K, 2).
 
 
 class CommandSequence(Part):
@@ -284,7 +287,14 @@ class SquareSequence(Part):
     turn_steps: Count = Field(description="steps of each quarter turn")
 
     def cycle(self, dt: float) -> Array:
-        """Drive the four sides."""
+        """Drive the four sides.
+
+        Examples
+        --------
+        >>> square = SquareSequence(side=4.0, speed=1.0, turn_steps=1)
+        >>> square.cycle(dt=2.0)[:3].round(4).tolist()
+        [[2.0, 0.0], [2.0, 0.0], [0.0, 1.5708]]
+        """
         steps = _steps(self.side, self.speed * dt)
         _steps(self.turn_steps, 1.0)  # checks the length
         straight = np.tile([self.side / steps, 0.0], (steps, 1))
@@ -391,30 +401,6 @@ ControlSequence = Annotated[
     | BlocksSequence,
     Field(discriminator="sequence"),
 ]
-
-
-def command_cycle(controls: ControlSequence, dt: float) -> Array:
-    """Compute one cycle of a control sequence.
-
-    Parameters
-    ----------
-    controls : ControlSequence
-        The `controls` of a scenario.
-    dt : float
-        Duration of one step [s].
-
-    Returns
-    -------
-    ndarray of float64, shape (K, 2)
-        Commands (d, α) [m, rad], one row per step.
-
-    Examples
-    --------
-    >>> square = SquareSequence(side=4.0, speed=1.0, turn_steps=1)
-    >>> command_cycle(square, dt=2.0)[:3].round(4).tolist()
-    [[2.0, 0.0], [2.0, 0.0], [0.0, 1.5708]]
-    """
-    return controls.cycle(dt)
 
 
 def _circle(radius: float, longest_step: float) -> Array:

@@ -47,7 +47,6 @@ from .landmarks_and_controls import (
     CircleSequence,
     ControlSequence,
     LandmarkLayout,
-    command_cycle,
     place_landmarks,
 )
 
@@ -448,7 +447,7 @@ class Scenario(Part):
                 )
 
     def _broken_limits(self) -> Iterator[str]:
-        fastest = np.abs(command_cycle(self.controls, self.dt)).max(axis=0) / self.dt
+        fastest = np.abs(self.controls.cycle(self.dt)).max(axis=0) / self.dt
         for name, unit, asked in zip(
             ("max_speed", "max_turn_rate"), ("m/s", "rad/s"), fastest, strict=True
         ):
@@ -470,7 +469,7 @@ class Scenario(Part):
             if getattr(faults, name) and (kinds not in kind or ":" in kind):
                 yield f"faults.{name} must be 0 with sensor.kind = '{kind}'"
         if drive == "bicycle":
-            distances, turns = np.abs(command_cycle(self.controls, self.dt)).T
+            distances, turns = np.abs(self.controls.cycle(self.dt)).T
             most = distances * largest_curvature(self.robot)
             if (turns > most * (1 + 1e-9)).any():
                 worst = int(np.argmax(turns - most))
@@ -591,7 +590,7 @@ def action_sequence(scenario: Scenario) -> Array:
     >>> action_sequence(load_scenario("six_landmarks")).shape
     (29, 2)
     """
-    cycle = command_cycle(scenario.controls, scenario.dt) / scenario.dt
+    cycle = scenario.controls.cycle(scenario.dt) / scenario.dt
     return np.resize(cycle, (scenario.steps, 2))
 
 

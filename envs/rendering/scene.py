@@ -254,11 +254,7 @@ def add_moving(axes: Axes, radius: float) -> MovingArtists:
 
     moving = MovingArtists(
         view=Polygon(
-            NO_POINT,
-            fc=(*to_rgba(RAY)[:3], 0.07),
-            ec=RAY,
-            lw=0.6,
-            label="field of view",
+            NO_POINT, fc=to_rgba(RAY, 0.07), ec=RAY, lw=0.6, label="field of view"
         ),
         rays=LineCollection([], colors=RAY, linewidths=0.9, alpha=0.6),
         readings=_points("o", RAY, "reading"),

@@ -93,12 +93,7 @@ def _write_gif(frames: Iterator[ImageArray], path: Path, fps: float) -> None:
         for frame in chain([first], frames)
     )
     next(images).save(
-        path,
-        format="GIF",
-        save_all=True,
-        append_images=images,
-        duration=1000 / fps,
-        loop=0,
+        path, save_all=True, append_images=images, duration=1000 / fps, loop=0
     )
 
 

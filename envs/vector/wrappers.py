@@ -208,9 +208,6 @@ def _common(options: list[Info]) -> Info | None:
     return options[0] or None
 
 
-Infos = dict[str, Any]
-
-
 class FlattenBatch(VectorWrapper):  # with type parameters since Gymnasium 1.4 only
     """Concatenates the arrays of every world's observation to (B, D) numbers.
 
@@ -246,14 +243,14 @@ class FlattenBatch(VectorWrapper):  # with type parameters since Gymnasium 1.4 o
         self.observation_space = batch_space(flat, env.num_envs)
         self._dtype = flat.dtype
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Array, Infos]:
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Array, Info]:
         """Start episodes in the wrapped environment."""
         observations, infos = self.env.reset(seed=seed, options=options)
         return self._flatten(observations), infos
 
     def step(
         self, actions: AnyArray
-    ) -> tuple[Array, AnyArray, AnyArray, AnyArray, Infos]:
+    ) -> tuple[Array, AnyArray, AnyArray, AnyArray, Info]:
         """Take a step in every world."""
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         if "final_obs" in infos:

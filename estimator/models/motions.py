@@ -140,7 +140,7 @@ def differential(track_width: float) -> Motion:
     >>> [round(float(part), 6) for part in differential(0.5).displacement(1.0, 1.0)]
     [1.0, 0.0, 0.0]
     """  # noqa: E501 (an equation)
-    width = _length("track_width", track_width)
+    width = argument_checks.above("track_width", track_width, 0.0)
     name = f"differential[track_width={width!r}]"
     return Motion(name, ("left", "right"), ("m", "m"), _Differential(width))
 
@@ -172,7 +172,7 @@ def bicycle(wheelbase: float, reference: tuple[float, float] = (0.0, 0.0)) -> Mo
     >>> [round(float(part), 6) for part in bicycle(2.0).displacement(1.0, 0.0)]
     [1.0, 0.0, 0.0]
     """
-    length = _length("wheelbase", wheelbase)
+    length = argument_checks.above("wheelbase", wheelbase, 0.0)
     a, b = argument_checks.pair("reference", reference)
     where = f", reference=[{a!r}, {b!r}]" if a or b else ""
     name = f"bicycle[wheelbase={length!r}{where}]"
@@ -204,10 +204,6 @@ def _arc(distance: Real, turn: Real) -> tuple[Real, Real, Real]:
     """Return the displacement along an arc of this length and angle."""
     chord = distance * np.sinc(turn / (2 * np.pi))
     return chord * np.cos(turn / 2), chord * np.sin(turn / 2), turn
-
-
-def _length(name: str, value: float) -> float:
-    return argument_checks.above(name, value, 0.0)
 
 
 #: The shipped drives by name: functions of their lengths.

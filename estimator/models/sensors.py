@@ -34,6 +34,7 @@ from ...suggestions import closest, imported
 from ..support import argument_checks
 from . import bearing_range
 from .bearing_range import LandmarkLocation, MeasurementPrediction, wrap_angle_jit
+from .rigid_motion import rotation
 
 Real = Any  # a number, or an array of any shape
 Numbers = tuple[Real, Real]
@@ -221,7 +222,7 @@ class Sensor:
         MeasurementPrediction
             Readings (m, 2), not wrapped, and the Jacobians (m, 2, 3) and (m, 2, 2).
         """
-        R = _rotation(pose[2])
+        R = rotation(pose[2])
         x, y = ((landmarks - pose[:2]) @ R).T
         D, measurement = self.slopes(x, y), self.read(x, y)
         by_landmark = D @ R.T
@@ -233,7 +234,7 @@ class Sensor:
         """Place each landmark by its reading, a row of (m, 2), from a pose (3,)."""
         if self.inverse is None:
             raise ValueError(f"one reading of {self.name} does not locate a landmark")
-        R, z = _rotation(pose[2]), readings.T
+        R, z = rotation(pose[2]), readings.T
         x, y = self.inverse(z[0], z[1])
         offset = np.stack([x, y], axis=1) @ R.T
         by_pose = np.tile(np.eye(2, 3), (len(readings), 1, 1))
@@ -275,11 +276,6 @@ class Sensor:
         if SENSORS.get(self.name) != self:
             return super().__reduce__()
         return _shipped, (self.name, *(getattr(self, name) for name in NUMBERS))
-
-
-def _rotation(angle: float) -> Array:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.array([[cos, -sin], [sin, cos]])
 
 
 # --------------------------------------------------------------------------------------

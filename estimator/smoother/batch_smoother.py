@@ -35,13 +35,14 @@ from .optimiser import (
 from .reassociation import Reassociation, reassociate
 
 ITERATIONS = 5  # of an update of the filter that gives the second start
+Start = ArrayLike | Belief  # poses, or the belief of a filter at the end
 SCALES = {"huber": 1.345, "cauchy": 2.3849}  # 95 % efficient without outliers
 
 
 def smooth(
     drive: Drive,
     *,
-    start: ArrayLike | Belief | None = None,
+    start: Start | None = None,
     landmarks: Mapping[int, ArrayLike] | None = None,
     robust: str | None = None,
     robust_scale: float | None = None,
@@ -142,8 +143,8 @@ def robust_kernel(robust: str | None, scale: float | None) -> tuple[float, float
 
 
 def _placed(
-    drive: Drive, start: ArrayLike | Belief | None, given: Mapping[int, ArrayLike]
-) -> tuple[Drive, ArrayLike | Belief, dict[int, ArrayLike]]:
+    drive: Drive, start: Start | None, given: Mapping[int, ArrayLike]
+) -> tuple[Drive, Start, dict[int, ArrayLike]]:
     """Return a drive without landmarks that a filter cannot place, and the others.
 
     For a sensor whose single reading does not determine a landmark.
@@ -201,10 +202,7 @@ def _places(landmarks: Mapping[int, ArrayLike], order: IntArray) -> dict[int, Ar
 
 
 def _starts(
-    drive: Drive,
-    start: ArrayLike | Belief | None,
-    given: Mapping[int, Array],
-    order: IntArray,
+    drive: Drive, start: Start | None, given: Mapping[int, Array], order: IntArray
 ) -> list[Callable[[], Estimate]]:
     """Return functions that compute poses and landmarks to start from, best first."""
 
@@ -277,11 +275,7 @@ class SmoothedDrive:
     """
 
     def __init__(
-        self,
-        optimiser: Optimiser,
-        solution: Solution,
-        order: Sequence[int],
-        drive: Drive,
+        self, optimiser: Optimiser, solution: Solution, order: list[int], drive: Drive
     ) -> None:
         estimate = solution.estimate
         #: Half the sum of the squared, normalised residuals; of a robust kernel, ρ.

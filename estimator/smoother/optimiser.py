@@ -72,9 +72,8 @@ class Solution(NamedTuple):
 
 
 class Minimum(NamedTuple):
-    """A solution with the system linearised there."""
+    """The system of a solution, linearised there."""
 
-    solution: Solution
     elimination: elimination.Elimination
     information: Array  # of the landmarks, shape (2n, 2n)
 
@@ -187,10 +186,10 @@ class Optimiser:
         return is_found
 
     def linearised(self, solution: Solution) -> Minimum:
-        """Return a solution with its system, which the next call overwrites."""
+        """Return the system of a solution, which the next call overwrites."""
         stds = self.reading_stds(solution.estimate)
         information = self.linearise(solution.estimate, stds)
-        return Minimum(solution, self._room, information)
+        return Minimum(self._room, information)
 
     def reading_stds(self, estimate: Estimate) -> Array:
         """Return (σβ, σr) of each reading, shape (M, 2), at its expected range."""

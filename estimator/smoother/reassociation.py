@@ -391,9 +391,8 @@ class _Search:
         P = state.covariance[np.ix_(entries, entries)]
         places = TwoPlaces(state.places[late], state.places[early], P, LARGEST_TURN)
         squared = _offsets(state.places[rows], P)[0][: len(late), len(late) :]
-        squared[self.together(state.labels, len(state.places))[np.ix_(late, early)]] = (
-            np.inf
-        )
+        together = self.together(state.labels, len(state.places))
+        squared[together[np.ix_(late, early)]] = np.inf
         nearest = np.argsort(squared, axis=None)[: constellations.LARGEST_GRAPH]
         nearest = np.sort(nearest[np.isfinite(squared.ravel()[nearest])])
         pairs = np.column_stack(np.unravel_index(nearest, squared.shape))

@@ -302,16 +302,10 @@ class MapPicture:
         artists, trace = self._artists, self._trace
         steps = np.append(np.arange(0, step, self.stride), step)
         artists.path.set_data(*trace.poses[: step + 1, :2].T)
-        scene.set_ellipses(
-            artists.predicted,
-            trace.predicted_poses[steps, :2],
-            trace.predicted_pose_covariances[steps, :2, :2],
-        )
-        scene.set_ellipses(
-            artists.updated,
-            trace.poses[steps, :2],
-            trace.pose_covariances[steps, :2, :2],
-        )
+        prior, P = trace.predicted_poses[steps], trace.predicted_pose_covariances[steps]
+        scene.set_ellipses(artists.predicted, prior[:, :2], P[:, :2, :2])
+        poses, P = trace.poses[steps], trace.pose_covariances[steps]
+        scene.set_ellipses(artists.updated, poses[:, :2], P[:, :2, :2])
         (left, right), (low, high) = self._axes.get_xlim(), self._axes.get_ylim()
         size = 0.018 * max(right - left, high - low)
         artists.robot.set_xy(scene.arrow_at(trace.poses[step], size))
@@ -327,11 +321,8 @@ class MapPicture:
     def _show_landmarks(self, step: int) -> None:
         artists, trace = self._artists, self._trace
         seen = self._first_steps <= step
-        scene.set_ellipses(
-            artists.first,
-            trace.first_landmarks[seen],
-            trace.first_landmark_covariances[seen],
-        )
+        means, P = trace.first_landmarks[seen], trace.first_landmark_covariances[seen]
+        scene.set_ellipses(artists.first, means, P)
         now = trace.map_at(step)
         scene.set_ellipses(artists.later, now.means, now.covariances)
         artists.estimates.set_data(*now.means.T)
@@ -492,11 +483,9 @@ def smoothed_figure(smoothed: SmoothedLog) -> Figure:
     figure = style.new_figure(7.2, 6.2 * height / width + 1.6)
     axes = figure.add_subplot()
     style.dress_map(axes, limits)
+    name = f"filter: {trace.estimator}"
     (filtered,) = axes.plot(
-        *trace.poses[:, :2].T,
-        color=style.ORANGE,
-        lw=1.0,
-        label=f"filter: {trace.estimator}",
+        *trace.poses[:, :2].T, color=style.ORANGE, lw=1.0, label=name
     )
     (path,) = axes.plot(
         *smoothed.poses[:, :2].T, color=style.BLUE, lw=1.4, label="smoother"

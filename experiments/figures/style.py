@@ -154,14 +154,15 @@ def deviations(covariances: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
 
+_Place = Literal["outside lower center", "outside upper left"]
+
+
 def legend(
     figure: Figure,
     keys: Sequence[Artist],
     columns: int,
     *,
-    place: Literal["outside lower center", "outside upper left"] = (
-        "outside lower center"
-    ),
+    place: _Place = "outside lower center",
     size: float = 9.0,
 ) -> None:
     """Put a legend of lines and ellipses outside the axes, by default below."""

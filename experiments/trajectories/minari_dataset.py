@@ -100,11 +100,7 @@ def _common_space(scenarios: Sequence[Scenario]) -> spaces.Dict:
         return spaces.Box(low, high, dtype=np.float64)
 
     return spaces.Dict(
-        {
-            "landmarks": box("landmarks"),
-            "mask": each[0]["mask"],
-            "odometry": box("odometry"),
-        }
+        landmarks=box("landmarks"), mask=each[0]["mask"], odometry=box("odometry")
     )
 
 

@@ -86,7 +86,7 @@ def write_rerun(
         steps = shown_steps([run.frames for run in runs])
         for number, run in enumerate(runs):
             colour = _COLOURS[number % len(_COLOURS)]
-            _Writer(rerun, recording, scans, run, colour).write(steps)
+            _Writer(recording, scans, run, colour).write(steps)
         recording.flush()
         recording.disconnect()
 
@@ -110,16 +110,11 @@ class _Writer:
     """Log one filter's run."""
 
     def __init__(
-        self,
-        rerun: Any,
-        recording: Any,
-        scans: Sequence[Array | None],
-        run: ViewedRun,
-        colour: Any,
+        self, recording: Any, scans: Sequence[Array | None], run: ViewedRun, colour: Any
     ) -> None:
-        self._rerun, self._recording, self._run = rerun, recording, run
+        self._rerun, self._recording, self._run = import_rerun(), recording, run
         self._scans, self._colour, self._log = scans, colour, recording.log
-        self._name = rerun.escape_entity_path_part(run.trace.estimator)
+        self._name = self._rerun.escape_entity_path_part(run.trace.estimator)
 
     def write(self, steps: Sequence[int]) -> None:
         """Log the kept steps."""

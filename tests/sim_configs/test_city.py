@@ -5,11 +5,7 @@ import pytest
 
 from slamgym.envs.controllers import planned_path
 from slamgym.sim_configs import ScenarioError, load_scenario, place_landmarks
-from slamgym.sim_configs.landmarks_and_controls import (
-    BlocksSequence,
-    StreetsLayout,
-    command_cycle,
-)
+from slamgym.sim_configs.landmarks_and_controls import BlocksSequence, StreetsLayout
 
 CITY = StreetsLayout(
     columns=3, rows=2, side=10.0, width=4.0, per_front=2, origin=(100.0, 50.0)
@@ -25,7 +21,7 @@ def crossings():
     """Where the drive is after each of its sides."""
     x = y = heading = 0.0
     path = [(0.0, 0.0)]
-    for distance, turn in command_cycle(DRIVE, 1.0):
+    for distance, turn in DRIVE.cycle(1.0):
         x, y = x + distance * np.cos(heading), y + distance * np.sin(heading)
         heading += turn
         path.append((x, y))
@@ -73,7 +69,7 @@ def test_the_drive_stays_on_the_streets_of_its_city():
 
 
 def test_no_step_is_longer_than_the_speed_allows():
-    distances, turns = command_cycle(DRIVE, 1.0).T
+    distances, turns = DRIVE.cycle(1.0).T
     assert distances.max() <= 0.8
     assert set(np.round(np.abs(turns), 12)) == {0.0, round(np.pi / 4, 12)}
 

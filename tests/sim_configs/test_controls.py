@@ -18,7 +18,6 @@ from slamgym.sim_configs.landmarks_and_controls import (
     FigureEightSequence,
     SpiralSequence,
     SquareSequence,
-    command_cycle,
 )
 
 CLOSED = [
@@ -50,13 +49,13 @@ def distance_of_segments(point, walls):
 
 def test_commands_are_repeated_in_order():
     controls = CommandSequence(commands=((3.0, 0.0, 2), (1.0, -0.5, 1)))
-    assert command_cycle(controls, 1.0).tolist() == [[3, 0], [3, 0], [1, -0.5]]
+    assert controls.cycle(1.0).tolist() == [[3, 0], [3, 0], [1, -0.5]]
 
 
 @pytest.mark.parametrize("controls", CLOSED, ids=lambda controls: controls.sequence)
 @pytest.mark.parametrize("dt", [0.1, 0.5, 1.0])
 def test_closed_sequences_come_home(controls, dt):
-    end = drive(command_cycle(controls, dt))[-1]
+    end = drive(controls.cycle(dt))[-1]
     assert np.allclose(end[:2], 0.0, atol=1e-9)
     assert math.remainder(end[2], 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
 
@@ -70,11 +69,11 @@ def test_no_step_is_longer_than_the_speed_allows(length, speed, dt):
         CircleSequence(radius=length, speed=speed),
         FigureEightSequence(radius=length, speed=speed),
     ):
-        assert command_cycle(controls, dt)[:, 0].max() <= speed * dt * (1 + 1e-9)
+        assert controls.cycle(dt)[:, 0].max() <= speed * dt * (1 + 1e-9)
 
 
 def test_a_square_has_sides_of_its_length_and_goes_left():
-    path = drive(command_cycle(CLOSED[0], 1.0))
+    path = drive(CLOSED[0].cycle(1.0))
     corners = path[[0, 11, 22, 33, 44], :2]
     assert np.allclose(corners, [[0, 0], [5, 0], [5, 5], [0, 5], [0, 0]])
 
@@ -82,18 +81,18 @@ def test_a_square_has_sides_of_its_length_and_goes_left():
 def test_a_side_of_whole_steps_takes_no_step_more():
     controls = SquareSequence(side=2.1, speed=0.3, turn_steps=1)
     assert 2.1 / 0.3 > 7
-    assert len(command_cycle(controls, 1.0)) == 4 * (7 + 1)
+    assert len(controls.cycle(1.0)) == 4 * (7 + 1)
 
 
 def test_a_circle_keeps_its_radius_to_the_left():
-    path = drive(command_cycle(CLOSED[1], 0.5))
+    path = drive(CLOSED[1].cycle(0.5))
     centre = path[:-1, :2].mean(axis=0)
     assert np.allclose(np.hypot(*(path[:, :2] - centre).T), 4.0)
     assert centre[1] > 0
 
 
 def test_a_figure_eight_goes_left_then_right():
-    path = drive(command_cycle(CLOSED[2], 0.5))
+    path = drive(CLOSED[2].cycle(0.5))
     half = len(path) // 2
     assert path[: half + 1, 1].min() > -1.0
     assert path[half:, 1].max() < 1.0
@@ -102,7 +101,7 @@ def test_a_figure_eight_goes_left_then_right():
 
 def test_a_spiral_widens_from_its_inner_to_its_outer_radius():
     controls = SpiralSequence(inner_radius=1.0, outer_radius=5.0, turns=2.0, speed=0.2)
-    distances, turns = command_cycle(controls, 0.5).T
+    distances, turns = controls.cycle(0.5).T
     radii = distances / turns
     assert np.allclose(distances, 0.1)
     assert radii[0] == pytest.approx(1.0)
@@ -113,7 +112,7 @@ def test_a_spiral_widens_from_its_inner_to_its_outer_radius():
 
 def test_a_spiral_grows_evenly_with_the_angle():
     controls = SpiralSequence(inner_radius=1.0, outer_radius=5.0, turns=2.0, speed=0.2)
-    distances, turns = command_cycle(controls, 0.5).T
+    distances, turns = controls.cycle(0.5).T
     turned = np.concatenate([[0.0], np.cumsum(turns)[:-1]])
     assert np.allclose(distances / turns, 1.0 + turned / math.pi)
 
