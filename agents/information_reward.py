@@ -202,7 +202,7 @@ class InformationReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
         collision_cost: float = 0.0,
         effort_cost: float = 0.0,
     ) -> None:
-        factors = {
+        factors: dict[str, Any] = {
             "gain": gain,
             "collision_cost": collision_cost,
             "effort_cost": effort_cost,
