@@ -51,9 +51,9 @@ begin no absence, since nothing is near, and for hidden landmarks that are never
 again.
 
 Something near may hide all landmarks for a few scans.  So the alarm follows g slowly,
-until g falls::
+in scans that change g by Δ, until g falls::
 
-    s ← min(g, s + (g − s) / 5)
+    s ← min(g, s + min(|Δ| / 0.3, 1) (g − s) / 5)
 
 A robot whose odometry fails where no landmark is in view for sure misses none.  Its
 readings are strange instead: they fit neither the map nor those of earlier scans.  A
@@ -122,8 +122,9 @@ HIDDEN_EACH, NO_RETURNS = 5, 100
 #: Subtracted from the root of the returns: up to nine of them prove nothing.
 LIMIT = 3.0
 
-#: A change of the evidence counts in full after about so many scans.
-SCANS = 5
+#: A change of the evidence counts in full after about so many scans with evidence,
+#: each of them of this size.
+SCANS, TELLING = 5, 0.3
 
 #: P_D of a missed landmark is the least up to this many cells beyond two σ.
 MARGIN = 0.5
@@ -175,7 +176,8 @@ class LostEvidence(NamedTuple):
         first_new = self.first_new
         if present == 0:
             first_new = max(first_new, 1 + max(mapped, default=-1))
-        lasting = min(present, self.lasting + (present - self.lasting) / SCANS)
+        share = min(abs(more) / TELLING, 1.0) / SCANS
+        lasting = min(present, self.lasting + share * (present - self.lasting))
         changed = present, lasting, max(self.largest, lasting), first_new
         return LostEvidence(*changed, *self[4:])
 

@@ -21,6 +21,7 @@ from slamgym.estimator.association.detections import (
     PROVEN,
     SCANS,
     SUREST,
+    TELLING,
     WIDEST,
     Detections,
     LostEvidence,
@@ -110,7 +111,8 @@ def plain_count(view, slots, explained, detections):
 
 def evidence_after(known, more, landmarks):
     present = max(0.0, known.present + min(more, MOST_OF_SCAN))
-    lasting = min(present, known.lasting + (present - known.lasting) / SCANS)
+    change = (present - known.lasting) * min(abs(more) / TELLING, 1) / SCANS
+    lasting = min(present, known.lasting + change)
     return known._replace(
         present=present,
         lasting=lasting,
@@ -467,6 +469,16 @@ def test_the_alarm_stays_once_the_map_is_seen_again():
     assert scores[39] == scores[-1] == 0
     assert scores[55] > LOST_SCORE
     assert detections.lost.largest == max(scores)
+
+
+def test_the_alarm_does_not_grow_in_scans_that_say_nothing():
+    evidence = LostEvidence()
+    for more in [2.0, 2.0, *[1e-4] * 60]:
+        evidence = evidence.after(more, ())
+    assert evidence.present > LOST_SCORE > 2 > evidence.largest
+    for _ in range(8):
+        evidence = evidence.after(0.4, ())
+    assert evidence.largest > LOST_SCORE
 
 
 def with_headings(stds, has_map=True):
