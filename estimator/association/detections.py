@@ -30,12 +30,13 @@ landmarks at the edge of the view count little::
 
     g ← max(0, g + min(c, Σ_seen ln ρ + Σ_missed ln (1 − ρ P_D) / (1 − P_D)))
 
-A scan adds at most c, since a single wrong pose may cause all its misses.  Three
+A scan adds at most c, since a single wrong pose may cause all its misses.  Four
 kinds of landmarks are no evidence.  If fewer than two scans have shown a landmark
 since it entered the map, it may be clutter.  If a landmark is not assigned a reading
-that may belong to it, the scan may show it.  If a landmark entered the map after the
-last scan at which g was 0, a lost filter may have mapped it a second time.  P_D
-learns the rates of a lost run, too, so g falls again: the largest evidence counts.
+that may belong to it, the scan may show it.  If the scan shows something nearer in
+its direction, this may hide it.  If a landmark entered the map after the last scan
+at which g was 0, a lost filter may have mapped it a second time.  P_D learns the
+rates of a lost run, too, so g falls again: the largest evidence counts.
 
 Misses in succession are independent in few real drives: a tree hides another one for
 as long as the robot stands.  A landmark seen again after misses of q < ε, where
@@ -126,6 +127,9 @@ LIMIT = 3.0
 #: each of them of this size.
 SCANS, TELLING = 5, 0.3
 
+#: Half the width of what may hide a landmark, beyond two σ [rad].
+SHADOW = 0.1
+
 #: P_D of a missed landmark is the least up to this many cells beyond two σ.
 MARGIN = 0.5
 
@@ -143,6 +147,13 @@ PROVEN = 2
 
 #: Bearing + π and range of a landmark, and two σ of both.
 Place = tuple[float, float, float, float]
+
+#: The landmark that each row of a scan shows, (m,), below 0: none; the landmarks that
+#: some row may belong to, (k,); and the rows (β, r), which may hide what is behind
+#: them, (p, 2).  To miss a landmark of the last two kinds is no evidence.
+Scan = tuple[IntArray, IntArray, Array]
+
+EMPTY: Scan = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2))
 
 NO_PATH = np.empty((0, 13))
 
@@ -221,8 +232,8 @@ class Detections(NamedTuple):
     >>> view = MapView(np.array([0, 0, 0, 4.5, 0.5]), 1e-6 * np.eye(5), (7,))
     >>> detections = Detections()
     >>> for slot in (0, 0, 0, -1):
-    ...     row = np.array([slot])
-    ...     cost, detections = detections.after(view, row, row[:0], longest=8.0)
+    ...     scan = np.array([slot]), *EMPTY[1:]
+    ...     cost, detections = detections.after(view, scan, longest=8.0)
     >>> share = (3 + 2 * 4 / 5) / 5  # of the cell, with that of its ring
     >>> bool(np.isclose(cost, -2 * np.log(HIDDEN + (1 - HIDDEN) * (1 - share))))
     True
@@ -243,7 +254,7 @@ class Detections(NamedTuple):
     path: Array = NO_PATH
 
     def after(
-        self, view: MapView, slots: IntArray, explained: IntArray, longest: float
+        self, view: MapView, scan: Scan, longest: float
     ) -> tuple[float, Detections]:
         """Count one scan; return the cost of the landmarks that it has missed, too.
 
@@ -251,10 +262,8 @@ class Detections(NamedTuple):
         ----------
         view : MapView
             The map before the scan.
-        slots : ndarray of int64, shape (m,)
-            Its landmarks that the rows of the scan show; below 0: none.
-        explained : ndarray of int64, shape (k,)
-            Its landmarks that some row may belong to: to miss these is no evidence.
+        scan : Scan
+            Which landmarks of the map the scan shows, and may show or hide.
         longest : float
             Longest range read so far [m].
         """
@@ -262,14 +271,14 @@ class Detections(NamedTuple):
         times = [self.shown.get(i, 0) for i in ids]
         pairs = zip(ids, times, strict=True)
         proven = [i < evidence.first_new and count >= PROVEN for i, count in pairs]
-        is_telling, scan = np.array(proven, dtype=np.bool_), (slots, explained)
+        is_telling = np.array(proven, dtype=np.bool_)
         missed = np.array([self.missed.get(i, 1.0) for i in ids])
         cost, fewer = _count(view[:2], scan, is_telling, longest, counts, missed)
         left, chances = self.missed, missed.tolist()
         if left or min(chances, default=1.0) < 1:
             left = {**left, **dict(zip(ids, chances, strict=True))}
             left = {i: chance for i, chance in left.items() if chance < 1}
-        seen = [slot for slot in slots.tolist() if slot >= 0]
+        seen = [slot for slot in scan[0].tolist() if slot >= 0]
         more = {ids[j]: times[j] + 1 for j in seen if times[j] < PROVEN}
         shown = {**self.shown, **more} if more else self.shown
         evidence = evidence.after(fewer, view.mapped)
@@ -318,16 +327,16 @@ class Detections(NamedTuple):
 
         ``prior`` is the probability that the scans before it have shown none.
         """
-        none, chance = np.zeros(0, dtype=np.int64), prior * np.ones(len(view.ids))
+        chance = prior * np.ones(len(view.ids))
         is_telling, counts = np.zeros(len(chance), dtype=np.bool_), self.detected.copy()
-        _count(view[:2], (none, none), is_telling, longest, counts, chance)
+        _count(view[:2], EMPTY, is_telling, longest, counts, chance)
         return chance
 
 
 @jit
 def _count(
     belief: tuple[Array, Array],
-    scan: tuple[IntArray, IntArray],
+    scan: Scan,
     is_telling: BoolArray,
     longest: float,
     counts: Array,
@@ -339,9 +348,8 @@ def _count(
     ----------
     belief : tuple
         Mean and covariance of the map.
-    scan : tuple
-        The landmark that each row shows (m,), below 0: none; and the landmarks (k,)
-        that some row may belong to: to miss these is no evidence.
+    scan : Scan
+        What the scan shows.
     is_telling : ndarray, shape (n,)
         Whether each landmark can be evidence.  Overwritten.
     longest : float
@@ -351,7 +359,7 @@ def _count(
     missed : ndarray, shape (n,)
         Probability of missing each landmark so often.  Updated.
     """
-    (mean, P), (slots, explained) = belief, scan
+    (mean, P), (slots, explained, readings) = belief, scan
     seen, expected, returned = counts[0], counts[1], counts[2]
     is_seen = np.zeros(len(missed), np.bool_)
     is_seen[slots[slots >= 0]] = True
@@ -385,12 +393,23 @@ def _count(
             left = missed[j] * (1 - least) if is_sure else min(missed[j], 1 - likely)
             odds = HIDDEN + (1 - HIDDEN) * left
             cost -= 2 * np.log(odds / (HIDDEN + (1 - HIDDEN) * missed[j]))
-            if is_sure and is_telling[j]:
+            if is_sure and is_telling[j] and not _is_behind(place, readings):
                 least, _ = _shares_around(shares, place, longest, MARGIN)
                 telling = 1 / (1 + hidden / max(missed[j], 1e-99))
                 fewer += telling * np.log((1 - FEWER * least) / (1 - least))
             missed[j] = left
     return cost, fewer
+
+
+@njit_internal
+def _is_behind(place: Place, readings: Array) -> bool:
+    """Return whether a nearer reading in this direction may hide a landmark."""
+    bearing, distance, turn, aside = place
+    for i in range(len(readings)):
+        gap = abs(wrap_angle_jit(bearing - np.pi - readings[i, 0]))
+        if readings[i, 1] < distance - aside and gap <= turn + SHADOW:
+            return True
+    return False
 
 
 @njit_internal

@@ -299,7 +299,8 @@ def associate(
     options = []
     known, longest = candidates.detections, candidates.density.longest
     for cost, slots in found.ranked:
-        missed, detections = known.after(view, slots, found.explained, longest)
+        scan = slots, found.explained, used
+        missed, detections = known.after(view, scan, longest)
         if policy.density is None:  # the Poisson probability of no other reading
             missed += 2 * candidates.density.per_scan
         options.append((cost + missed, partial(complete, slots, detections)))

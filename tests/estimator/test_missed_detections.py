@@ -10,6 +10,7 @@ from scipy.stats import poisson
 
 from slamgym.estimator import make_estimator
 from slamgym.estimator.association.detections import (
+    EMPTY,
     FEWER,
     HIDDEN,
     HIDDEN_EACH,
@@ -20,6 +21,7 @@ from slamgym.estimator.association.detections import (
     NO_RETURNS,
     PROVEN,
     SCANS,
+    SHADOW,
     SUREST,
     TELLING,
     WIDEST,
@@ -61,7 +63,7 @@ def shares_around(shares, middle, reach):
     return found
 
 
-def plain_count(view, slots, explained, detections):
+def plain_count(view, slots, explained, detections, readings=EMPTY[2]):
     """Return cost and counts from the dense expected readings, node by node."""
     expected, joint = predicted_readings(
         view.mean, view.covariance, np.arange(len(view.ids))
@@ -94,7 +96,10 @@ def plain_count(view, slots, explained, detections):
             continue
         found = shares_around(shares, middle, 2 * std)
         left = before * (1 - min(share for _, share in found))
-        if is_sure and is_telling and j not in explained:
+        aside = np.abs((bearing - readings[:, 0] + np.pi) % (2 * np.pi) - np.pi)
+        is_nearer = readings[:, 1] < distance - 2 * std[1]
+        is_hidden = (is_nearer & (aside <= 2 * std[0] + SHADOW)).any()
+        if is_sure and is_telling and j not in explained and not is_hidden:
             wider = shares_around(shares, middle, 2 * std + MARGIN * CELL)
             least = min(share for _, share in wider)
             ratio = np.log((1 - FEWER * least) / (1 - least))
@@ -139,8 +144,10 @@ def test_missed_landmarks_cost_what_the_dense_equations_say():
         lost = LostEvidence(2.0, memory.uniform(0, 2), 2.0, first_new)
         before = Detections(*known, shown, lost)
         explained = rng.permutation(8)[: rng.integers(4)]
-        cost, after = before.after(view, slots, explained, LONGEST)
-        expected_cost, expected = plain_count(view, slots, explained, before)
+        scale = np.pi, LONGEST
+        readings = memory.uniform((-1, 0), 1, (memory.integers(4), 2)) * scale
+        cost, after = before.after(view, (slots, explained, readings), LONGEST)
+        expected_cost, expected = plain_count(view, slots, explained, before, readings)
         assert cost == pytest.approx(expected_cost, rel=1e-9)
         assert after.lost == pytest.approx(expected.lost, rel=1e-9)
         evidence.append(after.lost.present - before.lost.present)
@@ -234,7 +241,7 @@ def cost_of_misses(place, std, scans):
     mean, covariance = np.append(np.zeros(3), place), np.diag([0, 0, 0, std, std]) ** 2
     view, detections, costs = MapView(mean, covariance, (0,)), Detections(), []
     for _ in range(scans):
-        cost, detections = detections.after(view, np.array([-1]), NONE, LONGEST)
+        cost, detections = detections.after(view, (np.array([-1]), *EMPTY[1:]), LONGEST)
         costs.append(cost)
     return costs
 
@@ -355,7 +362,7 @@ def test_a_landmark_of_clutter_raises_no_alarm():
     view = MapView(np.array([0, 0, 0, 3.0, 0.5, -2, 1]), 1e-6 * np.eye(7), (0, 1))
     detections = Detections()
     for slot in [[0]] * 80:  # landmark 1 is never shown
-        _, detections = detections.after(view, np.array(slot), NONE, LONGEST)
+        _, detections = detections.after(view, (np.array(slot), *EMPTY[1:]), LONGEST)
     assert detections.lost.largest == 0
 
 
@@ -368,7 +375,7 @@ def after_scans(places, scans):
         view = MapView(mean[:size], 1e-6 * np.eye(size), tuple(ids))
         rows = np.array(slots, np.int64), np.array(explained, np.int64)
         for _ in range(times):
-            _, detections = detections.after(view, *rows, LONGEST)
+            _, detections = detections.after(view, (*rows, EMPTY[2]), LONGEST)
     return detections.lost
 
 
@@ -402,7 +409,7 @@ def test_landmarks_that_a_lost_run_maps_anew_do_not_clear_it():
 def test_a_mapped_landmark_outside_the_view_is_not_newer_than_the_view():
     mean = np.array([0, 0, 0, 3.31, 0.66])
     view = MapView(mean, 1e-6 * np.eye(5), (0,), whole=(0, 5))
-    _, after = Detections().after(view, np.array([0]), NONE, LONGEST)
+    _, after = Detections().after(view, (np.array([0]), *EMPTY[1:]), LONGEST)
     assert after.lost.first_new == 6
 
 
@@ -428,7 +435,9 @@ def test_nine_returns_do_not_show_that_something_hides_landmarks():
         counts = detected(30, 30, 0)
         counts[2, 0, :3] = returned / 3
         telling = {0: 0.1}, {0: PROVEN}, LostEvidence(first_new=1)
-        _, after = Detections(counts, *telling).after(view, np.array([-1]), NONE, 6.0)
+        _, after = Detections(counts, *telling).after(
+            view, (np.array([-1]), *EMPTY[1:]), 6.0
+        )
         present.append(after.lost.present)
     assert present[0] == present[1] > present[2] > 0
 
@@ -439,7 +448,7 @@ def test_a_landmark_missed_so_often_that_its_odds_are_0_is_weighed(returned, wei
     counts = detected(30, 60, 0)
     counts[2, 0, :3] = returned / 3
     before = Detections(counts, {0: 0.0}, {0: PROVEN}, LostEvidence(first_new=1))
-    _, after = before.after(view, np.array([-1]), NONE, LONGEST)
+    _, after = before.after(view, (np.array([-1]), *EMPTY[1:]), LONGEST)
     ratio = (1 - FEWER / 2) / (1 - 1 / 2)  # P_D is a half
     assert after.missed == {0: 0.0}
     assert after.lost.present == pytest.approx(weight * np.log(ratio), abs=1e-9)
@@ -454,17 +463,30 @@ def test_a_landmark_at_the_edge_of_the_view_is_no_evidence():
     for ring in (3.4, 3.6):
         mean = np.array([0, 0, 0, ring * LONGEST / RINGS, 0.5])
         view = MapView(mean, 1e-6 * np.eye(5), (0,))
-        _, after = before.after(view, np.array([-1]), NONE, LONGEST)
+        _, after = before.after(view, (np.array([-1]), *EMPTY[1:]), LONGEST)
         evidence.append(after.lost.present)
     assert evidence[0] > 2
     assert evidence[1] < 0.1
+
+
+def test_a_landmark_behind_a_nearer_reading_is_no_evidence():
+    view = MapView(np.array([0, 0, 0, 3.31, 0.66]), 1e-6 * np.eye(5), (0,))
+    before = Detections(detected(30, 60, 0), {}, {0: PROVEN}, LostEvidence(first_new=1))
+    bearing, distance = np.arctan2(0.66, 3.31), np.hypot(0.66, 3.31)
+    evidence = []
+    for aside, beyond in [(0.0, -1.0), (0.09, -1.0), (0.2, -1.0), (0.0, 1.0)]:
+        readings = np.array([[bearing + aside, distance + beyond]])
+        _, after = before.after(view, (np.array([-1]), NONE, readings), LONGEST)
+        evidence.append(after.lost.present)
+    assert evidence[:2] == [0, 0]
+    assert min(evidence[2:]) > 0
 
 
 def test_the_alarm_stays_once_the_map_is_seen_again():
     view = MapView(np.array([0, 0, 0, 3.0, 0.5]), 1e-6 * np.eye(5), (0,))
     detections, scores = Detections(), []
     for slot in [0] * 40 + [-1] * 16 + [0] * 40:
-        _, detections = detections.after(view, np.array([slot]), NONE, LONGEST)
+        _, detections = detections.after(view, (np.array([slot]), *EMPTY[1:]), LONGEST)
         scores.append(detections.lost.lasting)
     assert scores[39] == scores[-1] == 0
     assert scores[55] > LOST_SCORE
