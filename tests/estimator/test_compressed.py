@@ -3,6 +3,7 @@
 import copy
 import pickle
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from town_drives import TOWN_MOTION_STD, map_all, run, wander
 from slamgym.estimator import EkfSlam, InvariantEkfSlam, check_estimator
 from slamgym.estimator.interface import Belief
 from slamgym.estimator.large_maps.compressed import compressed_map as active_set
+from slamgym.estimator.large_maps.compressed import phase_update
 from slamgym.estimator.large_maps.compressed.compressed_slam import (
     BASES,
     CompressedEkfSlam,
@@ -27,8 +29,9 @@ from slamgym.estimator.large_maps.compressed.deferred_covariance import (
     DeferredCovariance,
     Downdate,
 )
-from slamgym.estimator.large_maps.compressed.phase_update import Handover
+from slamgym.estimator.large_maps.compressed.phase_update import Handover, scale_of
 from slamgym.estimator.map_management.map_editor import MapEditor
+from slamgym.estimator.models.bearing_range import predict_measurement
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 from growing_maps_peers import FullWithDsyrk
@@ -149,6 +152,89 @@ def test_it_equals_the_full_filter_at_a_local_size_of_the_users_choice(base):
     assert len(slam.local_ids) <= 18 + 10
 
 
+def assert_accurate(slam, full, tolerance):
+    """Compare covariances, relative to the standard deviations of the full filter."""
+    expected = full.belief()
+    found = part_of(slam.belief(), expected.landmark_ids)
+    variances = expected.covariance.diagonal()
+    scale = np.sqrt(np.where(variances > 0, variances, 1.0))
+    error = np.abs(found.covariance - expected.covariance) / np.outer(scale, scale)
+    assert error.max() < tolerance
+
+
+def test_a_landmark_whose_place_was_a_guess_stays_accurate_when_it_becomes_exact():
+    """A variance of 90,000 falls to 1e-4, while another is 1e-4 from the beginning.
+
+    The filter is at rest.  The landmark leaves the local map in the last scan.
+    """
+    noise, near = ((0.01, 0.0, 0.3), (0.3, 0.01)), (0.0, 1.0)
+    slam, full = CompressedEkfSlam(*noise, local_size=6), EkfSlam(*noise)
+    scans = [([0, 1, 2, 3], [near] * 4), ([0, 1, 2, 3, 4], [near] * 5)]
+    scans += [([5, 6, 7, 8, 9], [(0.0, 3.0), (2.0, 1000.0), near, near, near])]
+    scans += [([3, 4, 5, 6, 7], [near] * 5), ([4, 5, 6], [near, near, (0.0, 0.5)])]
+    for ids, readings in [*scans, ([0], [near])]:
+        for each in (slam, full):
+            each.update(readings, ids)
+    assert_accurate(slam, full, 1e-6)
+
+
+@pytest.mark.parametrize("base", BASES)
+@pytest.mark.parametrize("std", [10.0, 100.0])
+def test_a_map_stays_accurate_when_its_place_becomes_known(base, std):
+    """All variances fall from std² to 1e-4, while distances are known to 1 cm."""
+    rng, start = np.random.default_rng(5), {"initial_pose_std": (std, std, 0.0)}
+    noise = ((0.01, 0.01, 0.01), (0.01, 0.01))
+    slam = CompressedEkfSlam(*noise, base=base, local_size=8, **start)
+    full = BASES[base](*noise, **start)
+    places = rng.uniform(-8.0, 8.0, (40, 2))
+    for step in range(30):
+        ids = np.arange(5 * step, 5 * step + 5)
+        if step >= 8:
+            ids = rng.choice(40, 6, replace=False)
+        readings = predict_measurement(np.zeros(3), places[ids]).measurement
+        readings += 0.01 * rng.standard_normal(readings.shape)
+        for each in (slam, full):
+            each.update(readings, ids.tolist())
+            if step == 20:
+                each.observe_pose((0.0, 0.0), np.eye(2, 3), 1e-4 * np.eye(2))
+    assert_accurate(slam, full, 1e-6)
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_any_scale_of_a_phase_gives_the_same_belief(base, monkeypatch):
+    """Also a diagonal one, which serves where a covariance is indefinite."""
+    drive = list(wander(100, 40, jumping=True))
+    start = run(map_all(CompressedEkfSlam(*NOISE, base=base), 100), drive[:10])
+    expected = run(copy.deepcopy(start), drive[10:]).belief()
+    rng = np.random.default_rng(0)
+
+    def diagonal(covariance):
+        return scale_of(-np.eye(len(covariance)) + np.diag(covariance.diagonal()))
+
+    def triangular(covariance):
+        size = covariance.shape
+        return np.tril(0.01 * rng.standard_normal(size)) + np.eye(*size)
+
+    for other in (diagonal, triangular):
+        monkeypatch.setattr(phase_update, "scale_of", other)
+        found = run(copy.deepcopy(start), drive[10:]).belief()
+        assert_close_beliefs(found, expected, 1e-8, 1e-9)
+
+
+def test_a_scale_is_a_root_of_the_covariance_as_far_as_there_is_one():
+    rng = np.random.default_rng(0)
+    factor = rng.standard_normal((7, 5)) * [1e-6, 1.0, 1e3, 1.0, 1.0]
+    factor[0] = 0.0
+    P = factor @ factor.T  # singular, and one variance is 0
+    T = scale_of(P)
+    std = np.sqrt(P.diagonal() + (P.diagonal() == 0))
+    assert (np.abs(T @ T.T - P) <= 1e-11 * np.outer(std, std)).all()
+    assert (T.diagonal() > 0).all()
+    np.testing.assert_array_equal(T, np.tril(T))
+    indefinite = np.array([[4.0, 5.0], [5.0, 1.0]])
+    np.testing.assert_allclose(scale_of(indefinite), np.diag([2.0, 1.0]))
+
+
 @pytest.mark.slow
 def test_over_4000_steps_it_stays_symmetric_and_positive_definite():
     slam = run(CompressedEkfSlam(*NOISE), wander(120, 4000, seen=4))
@@ -253,15 +339,18 @@ def test_a_state_is_shared_with_nobody():
     assert pickle.dumps(state) == kept
 
 
-@pytest.mark.parametrize("jumping", [False, True])
-def test_no_step_does_more_of_the_map_than_a_full_update(jumping, monkeypatch):
+@pytest.mark.parametrize(
+    ("base", "jumping"), [("ekf", False), ("ekf", True), ("invariant", True)]
+)
+def test_no_step_does_more_of_the_map_than_a_full_update(base, jumping, monkeypatch):
     count, seen = 400, 10
     done = []
 
-    def count_numbers(self, k):
-        done[-1] += len(self._pending[0].signs) * self._blocks[k].size
+    def count_numbers(self, blocks):
+        size = sum(self._blocks[k].size for k in blocks)
+        done[-1] += len(self._pending[0].signs) * size
 
-    slam = map_all(CompressedEkfSlam(*NOISE), count)
+    slam = map_all(CompressedEkfSlam(*NOISE, base=base), count)
     spied(monkeypatch, DeferredCovariance, "_apply", count_numbers)
     waiting = []
     for odometry, readings, ids in wander(count, 150, seen=seen, jumping=jumping):
@@ -273,6 +362,53 @@ def test_no_step_does_more_of_the_map_than_a_full_update(jumping, monkeypatch):
     assert max(done) < 2 * full
     assert sum(step > 0 for step in done) > 5
     assert max(waiting) < 150  # and nothing piles up
+
+
+def test_an_interrupt_applies_no_downdate_twice(monkeypatch):
+    """The last lines of a step are interrupted, which apply one to two blocks."""
+    slam, applied = map_all(CompressedEkfSlam(*NOISE), 150), []
+    spied(
+        monkeypatch,
+        DeferredCovariance,
+        "_apply",
+        lambda _, blocks: applied.extend(blocks),
+    )
+    for odometry, readings, ids in wander(150, 80, jumping=True):
+        slam.predict(odometry)
+        twin = copy.deepcopy(slam)
+        applied.clear()
+        slam.update(readings, ids)
+        if len(applied) > 1:
+            break
+    assert applied == [0, 1]
+    other = copy.deepcopy(twin)
+    lines = lines_of(partial(other.update, readings, ids))
+    for line in range(lines - 80, lines):
+        other = copy.deepcopy(twin)
+        assert is_interrupted(partial(other.update, readings, ids), line)
+        if other.steps < slam.steps:
+            other.update(readings, ids)
+        assert_same_bits(other.belief(), slam.belief())
+
+
+def test_a_downdate_without_memory_is_still_to_be_applied(monkeypatch):
+    stored, columns = DeferredCovariance(), np.arange(4)
+    stored.make_room(1)
+    root = np.random.default_rng(0).standard_normal((stored.width, 50))
+    stored.defer(Downdate(root, np.ones(50), []))
+    before = stored.marginal(columns)
+
+    def refuse(*_):
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(DeferredCovariance, "_apply", refuse)
+        with pytest.raises(MemoryError):
+            stored.work(50)
+    np.testing.assert_array_equal(stored.marginal(columns), before)
+    stored.work(50)
+    assert not stored.pending_rank
+    np.testing.assert_allclose(stored.marginal(columns), before)
 
 
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
@@ -357,6 +493,7 @@ def test_bad_arguments_are_named(call, message):
         ({"base": np.array("EkfSlam")}, "state is of EkfSlam, not of InvariantEkfSlam"),
         ({"strip": np.zeros((3, 3))}, r"state\['strip'\] must have shape"),
         ({"slots": np.zeros(3, dtype=int)}, r"state\['slots'\] must have one entry"),
+        ({"scale": np.eye(3)}, r"state\['scale'\] must have shape"),
         ({"points": np.zeros(3)}, r"state\['points'\] must have shape"),
         ({"far_covariance": np.zeros(7)}, "must be whole blocks of rows"),
         ({"far_pending_root": np.zeros((7, 0))}, "pending_root.* must have shape"),
@@ -371,6 +508,14 @@ def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(change, messag
     with pytest.raises(ValueError, match=message):
         slam.load_state_dict(state)
     assert_same_bits(before, slam.belief())
+
+
+def test_a_saved_scale_must_be_triangular():
+    slam = map_all(CompressedEkfSlam(*NOISE), 100)
+    state = run(slam, wander(100, 5, jumping=True)).state_dict()
+    for scale in (state["scale"].T, -state["scale"], np.zeros_like(state["scale"])):
+        with pytest.raises(ValueError, match="must be triangular, with a diag"):
+            slam.load_state_dict(state | {"scale": scale})
 
 
 def test_a_restart_forgets_the_map():
@@ -409,7 +554,7 @@ def test_the_stored_covariance_is_that_of_a_dense_matrix(seed):
         taken = np.sort(rng.choice(width, rng.integers(1, 9), replace=False))
         root = rng.standard_normal((width, rng.integers(1, 60)))
         signs = rng.choice([-1.0, 1.0], root.shape[1])
-        downdate = Downdate(root.copy(), signs)
+        downdate = Downdate(root.copy(), signs, [])
         dense -= (root * signs) @ root.T
         rows = np.empty((len(taken), width))
         for blocks in (range(2), range(2, 3)):
@@ -437,26 +582,31 @@ def test_in_a_small_map_it_has_the_bits_of_the_full_filter(base):
 
 @pytest.mark.usefixtures("_small_maps_are_whole")
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
-def test_a_map_may_grow_beyond_a_small_one_and_become_small_again(base):
+def test_a_map_may_become_large_and_small_and_large_again(base, monkeypatch):
     full, slam = BASES[base](*NOISE), CompressedEkfSlam(*NOISE, base=base)
     resumed = CompressedEkfSlam(*NOISE, base=base)
     for each in (full, slam):
         map_all(each, WHOLE)
     assert slam.local_ids == slam.landmark_ids
     larger = map_all(slam, WHOLE + 40), map_all(full, WHOLE + 40)
-    for step, (odometry, readings, ids) in enumerate(wander(WHOLE + 40, 60)):
+    for step, (odometry, readings, ids) in enumerate(wander(WHOLE + 40, 90)):
         if step == 30:
             assert len(slam.local_ids) < 60
             gone = [i for i in range(WHOLE + 40) if i not in ids][: WHOLE // 2]
             slam.remove(gone)
             forget(full, gone)
+        if step == 60:
+            assert set(slam.local_ids) == set(slam.landmark_ids)
+            assert_equal_beliefs(slam.belief(), full.belief())
+            for limit in LIMITS:
+                monkeypatch.setattr(active_set, limit, WHOLE // 2)
         for each in larger:
             each.predict(odometry)
             each.update(readings, ids)
         if step % 10 == 9:
             resumed.load_state_dict(slam.state_dict())
             assert_same_bits(resumed.belief(), slam.belief())
-    assert set(slam.local_ids) == set(slam.landmark_ids)
+    assert len(slam.local_ids) < 60
     assert_equal_beliefs(slam.belief(), full.belief())
 
 

@@ -22,6 +22,7 @@ from ...support.saved_states import with_prefix, without_prefix
 from ..multifrontal import pairs, symmetric
 from . import phase_update
 from .deferred_covariance import BLOCK, DeferredCovariance, subtract
+from .phase_update import combine
 
 
 class CompressedMap:
@@ -47,11 +48,12 @@ class CompressedMap:
         self._references = np.zeros(0)
         self.deferred = DeferredCovariance()
         self.local: dict[int, None] = {}  # the local landmarks, in their order
+        self._stored = 0  # how many of these, the first, have rows in `deferred`
         self._virtual = 0
-        self._handover: phase_update.Handover | None = (
-            None  # the last change of the local map
-        )
+        # The last change of the local map, as long as it takes.
+        self._handover: phase_update.Handover | None = None
         self._strip = np.zeros((0, 0))  # covariance of local and all other coordinates
+        self._scale = np.zeros((0, 0))  # T of this phase
         self._origin = self.filter.map.mean[:2].copy()  # start of the phase
 
     def add(self, ids: Sequence[int]) -> None:
@@ -88,25 +90,24 @@ class CompressedMap:
         covariance = np.zeros((len(mean), len(mean)))
         is_local = np.array([i in order for i in ids], dtype=bool)
         inside = np.r_[0:3, 3 + pairs(np.flatnonzero(is_local))]
-        local = np.r_[0:3, 3 + pairs([order[i] for i in ids if i in order])]
+        local = np.r_[0:3, now.first + pairs([order[i] for i in ids if i in order])]
         mean[inside] = now.mean[local]
         covariance[np.ix_(inside, inside)] = now.covariance[np.ix_(local, local)]
         if not is_local.all():
             self.finish_handover()
             outside = 3 + pairs(np.flatnonzero(~is_local))
             columns = self._columns([i for i in ids if i not in order])
-            strip = np.ascontiguousarray(self._strip[:, columns])
-            mean[outside] = self._points[columns] + self._combine(now.shift, strip)[0]
-            cross = self._combine(now.gain[local], strip)
+            strip = now.scaled(np.ascontiguousarray(self._strip[:, columns]))
+            mean[outside] = self._points[columns] + combine(now.shift, strip)[0]
+            cross = combine(now.gain(local), strip)
             covariance[np.ix_(inside, outside)] = cross
             covariance[np.ix_(outside, inside)] = cross.T
-            root, signs = phase_update.roots(now.loss, self.is_invariant)
+            root, signs = now.roots()
             block = self.deferred.marginal(columns)
-            subtract(block, self._combine(root, strip).T, signs)
+            subtract(block, combine(root, strip).T, signs)
             covariance[np.ix_(outside, outside)] = symmetric(block)
             del block  # frees memory before the belief takes its copy
-        frame = self.filter.frame
-        return Belief(mean, covariance, tuple(ids), frame)
+        return Belief(mean, covariance, tuple(ids), self.filter.frame)
 
     def ids_near(self, pose: Belief, within: float) -> list[int]:
         """Return the local landmarks and all that may lie within a distance [m].
@@ -147,24 +148,25 @@ class CompressedMap:
         self._make_room()
         self._points, self._references = self._points.copy(), self._references.copy()
         if not whole:
-            self._points += self._combine(now.shift, self._strip)[0]
-        self._points[own] = now.mean[3:]
-        self._references[own] = now.reference[3:]
+            self._points += combine(now.unscaled(now.shift), self._strip)[0]
+        self._points[own] = now.mean[now.first :]
+        self._references[own] = now.reference[now.first :]
         ahead = now.mean[:2] + (now.mean[:2] - self._origin) / 2  # likely direction
         points = self._points.reshape(-1, 2)
         chosen = choose_local(ahead, required, self.slots, points, size)
         self._origin = now.mean[:2].copy()
-        rows, self.local = phase_update.exchanged_rows(self.slots, self.local, chosen)
-        self._handover, covariance = phase_update.begin_handover(
-            self.deferred,
-            self._strip,
-            now,
-            rows,
-            invariant=self.is_invariant,
-            hurried=hurried,
+        rows, self.local = phase_update.exchanged_rows(
+            self.slots, self.local, chosen, self._stored, now.first
         )
-        self._strip = self._handover.next_strip
-        self._begin(covariance)
+        blocks = phase_update.blocks_in_a_step(self.deferred.width, hurried=hurried)
+        self._handover = phase_update.Handover(now, self._strip, rows, blocks)
+        self.deferred.forget(rows.new)
+        columns = self._columns(list(self.local))
+        if hurried:
+            self._handover.advance(self.deferred, blocks)
+            self._begin(columns, self._handover.next_strip[:, columns])
+        else:
+            self._begin(columns, self._handover.beginning(self.deferred))
 
     def work(self, rank: int, age: int, *, hurried: bool) -> None:
         """Do a part of the deferred work.
@@ -172,8 +174,8 @@ class CompressedMap:
         Parameters
         ----------
         rank : int
-            That of a full update: the work is at most its downdate, and only a share
-            of it unless hurried.
+            That of a full update: the work is a share of its downdate.  If hurried, it
+            is the whole, or as much as is deferred in this step.
         age : int
             Steps since the local map changed, including this one.
         hurried : bool
@@ -182,8 +184,10 @@ class CompressedMap:
         width = self.deferred.width
         share = phase_update.blocks_in_a_step(width, hurried=hurried)
         if hurried or (age - 3) * share * BLOCK >= width:
+            before = self.deferred.pending_rank
             self.finish_handover()
-            self.deferred.work(rank if hurried else rank * SHARE)
+            added = self.deferred.pending_rank - before
+            self.deferred.work(max(rank, added) if hurried else rank * SHARE)
         elif self._handover is not None and age > 1:
             self._handover.advance(self.deferred, (age - 2) * share)
 
@@ -192,6 +196,7 @@ class CompressedMap:
         if self._handover is not None:
             self._handover.advance(self.deferred, self.deferred.width // BLOCK)
             self.deferred.defer(self._handover.lost)
+            self._strip = self._handover.next_strip
             self._handover = None
 
     @property
@@ -211,8 +216,8 @@ class CompressedMap:
     def state_dict(self, numbers: Sequence[int]) -> dict[str, Any]:
         """Return copies of the whole state as arrays, with numbers of the caller."""
         self.finish_handover()
-        near = [self.slots[i] for i in self.local]
-        invalid = pairs([*near, *self.free])  # arrays hold rests of these
+        new = [self.slots[i] for i in list(self.local)[self._stored :]]
+        invalid = pairs([*new, *self.free])  # arrays hold rests of these
         local = with_prefix("local", self.filter.state_dict(), "_")
         found = {
             "landmark_ids": list(self.slots),
@@ -220,8 +225,9 @@ class CompressedMap:
             "points": self._points,
             "references": self._references,
             "strip": self._strip,
+            "scale": self._scale,
             "origin": self._origin,
-            "numbers": [self._virtual, *numbers, *self.free],
+            "counts": [self._virtual, self._stored, *numbers, *self.free],
         }
         state = {"base": local.pop("local_estimator")}
         state |= saved_states.write(found, STATE)
@@ -248,17 +254,20 @@ class CompressedMap:
         self.deferred.load_state_dict(without_prefix(state, "far", "_"))
         width = self.deferred.width
         saved = saved_states.read(state, STATE, w=width)
-        ids, slots, numbers = (
-            list(map(int, saved[key])) for key in ("landmark_ids", "slots", "numbers")
+        ids, slots, counts = (
+            list(map(int, saved[key])) for key in ("landmark_ids", "slots", "counts")
         )
-        _check_slots(slots, numbers, len(ids), len(local_ids))
+        _check_slots(slots, counts, len(ids), len(local_ids))
         local = saved_states.read(without_prefix(state, "local", "_"), LOCAL)
-        self._virtual, *counters = numbers[:COUNTERS]
-        self.free = numbers[COUNTERS:]
+        self._virtual, self._stored, *numbers = counts[:COUNTERS]
+        self.free = counts[COUNTERS:]
         self.slots = dict(zip(ids, slots, strict=True))
         self.local = dict.fromkeys(local_ids[self._virtual :])
         self._points, self._references = saved["points"], saved["references"]
         self._strip, self._origin = saved["strip"], saved["origin"]
+        self._scale = saved["scale"]
+        if np.triu(self._scale, 1).any() or (self._scale.diagonal() <= 0).any():
+            raise ValueError("state['scale'] must be triangular, with a diagonal > 0")
         rows = phase_update.virtual_landmarks(len(self._strip), self.is_invariant)
         if self._virtual and rows != self._virtual:
             raise ValueError(
@@ -271,24 +280,26 @@ class CompressedMap:
         if not self.local.keys() <= self.slots.keys():
             raise ValueError("state['local_landmark_ids'] must be among landmark_ids")
         self.filter.restore(local)
-        return counters
+        return numbers
 
     def _drop(self, ids: Sequence[int]) -> None:
         gone = set(ids)
         self.free = self.free + [self.slots[i] for i in ids]
         self.slots = {i: slot for i, slot in self.slots.items() if i not in gone}
+        stored = list(self.local)[: self._stored]
+        self._stored = len(stored) - len(gone.intersection(stored))
         self.local = {i: None for i in self.local if i not in gone}
 
-    def _begin(self, rows: Array) -> None:
+    def _begin(self, columns: IntArray, rows: Array) -> None:
         """Load the local map with these covariance rows (a, a - 3) into the filter."""
-        columns = self._columns(list(self.local))
         whole = len(self.local) == len(self.slots)
+        self._stored = 0 if whole else len(self.local)
         self._virtual = (
             0 if whole else phase_update.virtual_landmarks(len(rows), self.is_invariant)
         )
         if whole:
             self._strip, self._handover = self._strip[:0], None
-        phase_update.begin_phase(
+        self._scale = phase_update.begin_phase(
             self.filter,
             self._points[columns],
             rows,
@@ -305,11 +316,9 @@ class CompressedMap:
             self._references = np.append(self._references, np.zeros(more))
             self._strip = np.pad(self._strip, ((0, 0), (0, more)))
 
-    def _combine(self, coefficients: Array, strip: Array) -> Array:
-        return phase_update.combine(coefficients, strip, self.is_invariant)
-
     def _phase(self) -> phase_update.Phase:
-        return phase_update.end_phase(self.filter, self._virtual)
+        parts = (*self.filter.map.used, 3 + 2 * self._virtual)
+        return phase_update.Phase(*parts, self._scale, self.is_invariant)
 
     def _columns(self, ids: Sequence[int]) -> IntArray:
         """Return the columns of landmarks in the map's arrays."""
@@ -394,11 +403,9 @@ def choose_local(
     distances = ((points[list(slots.values())] - centre) ** 2).sum(axis=1)
     count = min(size + len(required), len(ids))
     nearest = np.argpartition(distances, count - 1)[:count]
-    for k in nearest[np.argsort(distances[nearest], kind="stable")].tolist():
-        if len(chosen) >= size:
-            break
-        chosen[ids[k]] = None
-    return chosen
+    nearest = nearest[np.argsort(distances[nearest], kind="stable")]
+    chosen |= dict.fromkeys(ids[k] for k in nearest.tolist())
+    return dict.fromkeys(list(chosen)[:size])
 
 
 # --------------------------------------------------------------------------------------
@@ -409,19 +416,21 @@ STATE: saved_states.Table = {
     "slots": (saved_states.COUNTS, -1),
     "points": (saved_states.NUMBERS, "w"),
     "references": (saved_states.NUMBERS, "w"),
-    "strip": (saved_states.NUMBERS, -1, "w"),
+    "strip": (saved_states.NUMBERS, "s", "w"),
+    "scale": (saved_states.NUMBERS, "s", "s"),
     "origin": (saved_states.NUMBERS, 2),
-    "numbers": (saved_states.COUNTS, -1),
+    "counts": (saved_states.COUNTS, -1),
 }
 LOCAL: saved_states.Table = {
     **MAP_STATE,
     "covariance": (saved_states.SYMMETRIC, "3+2n", "3+2n"),
 }
-COUNTERS = 4  # numbers before the free slots: virtual landmarks, extra ones, age, rest
+# Numbers before the free slots: virtual landmarks, stored ones, extra ones, age, rest.
+COUNTERS = 5
 
 
 def _check_slots(
-    slots: list[int], numbers: list[int], landmarks: int, local: int
+    slots: list[int], counts: list[int], landmarks: int, local: int
 ) -> None:
     """Refuse places of landmarks that do not fit their number."""
     if landmarks != len(slots):
@@ -429,14 +438,14 @@ def _check_slots(
             f"state['slots'] must have one entry for each of {landmarks} landmarks, "
             f"got {len(slots)}"
         )
-    if len(numbers) < COUNTERS or numbers[0] > local:
+    if len(counts) < COUNTERS or counts[0] + counts[1] > local:
         raise ValueError(
-            f"state['numbers'] must be at least {COUNTERS}, the first of them at most "
-            f"{local}, got {numbers}"
+            f"state['counts'] must be at least {COUNTERS}, the first two of them "
+            f"together at most {local}, got {counts}"
         )
-    free = numbers[COUNTERS:]
+    free = counts[COUNTERS:]
     if sorted(slots + free) != list(range(len(slots + free))):
         raise ValueError(
-            "state['slots'] and the free ones in state['numbers'] must be 0, 1, … "
+            "state['slots'] and the free ones in state['counts'] must be 0, 1, … "
             f"without repetition, got {slots} and {free}"
         )

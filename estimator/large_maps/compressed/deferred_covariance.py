@@ -5,6 +5,7 @@ applied later; the compiled functions below copy rows and columns.
 """
 
 from collections.abc import Mapping
+from itertools import starmap
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,13 +17,15 @@ from ...support.argument_checks import refuse_beyond_memory
 from ...support.undo import Undo, contents
 from ..multifrontal import symmetric
 
-# Rows of one block: 64 landmarks.
-BLOCK = 128
+# Rows of one block: 68 landmarks.
+#
+# Rows whose lengths are multiples of a high power of two would compete for the same few
+# places of the processor's caches.
+BLOCK = 136
 # Smallest rank to apply; smaller downdates wait: memory limits thin products.
 WORTHWHILE = 40
 # Larger pending ranks must not wait for the exchange of rows.
 LARGEST_BACKLOG = 400
-_EVERY_ROW = np.arange(BLOCK)
 
 
 class Downdate(NamedTuple):
@@ -30,20 +33,20 @@ class Downdate(NamedTuple):
 
     root: Array  # W, shape (width, rank)
     signs: Array  # s, shape (rank,), each 1 or -1
+    applied: list[int]  # one number for each block that has changed already
 
 
 class DeferredCovariance:
     """Lower half of a growing covariance, in blocks of rows, with pending downdates.
 
-    Block k holds rows 128 k to 128 (k + 1) of P, as far as the diagonal.  This takes
+    Block k holds rows 136 k to 136 (k + 1) of P, as far as the diagonal.  This takes
     half the memory of a square and grows without a copy.  Every block is contiguous, so
     that BLAS changes it in place::
 
         P = stored − W diag(s) Wᵀ
 
     W is small.  Reading subtracts its product, and :meth:`work` applies it to one block
-    after the other.  A local map may read the rows of its landmarks and update its
-    copy; the stored rows of these landmarks are invalid until it puts them back.  Rows
+    after the other.  The rows of a new landmark are invalid until they are put.  Rows
     are read and put block by block, between which :meth:`work` must not be called.
     """
 
@@ -52,7 +55,7 @@ class DeferredCovariance:
         self._pending: list[Downdate] = []
         self._under_way = False  # whether the first downdate is being applied
         self._done = 0  # number of blocks to which it has been applied
-        self._credit = 0.0  # multiplications granted and not yet used
+        self._credit = 0.0  # multiplications granted, less those made
 
     @property
     def width(self) -> int:
@@ -104,20 +107,17 @@ class DeferredCovariance:
         """
         bounds = _bounds(columns, blocks)
         for k, start, end in zip(blocks, bounds, bounds[1:], strict=False):
-            block, first = self._blocks[k], k * BLOCK
-            if end > start:
-                rows[start:end, : first + BLOCK] = block[columns[start:end] - first]
-            read_columns(block, first, columns[:start], rows)
-        for index, (root, signs) in enumerate([*self._pending, coming]):
-            applied = self._done if index == 0 else 0  # only the first has been begun
+            read_rows(self._blocks[k], k * BLOCK, columns[:end], start, rows)
+        applied = self._done  # blocks; only the first downdate has been begun
+        for root, signs, _ in [*self._pending, coming]:
             left = range(max(blocks.start, applied), blocks.stop)
-            first, last = left.start * BLOCK, left.stop * BLOCK
-            if last > first:
-                start, end = _bounds(columns, range(left.start, left.stop))[
-                    :: len(left)
-                ]
-                weights, before = rows_of(root, columns[:end]) * signs, root[:last]
-                rows[start:end, : len(before)] -= weights[start:] @ before.T
+            applied, first, last = 0, left.start * BLOCK, left.stop * BLOCK
+            if last <= first:
+                continue
+            start, end = columns.searchsorted((first, last)).tolist()
+            weights, before = rows_of(root, columns[:end]) * signs, root[:last]
+            rows[start:end, : len(before)] -= weights[start:] @ before.T
+            if start:
                 rows[:start, first : len(before)] -= weights[:start] @ before[first:].T
 
     def put(
@@ -136,23 +136,19 @@ class DeferredCovariance:
         """
         bounds = _bounds(columns, blocks)
         for k, start, end in zip(blocks, bounds, bounds[1:], strict=False):
-            block, first, others = self._blocks[k], k * BLOCK, _EVERY_ROW
-            if end > start:
-                own = rows[places[start:end], : first + BLOCK]
-                block[columns[start:end] - first] = own
-            if end - start > BLOCK // 4:  # most are written already
-                others = np.delete(_EVERY_ROW, columns[start:end] - first)
-            write_columns(block, first, others, columns[:end], rows, places)
+            own = columns[:end]
+            write_rows(self._blocks[k], k * BLOCK, own, start, rows, places)
 
     def forget(self, columns: IntArray) -> None:
         """Drop the pending downdates of rows that are about to be put."""
-        for root, _ in self._pending:
+        for root, _, _ in self._pending:
             root[columns[columns < len(root)]] = 0.0
 
     def checkpoint(self) -> Undo:
-        """Return what takes back later calls.
+        """Return what takes back later calls, but for changes of the blocks.
 
-        The stored rows of local landmarks are invalid, and remain so.
+        Rows that have been put are invalid again.  A downdate that is applied remains
+        so, and :meth:`work` does not repeat it.
         """
         return contents(self)
 
@@ -165,30 +161,34 @@ class DeferredCovariance:
     def work(self, rank: float) -> None:
         """Apply pending downdates, for the cost of one full downdate of this rank.
 
-        Blocks are changed as a whole; unused cost is kept for the next call.
+        Blocks are changed as a whole; what this costs too little or too much is kept
+        for the next call.
         """
         self._credit += rank * (self.width * (self.width + BLOCK) / 2)
         while self._begin():
-            root, signs = self._pending[0]
-            cost = len(signs) * self._blocks[self._done].size
-            if cost > self._credit:
+            root, signs, _ = self._pending[0]
+            last, count = self._done, len(root) // BLOCK
+            for block in self._blocks[last:count]:
+                cost = len(signs) * block.size
+                if cost > 2 * self._credit:
+                    break
+                self._credit -= cost
+                last += 1
+            self._apply(range(self._done, last))
+            self._done = last
+            if last < count:
                 return
-            self._apply(self._done)
-            self._credit -= cost
-            self._done += 1
-            if self._done * BLOCK >= len(root):
-                self._pending.pop(0)
-                self._under_way, self._done = False, 0
-        self._credit = 0.0
+            self._pending.pop(0)
+            self._under_way, self._done = False, 0
+        self._credit = min(self._credit, 0.0)
 
     def marginal(self, columns: IntArray) -> Array:
         """Return the covariance (c, c) of some columns; exactly symmetric."""
         covariance = np.empty((len(columns), len(columns)))
-        holding = set((columns // BLOCK).tolist())
-        for k in holding:
+        for k in set((columns // BLOCK).tolist()):
             read_marginal(self._blocks[k], k * BLOCK, columns, covariance)
         applied = columns < self._done * BLOCK
-        for index, (root, signs) in enumerate(self._pending):
+        for index, (root, signs, _) in enumerate(self._pending):
             rows = rows_of(root, columns)
             change = (rows * signs) @ rows.T
             if index == 0 and self._done:
@@ -241,17 +241,17 @@ class DeferredCovariance:
         saved = saved_states.read(state, PENDING, "far_", w=BLOCK * count)
         pending = _downdates(saved)
         under_way, done, credit = progress = saved["progress"].tolist()
-        if not (
-            under_way in (0, 1) and done in range(count + 1) and credit >= 0
-        ) or under_way > len(pending):
+        if done not in range(count + 1) or under_way not in (0, min(1, len(pending))):
             raise ValueError(
                 f"state['far_progress'] must be 0 or 1, at most {count} blocks and a "
-                f"credit >= 0, got {progress}"
+                f"credit, got {progress}"
             )
         ends = BLOCK**2 * np.cumsum(np.arange(1, count + 1))
         parts = np.split(flat, ends)[:count]
         self._blocks = [part.reshape(BLOCK, -1).copy() for part in parts]
         self._pending = pending
+        if pending:
+            pending[0].applied.extend(range(int(done)))
         self._under_way, self._done, self._credit = bool(under_way), int(done), credit
 
     def _enumerate(self) -> list[tuple[int, Array]]:
@@ -262,31 +262,34 @@ class DeferredCovariance:
         """Return whether a downdate is under way; join the pending ones to start it."""
         if not self._under_way and self.pending_rank >= WORTHWHILE:
             width = max(len(downdate.root) for downdate in self._pending)
-            root = np.zeros((width, self.pending_rank))
-            last = 0
+            root, last = np.empty((width, self.pending_rank)), 0
             for downdate in self._pending:
                 first, last = last, last + len(downdate.signs)
                 root[: len(downdate.root), first:last] = downdate.root
+                root[len(downdate.root) :, first:last] = 0.0
             signs = np.concatenate([downdate.signs for downdate in self._pending])
-            self._pending = [Downdate(root, signs)]
+            self._pending = [Downdate(root, signs, self._pending[0].applied)]
             self._under_way, self._done = True, 0
         return self._under_way
 
-    def _apply(self, k: int) -> None:
-        """Apply the downdate under way to a copy of one block, which replaces it."""
+    def _apply(self, blocks: range) -> None:
+        """Apply the downdate under way to some blocks, in place, unless it has been."""
         from scipy.linalg.blas import dgemm  # noqa: PLC0415 (slow to import)
 
-        root, signs = self._pending[0]
-        first, last = k * BLOCK, (k + 1) * BLOCK
-        # The transposes are contiguous in Fortran order: dgemm copies none of them.
-        self._blocks[k] = dgemm(
-            -1.0,
-            root[:last].T,
-            (root[first:last] * signs).T,
-            1.0,
-            self._blocks[k].T,
-            trans_a=True,
-        ).T
+        root, signs, applied = self._pending[0]
+        first = max(blocks.start, len(applied))
+        weighted = root[first * BLOCK : blocks.stop * BLOCK]
+        if (signs < 0).any():
+            weighted = weighted * signs
+        calls = []
+        for k, block in enumerate(self._blocks[first : blocks.stop]):
+            own = weighted[k * BLOCK : (k + 1) * BLOCK]
+            # The transposes are contiguous in Fortran order: dgemm copies none of them.
+            factors = root[: block.shape[1]].T, own.T
+            calls.append((-1.0, *factors, 1.0, block.T, True, False, True))
+        # No line of Python runs between the change of a block and the note of it: an
+        # interrupt finds neither or both.
+        applied.extend(map(len, starmap(dgemm, calls)))
 
 
 def stored_bytes(landmarks: int) -> int:
@@ -323,7 +326,9 @@ def _downdates(saved: Mapping[str, Any]) -> list[Downdate]:
         raise ValueError("state['far_pending_signs'] must be 1 or -1")
     ends = np.cumsum(shapes[:, 1]).tolist()
     return [
-        Downdate(root[:rows, end - rank : end].copy(), signs[end - rank : end].copy())
+        Downdate(
+            root[:rows, end - rank : end].copy(), signs[end - rank : end].copy(), []
+        )
         for (rows, rank), end in zip(shapes.tolist(), ends, strict=True)
     ]
 
@@ -351,14 +356,19 @@ def subtract(covariance: Array, root: Array, signs: Array) -> None:
 
 
 @jit
-def read_columns(block: Array, first: int, columns: IntArray, rows: Array) -> None:
-    """Copy some columns of a block into rows (c, width), from column ``first`` on.
+def read_rows(
+    block: Array, first: int, columns: IntArray, start: int, rows: Array
+) -> None:
+    """Copy what a block holds of the rows (c, width) of some columns.
 
-    The copy runs row by row, because neighbours share a cache line.
+    The first ``start`` are columns of the block, and the others are among its rows.
+    Columns are copied row by row, because neighbours share a cache line.
     """
     for i in range(len(block)):
-        for j in range(len(columns)):
+        for j in range(start):
             rows[j, first + i] = block[i, columns[j]]
+    for j in range(start, len(columns)):
+        rows[j, : first + len(block)] = block[columns[j] - first]
 
 
 @jit
@@ -378,56 +388,43 @@ def read_marginal(
 
 
 @jit
-def write_columns(
+def write_rows(
     block: Array,
     first: int,
-    own: IntArray,
     columns: IntArray,
+    start: int,
     rows: Array,
     places: IntArray,
 ) -> None:
-    """Copy the rows at ``places``, from column ``first`` on, into some columns.
-
-    Only the rows ``own`` of the block change.
-    """
-    for i in own:
+    """Store what a block holds of the rows at ``places``, as :func:`read_rows`."""
+    for j in range(start, len(columns)):
+        block[columns[j] - first] = rows[places[j], : first + len(block)]
+    for i in range(len(block)):
         for j in range(len(columns)):
             block[i, columns[j]] = rows[places[j], first + i]
 
 
 @jit
-def fill_extended(
-    covariance: Array, pose: Array, rows: Array, virtual: int, step: int
-) -> None:
+def fill_extended(covariance: Array, own: Array, scale: Array, virtual: int) -> None:
     """Put a local map and the extension of a phase into the covariance of a filter.
 
     Parameters
     ----------
     covariance : ndarray, shape (capacity, capacity)
         Zeros.
-    pose : ndarray, shape (3, 3)
-        Covariance of the pose.
-    rows : ndarray, shape (a, a - 3)
-        Covariance of pose and local landmarks with the local landmarks.  Of the last
-        a - 3 rows, only the lower half is used.
-    virtual, step : int
-        Number of columns of the extension; every ``step``-th belongs to a coordinate.
+    own : ndarray, shape (s, s)
+        Covariance of pose and local landmarks; the lower half is used.
+    scale : ndarray, shape (s, s)
+        T, lower triangular; unused if ``virtual`` is 0.
+    virtual : int
+        Number of columns of the extension, one or two for each coordinate.
     """
-    for i in range(len(rows)):
+    step = virtual // len(own)
+    for i in range(len(own)):
+        k = i + virtual * (i >= 3)
         for j in range(i + 1):
-            value = pose[i, j] if i < 3 else rows[j, i - 3]
-            if j >= 3:
-                value = rows[i, j - 3]
-            k, m = i + virtual * (i >= 3), j + virtual * (j >= 3)
-            covariance[k, m] = covariance[m, k] = value
-        if virtual:
-            k, m = i + virtual * (i >= 3), 3 + step * i
-            covariance[k, m] = covariance[m, k] = 1.0
-
-
-@jit
-def unpivot(factor: Array, places: IntArray, rows: Array) -> None:
-    """Copy the first rows of a triangular factor, its columns to their places."""
-    for i in range(len(rows)):
-        for j in range(i, len(places)):
-            rows[i, places[j]] = factor[i, j]
+            m = j + virtual * (j >= 3)
+            covariance[k, m] = covariance[m, k] = own[i, j]
+            if virtual:
+                m = 3 + step * j
+                covariance[k, m] = covariance[m, k] = scale[i, j]

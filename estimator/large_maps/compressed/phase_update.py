@@ -4,17 +4,24 @@ At the beginning of a phase let S (s, width) be the covariance of the s local
 coordinates x_a (pose and local landmarks) with all others, x_b.  The phase only
 measures x_a.  The ordinary filter then runs on an extended state (x_a, y)::
 
-    mean (x_a, 0),   covariance [P_aa  I; I  0]
+    mean (x_a, 0),   covariance [P_aa  T; Tᵀ  0]
 
-x_b is a linear function of y, x_b = Sᵀ y + terms that do not change.  With the final
-covariance [P_aa Φ; Φᵀ −Ψ] and mean (x_a, y), the phase changes the rest of the map by::
+with any invertible T.  x_b is a linear function of y, x_b = S̃ᵀ y + terms that do not
+change, with S = T S̃.  With the final covariance [P_aa Φ; Φᵀ −Ψ] and mean (x_a, y), the
+phase changes the rest of the map by::
 
-    x_b ← x_b + Sᵀ y,   P_ab ← Φ S,   P_bb ← P_bb − Sᵀ Ψ S
+    x_b ← x_b + S̃ᵀ y,   P_ab ← Φ S̃,   P_bb ← P_bb − S̃ᵀ Ψ S̃
 
-(Guivant and Nebot, 2001, in the form of an augmented state.)
+This holds for local landmarks, too: x_b may contain them as they were at the beginning.
+(Guivant and Nebot, 2001, in the form of an augmented state with T = I.)
+
+Here T Tᵀ = P_aa.  Then Ψ has eigenvalues of at most 1.  With T = I, they would be of
+the size of the information about x_a.  Where P_aa has large and small eigenvalues, as
+in a map whose place is known much less well than its shape, rounding would hide what a
+phase reveals about the former, and variances could become negative.
 
 In the invariant frame a correction also rotates and shears points,
-q⁺ = q + V(t) δq, and the covariance is transported, P ← T P Tᵀ, e_q⁺ = e_q + J (q⁺ − q)
+q⁺ = q + V(t) δq, and the covariance is transported, P ← G P Gᵀ, e_q⁺ = e_q + J (q⁺ − q)
 e_θ.  Both are linear in q read as a complex number, J = i.  There y is one complex
 number for each of the s coordinates, a *virtual landmark* at the origin.  With x_b and
 the rows of S read as complex numbers, the equations above hold unchanged.
@@ -29,25 +36,135 @@ import numpy as np
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
 from ...filters.gaussian_map import parts_of
-from ..multifrontal import pairs, symmetric
-from .deferred_covariance import (
-    BLOCK,
-    DeferredCovariance,
-    Downdate,
-    fill_extended,
-    unpivot,
-)
+from ..multifrontal import pairs
+from .deferred_covariance import BLOCK, DeferredCovariance, Downdate, fill_extended
 
 
 class Phase(NamedTuple):
-    """The parts of the filter's belief at the end of a phase."""
+    """The belief of the filter at the end of a phase, (x_a, y) in its own order.
 
-    mean: Array  # (a,) of pose and local landmarks
-    reference: Array  # (a,) their linearisation points, for filters that fix them
-    covariance: Array  # P_aa, (a, a)
-    gain: Array  # Φ, (a, e)
-    loss: Array  # Ψ, (e, e)
-    shift: Array  # y, (1, e)
+    The pose comes first, then y, then the local landmarks.  The arrays are views of the
+    filter's memory, which the next phase does not use.
+    """
+
+    mean: Array  # (size,)
+    covariance: Array  # (size, size)
+    reference: Array  # (size,) linearisation points, for filters that fix them
+    first: int  # row of the first local landmark, 3 + e
+    scale: Array  # T, (s, s), lower triangular
+    invariant: bool  # whether what refers to y is read as complex numbers
+
+    def coefficients(self, numbers: Array) -> Array:
+        """Return rows (k, e) as the coefficients (k, s) of rows of S̃."""
+        if self.invariant:
+            return numbers.view(np.complex128)
+        return numbers[:, : len(self.scale)]
+
+    def gain(self, rows: IntArray) -> Array:
+        """Return rows of Φ, shape (k, s)."""
+        return self.coefficients(self.covariance[rows, 3 : self.first])
+
+    @property
+    def loss(self) -> Array:
+        """Ψ, shape (e, e)."""
+        return -self.covariance[3 : self.first, 3 : self.first]
+
+    @property
+    def shift(self) -> Array:
+        """The mean of y, shape (1, s)."""
+        return self.coefficients(self.mean[None, 3 : self.first])
+
+    def roots(self) -> tuple[Array, Array]:
+        """Factor Ψ = U diag(σ) Uᵀ at its numerical rank.
+
+        The rank of Ψ is that of the measurements of the phase, far below its size.  In
+        the invariant frame, Ψ is indefinite.
+
+        Returns
+        -------
+        root : ndarray, shape (rank, s)
+            Uᵀ.
+        signs : ndarray, shape (rank,)
+            σ, each 1 or -1.
+        """
+        factor = _by_eigenvalues if self.invariant else _by_pivots
+        root, signs = factor(self.loss)
+        return self.coefficients(root), signs
+
+    def scaled(self, strip: Array) -> Array:
+        """Return S̃ = T⁻¹ S."""
+        return _solve(self.scale, strip, side=1)
+
+    def unscaled(self, coefficients: Array) -> Array:
+        """Return Φ T⁻¹, whose product with S is that of Φ with S̃."""
+        return _solve(self.scale, coefficients, side=0)
+
+
+def combine(coefficients: Array, strip: Array) -> Array:
+    """Return Φ S, shape (k, width), of coefficients (k, s) and the strip (s, width)."""
+    product: Array = coefficients @ strip.view(coefficients.dtype)
+    return product.view(np.float64)
+
+
+def _by_pivots(loss: Array) -> tuple[Array, Array]:
+    """Pivoted Cholesky decomposition of a semidefinite matrix."""
+    from scipy.linalg.lapack import dpstrf  # noqa: PLC0415 (slow to import)
+
+    factor, pivots, rank, _ = dpstrf(loss, lower=True)
+    root = np.empty((rank, len(loss)))
+    root[:, pivots - 1] = np.triu(factor.T[:rank])
+    return root, np.ones(rank)
+
+
+def _by_eigenvalues(loss: Array) -> tuple[Array, Array]:
+    """Eigenvalue decomposition of a symmetric matrix, without its rows of zeros."""
+    used = np.flatnonzero(loss.any(axis=0))
+    values, vectors = np.linalg.eigh(loss[used[:, None], used])
+    least = np.finfo(np.float64).eps * len(used) * np.abs(values).max(initial=0.0)
+    large = np.abs(values) > least
+    root = np.zeros((large.sum(), len(loss)))
+    root[:, used] = (vectors[:, large] * np.sqrt(np.abs(values[large]))).T
+    return root, np.sign(values[large])
+
+
+def _solve(scale: Array, rows: Array, side: int) -> Array:
+    """Solve X T = rows, or T X = rows at side 1, for a lower triangular T."""
+    from scipy.linalg import get_blas_funcs  # noqa: PLC0415 (slow to import)
+
+    if not rows.size:
+        return rows
+    (trsm,) = get_blas_funcs(("trsm",), (scale, rows))
+    # The transposes are contiguous in Fortran order: BLAS copies none of them.
+    solution: Array = trsm(1.0, scale.T, rows.T, side=side).T
+    return solution
+
+
+# What T Tᵀ adds to a variance, relative to it, so that T is invertible.
+ADDED = 1e-12
+# Variance of an exactly known coordinate in T Tᵀ; all its covariances are 0.
+EXACT = 1e-24
+
+
+def scale_of(covariance: Array) -> Array:
+    """Return T, lower triangular and invertible, with T Tᵀ as close to P as it can be.
+
+    Only the lower half of P is used.  A diagonal T is as right, and less accurate; it
+    serves where P is indefinite.
+
+    Examples
+    --------
+    >>> scale_of(np.array([[4.0, 2.0], [2.0, 10.0]])).round(9)
+    array([[2., 0.],
+           [1., 3.]])
+    """
+    from scipy.linalg.lapack import dpotrf  # noqa: PLC0415 (slow to import)
+
+    sums = covariance.copy()
+    variances = sums.diagonal().clip(0.0)
+    variances += np.where(variances > 0, ADDED * variances, EXACT)
+    np.fill_diagonal(sums, variances)
+    factor, status = dpotrf(sums.T, overwrite_a=True)
+    return np.diag(np.sqrt(variances)) if status else factor.T
 
 
 def virtual_landmarks(coordinates: int, invariant: bool) -> int:
@@ -57,8 +174,8 @@ def virtual_landmarks(coordinates: int, invariant: bool) -> int:
 
 def begin_phase(
     slam: EkfSlam, mean: Array, rows: Array, reference: Array, ids: list[int]
-) -> None:
-    """Replace the map of a filter by the extension, followed by a local map.
+) -> Array:
+    """Replace the map of a filter by the extension and a local map; return T.
 
     Parameters
     ----------
@@ -74,103 +191,24 @@ def begin_phase(
     gaussian, size = slam.map, 3 + 2 * len(ids)
     block = gaussian.blank(len(ids), more=len(ids) // 2)
     parts, virtual = parts_of(block), size - len(rows)
-    step = 2 if virtual == 2 * len(rows) else 1
-    for array, head, tail in (
-        (parts.mean, gaussian.mean[:3], mean),
-        (parts.reference, gaussian.reference[:3], reference),
-    ):
-        array[:3], array[3 + virtual : size] = head, tail
-    fill_extended(parts.covariance, gaussian.covariance[:3, :3], rows, virtual, step)
+    own = np.hstack([np.vstack([gaussian.covariance[:3, :3], rows[:3].T]), rows])
+    scale = scale_of(own) if virtual else np.zeros((0, 0))
+    rest = slice(3 + virtual, size)
+    parts.mean[:3], parts.mean[rest] = gaussian.mean[:3], mean
+    parts.reference[:3], parts.reference[rest] = gaussian.reference[:3], reference
+    fill_extended(parts.covariance, own, scale, virtual)
     gaussian.hold(None, ids, block=block)
-
-
-def end_phase(slam: EkfSlam, virtual: int) -> Phase:
-    """Split the belief of a filter that ran on an extended state; return copies.
-
-    Without an extension the covariance is a view: the local map may be large.
-    """
-    size, rest = slam.map.size, 3 + 2 * virtual
-    mean, covariance = slam.map.mean[:size], slam.map.covariance[:size, :size]
-    if not virtual:
-        reference, nothing = slam.map.reference[:size].copy(), np.empty((size, 0))
-        none = np.empty((1, 0))
-        return Phase(mean.copy(), reference, covariance, nothing, none[:0], none)
-    rows = np.concatenate([covariance[:3], covariance[rest:]])
-    return Phase(
-        _without(mean, rest),
-        _without(slam.map.reference[:size], rest),
-        np.concatenate([rows[:, :3], rows[:, rest:]], axis=1),
-        rows[:, 3:rest].copy(),
-        -covariance[3:rest, 3:rest],
-        mean[None, 3:rest].copy(),
-    )
-
-
-def _without(vector: Array, rest: int) -> Array:
-    return np.concatenate([vector[:3], vector[rest:]])
-
-
-def combine(coefficients: Array, strip: Array, invariant: bool) -> Array:
-    """Return Φ S, shape (k, width), of coefficients (k, e) and the strip (s, width)."""
-    if not invariant:
-        product: Array = coefficients[:, : len(strip)] @ strip
-        return product
-    turned = coefficients.view(np.complex128) @ strip.view(np.complex128)
-    return turned.view(np.float64)
-
-
-def roots(loss: Array, invariant: bool) -> tuple[Array, Array]:
-    """Factor Ψ = U diag(s) Uᵀ at its numerical rank.
-
-    The rank of Ψ is that of the measurements of the phase, far below its size.  In the
-    invariant frame, Ψ is indefinite.
-
-    Returns
-    -------
-    root : ndarray, shape (rank, e)
-        Uᵀ.
-    signs : ndarray, shape (rank,)
-        s, each 1 or -1.
-    """
-    if not invariant:
-        return _by_pivots(loss)
-    used = np.flatnonzero(loss.any(axis=0))
-    root, signs = _by_eigenvalues(loss[used[:, None], used])
-    rows = np.zeros((len(root), len(loss)))
-    rows[:, used] = root
-    return rows, signs
-
-
-def _by_pivots(loss: Array) -> tuple[Array, Array]:
-    """Pivoted Cholesky decomposition of a semidefinite matrix."""
-    from scipy.linalg.lapack import dpstrf  # noqa: PLC0415 (slow to import)
-
-    used = np.flatnonzero(loss.diagonal())
-    factor, pivots, rank, _ = dpstrf(loss[used[:, None], used], lower=True)
-    root = np.zeros((rank, len(loss)))
-    unpivot(factor.T, used[pivots - 1], root)
-    return root, np.ones(rank)
-
-
-def _by_eigenvalues(part: Array) -> tuple[Array, Array]:
-    """Eigenvalue decomposition of a symmetric matrix."""
-    if not len(part):
-        return part, np.empty(0)
-    values, vectors = np.linalg.eigh(part)
-    least = np.finfo(np.float64).eps * len(part) * np.abs(values).max()
-    large = np.abs(values) > least
-    root = (vectors[:, large] * np.sqrt(np.abs(values[large]))).T
-    return root, np.sign(values[large])
+    return scale
 
 
 # --------------------------------------------------------------------------------------
 # A change of the local map, spread over several steps.
 #
-# The rows of the landmarks that leave go back to the stored covariance, those of the
-# landmarks that enter are read, and Φ S becomes the strip of the new local map.  The
-# new phase needs none of this before it ends: it begins with the covariance of its own
-# landmarks alone.  Ψ is therefore factored in the step after the change, and the
-# exchange proceeds block by block in the steps that follow.
+# The rows of the landmarks that are new to the map are stored, those of the landmarks
+# that enter are read, and Φ S becomes the strip of the new local map.  The new phase
+# needs none of this before it ends: it begins with the covariance of its own landmarks
+# alone.  Ψ is therefore factored in the step after the change, and the exchange
+# proceeds block by block in the steps that follow.
 
 SPREAD = 4  # steps that an exchange takes in a large map
 
@@ -180,25 +218,30 @@ def blocks_in_a_step(width: int, *, hurried: bool) -> int:
 
     Examples
     --------
-    >>> [blocks_in_a_step(width, hurried=False) for width in (256, 1024, 6016)]
+    >>> [blocks_in_a_step(width, hurried=False) for width in (272, 1088, 6120)]
     [1, 2, 11]
     """
-    blocks = width // BLOCK
-    return max(1, blocks if hurried else blocks // SPREAD)
+    return max(1, width // BLOCK // (1 if hurried else SPREAD))
 
 
 class Exchanged(NamedTuple):
     """The rows of a change of the local map."""
 
-    own: IntArray  # columns of the old local landmarks, shape (a - 3,)
-    kept: IntArray  # rows of the pose and of landmarks that stay, in the old local map
-    leaving: IntArray  # ascending columns of the landmarks that leave
-    places: IntArray  # their rows in the old local map
+    own: IntArray  # ascending columns of the old local landmarks, shape (a - 3,)
+    order: IntArray  # their rows in the old belief of the filter
+    needed: IntArray  # its rows whose Φ S is needed
+    left: int  # how many of these, the first, belong to new landmarks that leave
+    new: IntArray  # ascending columns of the landmarks to store
+    places: IntArray  # their rows among those needed
     entering: IntArray  # ascending columns of the landmarks that enter
 
 
 def exchanged_rows(
-    slots: Mapping[int, int], local: Iterable[int], chosen: Collection[int]
+    slots: Mapping[int, int],
+    local: Iterable[int],
+    chosen: Collection[int],
+    stored: int,
+    first: int,
 ) -> tuple[Exchanged, dict[int, None]]:
     """Return the rows of a change of the local map, and its landmarks in their order.
 
@@ -208,17 +251,28 @@ def exchanged_rows(
         Place of each landmark in the map's arrays.
     local, chosen : collection of int
         The old and the new local landmarks.
+    stored : int
+        How many old ones, the first, are in the stored covariance.
+    first : int
+        Row of the first old one in the belief of the filter.
     """
     old = list(local)
     staying = [k for k, i in enumerate(old) if i in chosen]
-    places = {slots[i]: k for k, i in enumerate(old) if i not in chosen}
-    leaving, before = sorted(places), set(old)
+    leaving = [k for k in range(stored, len(old)) if old[k] not in chosen]
+    left, before = 2 * len(leaving), set(old)
     entering = sorted((i for i in chosen if i not in before), key=slots.__getitem__)
+    own = pairs([slots[i] for i in old])
+    order = own.argsort()
+    place = {k: 2 * row for row, k in enumerate(leaving)}
+    place |= {k: left + 3 + 2 * row for row, k in enumerate(staying)}
+    new = sorted(range(stored, len(old)), key=lambda k: slots[old[k]])
     rows = Exchanged(
-        pairs([slots[i] for i in old]),
-        np.r_[0:3, 3 + pairs(staying)],
-        pairs(leaving),
-        3 + pairs([places[slot] for slot in leaving]),
+        own[order],
+        first + order,
+        np.concatenate([first + pairs(leaving), (0, 1, 2), first + pairs(staying)]),
+        left,
+        pairs([slots[old[k]] for k in new]),
+        np.array([place[k] + c for k in new for c in (0, 1)], dtype=np.int64),
         pairs([slots[i] for i in entering]),
     )
     return rows, dict.fromkeys([old[k] for k in staying] + entering)
@@ -235,15 +289,22 @@ class Handover:
     old: Phase  # the end of the old phase
     strip: Array  # S of the old phase, shape (s, width)
     rows: Exchanged
-    next_strip: Array  # S of the new phase, shape (s', width), to be filled
-    invariant: bool
     group: int  # number of blocks that are exchanged at a time
     done: int = 0  # number of blocks that have been exchanged
     is_factored: bool = False  # whether what follows is known
     lost: Downdate = field(init=False, repr=False)  # to be deferred at the end
-    _coefficients: Array = field(init=False, repr=False)  # Φ above Uᵀ, (a + r, e)
-    _values: Array = field(init=False, repr=False)
-    _order: IntArray = field(init=False, repr=False)
+    _coefficients: Array = field(init=False, repr=False)  # (Φ above Uᵀ) T⁻¹, (k + r, s)
+    _values: Array = field(init=False, repr=False)  # rows of P, (left + s', width)
+
+    def __post_init__(self) -> None:
+        """Make room for the new strip and for the rows to store."""
+        size = len(self.rows.needed) + len(self.rows.entering)
+        self._values = np.empty((size, self.strip.shape[1]))
+
+    @property
+    def next_strip(self) -> Array:
+        """S of the new phase, shape (s', width), as far as it has been exchanged."""
+        return self._values[self.rows.left :]
 
     def advance(self, stored: DeferredCovariance, blocks: int) -> None:
         """Exchange groups of blocks until ``blocks`` are done, or all.
@@ -258,77 +319,52 @@ class Handover:
             self._exchange(stored, range(self.done, last))
             self.done = last
 
+    def beginning(self, stored: DeferredCovariance) -> Array:
+        """Return the covariance with which a new phase begins, shape (a', a' - 3).
+
+        It is that of pose and new local landmarks, without the columns of the pose, and
+        does not need the new strip.
+        """
+        kept, entering = self.rows.needed[self.rows.left :], self.rows.entering
+        S = self.old.scaled(np.ascontiguousarray(self.strip[:, entering]))
+        block, P = stored.marginal(entering), self.old.covariance
+        lost = combine(self.old.coefficients(self.old.loss), S).T.copy()
+        block -= combine(self.old.coefficients(lost), S)  # S̃ᵀ Ψ S̃
+        across = combine(self.old.gain(kept), S)
+        return np.block([[P[np.ix_(kept, kept[3:])], across], [across[3:].T, block]])
+
     @property
     def nbytes(self) -> int:
-        """Memory that the exchange holds [bytes]."""
-        arrays = [self.strip, self.old.covariance, self.old.gain, self.old.loss]
+        """Memory that the exchange holds, without the old strip [bytes]."""
+        arrays = [self._values, self.old.covariance]
         if self.is_factored:
-            arrays += [self._coefficients, self._values, self.lost.root]
+            arrays += [self._coefficients, self.lost.root]
         return sum(array.nbytes for array in arrays)
 
     def _factor(self, width: int) -> None:
-        root, signs = np.empty((0, self.old.gain.shape[1])), np.empty(0)
-        if len(self.old.loss):
-            root, signs = roots(self.old.loss, self.invariant)
-        self._coefficients = np.concatenate([self.old.gain, root])
-        self._values = np.zeros((len(self.old.mean), width))
-        self._order = np.argsort(self.rows.own)
-        self.lost = Downdate(np.zeros((width, len(signs))), signs)
+        root, signs = self.old.roots()
+        rows = np.concatenate([self.old.gain(self.rows.needed), root])
+        self._coefficients = self.old.unscaled(rows)
+        self.lost = Downdate(np.empty((width, len(signs))), signs, [])
         self.is_factored = True
 
     def _exchange(self, stored: DeferredCovariance, blocks: range) -> None:
-        here, a = slice(blocks.start * BLOCK, blocks.stop * BLOCK), len(self._values)
-        if self._coefficients.size:
-            part = combine(self._coefficients, self.strip[:, here], self.invariant)
-            self._values[:, here] = part[:a]
-            self.lost.root[here] = part[a:].T
-        own = self._order[_within(self.rows.own[self._order], here)]
-        self._values[:, self.rows.own[own]] = self.old.covariance[:, 3 + own]
-        self.lost.root[self.rows.leaving[_within(self.rows.leaving, here)]] = 0.0
-        stored.put(blocks, self.rows.leaving, self._values, self.rows.places)
-        count = len(self.rows.kept)
-        self.next_strip[:count, here] = self._values[self.rows.kept, here]
-        stored.read(blocks, self.rows.entering, self.next_strip[count:], self.lost)
-
-
-def begin_handover(
-    stored: DeferredCovariance,
-    strip: Array,
-    now: Phase,
-    rows: Exchanged,
-    *,
-    invariant: bool,
-    hurried: bool,
-) -> tuple[Handover, Array]:
-    """Begin a handover; also return the covariance with which a new phase begins.
-
-    Parameters
-    ----------
-    stored : DeferredCovariance
-    strip : ndarray, shape (s, width)
-        S of the old phase.
-    now : Phase
-        The end of the old phase.
-    rows : Exchanged
-    invariant, hurried : bool
-
-    Returns
-    -------
-    handover : Handover
-    covariance : ndarray, shape (a', a' - 3)
-        Of pose and new local landmarks, without the columns of the pose.
-    """
-    entering = np.ascontiguousarray(strip[:, rows.entering])
-    block = stored.marginal(rows.entering)
-    lost = np.ascontiguousarray(combine(now.loss, entering, invariant).T)
-    block -= combine(lost, entering, invariant)  # Sᵀ Ψ S
-    stored.forget(rows.leaving)
-    next_strip = np.empty((len(rows.kept) + len(rows.entering), stored.width))
-    group = blocks_in_a_step(stored.width, hurried=hurried)
-    handover = Handover(now, strip, rows, next_strip, invariant, group)
-    across = combine(now.gain[rows.kept], entering, invariant)
-    inside = now.covariance[np.ix_(rows.kept, rows.kept[3:])]
-    return handover, np.block([[inside, across], [across[3:].T, symmetric(block)]])
+        here = slice(blocks.start * BLOCK, blocks.stop * BLOCK)
+        rows, values, S = self.rows, self._values, self.strip[:, here]
+        needed = len(rows.needed)
+        gain, root = self._coefficients[:needed], self._coefficients[needed:]
+        values[:needed, here] = combine(gain, S)
+        if self.old.invariant:
+            self.lost.root[here] = combine(root, S).T
+        else:  # without a copy
+            np.matmul(S.T, root.T, out=self.lost.root[here])
+        own = _within(rows.own, here)
+        inside = self.old.covariance[rows.needed[:, None], rows.order[own]]
+        values[:needed, rows.own[own]] = inside
+        if len(rows.new):
+            self.lost.root[rows.new[_within(rows.new, here)]] = 0.0
+            stored.put(blocks, rows.new, values, rows.places)
+        stored.read(blocks, rows.entering, values[needed:], self.lost)
 
 
 def _within(columns: IntArray, here: slice) -> slice:
