@@ -379,8 +379,7 @@ class Explorers(Restorable):
         """Start the filters of some worlds, (B,), at estimates (B, 3)."""
         if self._record is not None:
             self._record.begin(worlds)
-        std = self._task.scenario.start.std
-        self._filters.reset(estimates, std, runs=worlds)
+        self._filters.reset(estimates, self._task.scenario.start.std, runs=worlds)
 
     def scan(
         self,

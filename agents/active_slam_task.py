@@ -306,9 +306,8 @@ class AssociationRecord(Restorable):
         for b in np.flatnonzero(ended).tolist():
             slam = filters[b]
             if isinstance(slam, SupportsDecisions):
-                confirm = policy_of(slam).confirm
                 scores = score_association(
-                    slam.decisions, self._true_ids[b], confirm=confirm
+                    slam.decisions, self._true_ids[b], confirm=policy_of(slam).confirm
                 ).as_dict()
                 table[:, b] = [scores[name] for name in SCORES]
         table = np.nan_to_num(table, nan=-1.0)

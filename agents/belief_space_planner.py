@@ -245,8 +245,7 @@ def _tours(knowledge: AgentKnowledge, chance: Array, cells: int) -> Array:
     starts, ends = np.concatenate(first), np.concatenate(second)
     pairs = np.empty((len(starts), len(ends), 2, 2))
     pairs[:, :, 0], pairs[:, :, 1] = starts[:, None], ends
-    kept = grid.routes.kept_clear(pairs.reshape(-1, 2))
-    return kept.reshape(-1, 2, 2)
+    return grid.routes.kept_clear(pairs.reshape(-1, 2)).reshape(-1, 2, 2)
 
 
 def _spread_out(points: Array, position: Array, most: int) -> IndexArray:

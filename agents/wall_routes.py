@@ -372,5 +372,4 @@ class AgentKnowledge(NamedTuple):
         landmarks: Array = self.belief.landmarks[~self.known_in_map]
         if not self.missing:
             return landmarks
-        cells = self.grid.cells[self.to_explore]
-        return np.concatenate([landmarks, as_points(cells)])
+        return np.concatenate([landmarks, as_points(self.grid.cells[self.to_explore])])

@@ -136,8 +136,7 @@ class UnicycleBody(Restorable):
             dx, dy = share * dx, share * dy
         self._body.velocity = dx, dy
         self._space.step(1.0)
-        turned = self._pose[2] + (command[1] + slip[2])
-        self._arrive(*self._body.position, turned)
+        self._arrive(*self._body.position, self._pose[2] + (command[1] + slip[2]))
         return share
 
     def _arrive(self, x: float, y: float, heading: float) -> None:

@@ -134,8 +134,7 @@ def clipped_action(action: ArrayLike, limits: Sequence[float]) -> tuple[float, f
     >>> clipped_action([3, -0.5], limits=(1.0, 1.0))
     (1.0, -0.5)
     """
-    numbers = _real_numbers(action, (2,), partial(_refusal, action))
-    speed, turn_rate = numbers.tolist()
+    speed, turn_rate = _real_numbers(action, (2,), partial(_refusal, action)).tolist()
     fastest, quickest = limits
     if not (-fastest <= speed <= fastest and -quickest <= turn_rate <= quickest):
         if not (math.isfinite(speed) and math.isfinite(turn_rate)):

@@ -49,8 +49,7 @@ def normalised_squared_error(errors: Array, covariances: Array) -> Array:
         scaled = errors / std
         correlations = covariances / std[..., :, None] / std[..., None, :]
         whiten = _whiten_few if errors.shape[-1] <= _FEW else _whiten_each
-        white = whiten(scaled, correlations)
-        return np.asarray((white**2).sum(axis=-1))
+        return np.asarray((whiten(scaled, correlations) ** 2).sum(axis=-1))
 
 
 def pose_nees(

@@ -359,22 +359,19 @@ def _readings(
 
     yield read("", claims)
     if name:
-        following = jacobian @ claims @ np.swapaxes(jacobian, -1, -2)
-        yield read("", following)
+        yield read("", jacobian @ claims @ np.swapaxes(jacobian, -1, -2))
     is_diagonal = not np.triu(claims, 1).any()  # as in no covariance of another error
     for kind, title in FRAMES.items():
         if kind != frame and not is_diagonal:
             yield read(f"covariances of {title}", claims, kind)
-    turned = "covariances with headings in degrees"
-    yield read(turned, _TURN @ claims @ _TURN)
+    yield read("covariances with headings in degrees", _TURN @ claims @ _TURN)
     for order, matrix in _ORDERS.items():
         yield read(f"covariances with {order}", matrix @ claims @ matrix.T)
     xx, xy, xt, yy, yt, tt = np.moveaxis(claims[..., *np.triu_indices(3)], -1, 0)
     lower = np.stack([xx, xy, yy, xy, xt, yt, yy, yt, tt], axis=-1)
     by_rows = lower.reshape(claims.shape)
     yield read("the lower triangle of the covariance, row by row", by_rows)
-    std = "standard deviations in place of variances"
-    yield read(std, np.sign(claims) * claims**2)
+    yield read("standard deviations in place of variances", np.sign(claims) * claims**2)
     known = np.isfinite(claims).all(axis=(-2, -1)) & (np.linalg.det(claims) > 0)
     information = np.linalg.inv(np.where(known[..., None, None], claims, np.eye(3)))
     yield read("information matrices in place of covariances", information)

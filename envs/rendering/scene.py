@@ -427,8 +427,7 @@ class Clock(Artist):
         image[..., :3] = self._colour
         image[..., 3] = np.asarray(mask, dtype=np.uint8).reshape(image.shape[:2])
         context = renderer.new_gc()
-        corner = self.get_window_extent().min
-        renderer.draw_image(context, *corner, image[::-1])
+        renderer.draw_image(context, *self.get_window_extent().min, image[::-1])
         context.restore()
 
     def _figure(self) -> Any:

@@ -438,8 +438,7 @@ def final_infos(observations: Infos, infos: Infos, ended: BoolArray) -> Infos:
     dict
         In the form of Gymnasium's same-step mode.
     """
-    count = len(ended)
-    last = np.full(count, None, dtype=object)
+    last = np.full(len(ended), None, dtype=object)
     for world in np.flatnonzero(ended):
         last[world] = {key: value[world].copy() for key, value in observations.items()}
     return {

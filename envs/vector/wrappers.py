@@ -255,8 +255,7 @@ class FlattenBatch(VectorWrapper):  # with type parameters since Gymnasium 1.4 o
         observations, rewards, terminated, truncated, infos = self.env.step(actions)
         if "final_obs" in infos:
             infos["final_obs"] = self._flatten_final(infos["final_obs"])
-        flat = self._flatten(observations)
-        return flat, rewards, terminated, truncated, infos
+        return self._flatten(observations), rewards, terminated, truncated, infos
 
     def _flatten(self, observations: dict[str, Any]) -> Array:
         parts = [

@@ -685,8 +685,7 @@ def _check_std(sensor: Sensor, noise: Array, distances: Array) -> None:
 
 
 def _check_compiled(sensor: Sensor, x: Array, y: Array) -> None:
-    parts = kernel_parts(sensor)
-    expected = parts[bearing_range.expected_reading_jit]
+    expected = kernel_parts(sensor)[bearing_range.expected_reading_jit]
     for k in range(len(x)):
         compiled = expected(float(x[k]), float(y[k]), 0.0)
         plain = sensor.read(x[k : k + 1], y[k : k + 1])[0]

@@ -106,7 +106,7 @@ class PeerSlam(ABC):
             If the arguments are malformed; the belief is then as before.
         """
         readings = argument_checks.scan(measurements)
-        ids = argument_checks.given_identities(landmark_ids, len(readings), self)
+        ids = argument_checks.identities(landmark_ids, len(readings), self)
         argument_checks.refuse_unusable(readings, ids)
         slots = np.array([self._slots.get(i, -1) for i in ids], dtype=np.int64)
         mapped, ranges = slots >= 0, readings[:, 1].copy()

@@ -476,8 +476,7 @@ def _between(first: Array, last: Array, motion: Motion, noise: MotionNoise) -> A
     pose, covariance = np.zeros(3), np.zeros((3, 3))
     for i, (*odometry, dt) in enumerate(motion.steps):
         moved = noise.motion.moved(odometry)
-        variance = noise.over(moved, dt)
-        predict(pose, covariance, pose, 3, *moved, variance, AT_ESTIMATE)
+        predict(pose, covariance, pose, 3, *moved, noise.over(moved, dt), AT_ESTIMATE)
         onward = np.eye(3)
         onward[0, 2] = -(motion.increment[1] - pose[1])
         onward[1, 2] = motion.increment[0] - pose[0]

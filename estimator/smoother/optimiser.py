@@ -188,8 +188,7 @@ class Optimiser:
     def linearised(self, solution: Solution) -> Minimum:
         """Return the system of a solution, which the next call overwrites."""
         stds = self.reading_stds(solution.estimate)
-        information = self.linearise(solution.estimate, stds)
-        return Minimum(self._room, information)
+        return Minimum(self._room, self.linearise(solution.estimate, stds))
 
     def reading_stds(self, estimate: Estimate) -> Array:
         """Return (σβ, σr) of each reading, shape (M, 2), at its expected range."""

@@ -111,9 +111,11 @@ def scan(
     )
 
 
-def identities(landmark_ids: LandmarkIds, count: int) -> list[int]:
-    """Return ids as Python integers: one for each of ``count`` readings, no repeats."""
-    ids: list[int] = identity_array(landmark_ids, count, None).tolist()
+def identities(
+    landmark_ids: LandmarkIds | None, count: int, estimator: object = None
+) -> list[int]:
+    """Return ids as Python integers, without repetition; see `identity_array`."""
+    ids: list[int] = identity_array(landmark_ids, count, estimator).tolist()
     refuse_repeated(ids)
     return ids
 
@@ -176,15 +178,6 @@ def refuse_reserved(ids: Iterable[int]) -> None:
         raise ValueError(
             f"landmark_ids must be >= {LOWEST_ID + RESERVED_IDS}, got {lowest}"
         )
-
-
-def given_identities(
-    landmark_ids: LandmarkIds | None, count: int, estimator: object
-) -> list[int]:
-    """Return the ids of ``count`` readings for an estimator that needs them."""
-    ids: list[int] = identity_array(landmark_ids, count, estimator).tolist()
-    refuse_repeated(ids)
-    return ids
 
 
 def asked_identities(ids: LandmarkIds | None, mapped: Mapping[int, int]) -> list[int]:

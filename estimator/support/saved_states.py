@@ -163,8 +163,7 @@ def is_semidefinite(P: Array) -> bool:
     size = P.shape[-1]
     if not P.size:
         return True
-    trace = np.trace(P, axis1=-2, axis2=-1)
-    slack = ROUNDING * np.maximum(1.0, trace)
+    slack = ROUNDING * np.maximum(1.0, np.trace(P, axis1=-2, axis2=-1))
     try:
         np.linalg.cholesky(P + slack[..., None, None] * np.eye(size))
     except np.linalg.LinAlgError:

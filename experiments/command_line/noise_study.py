@@ -194,8 +194,7 @@ def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
         shown = [effects_table(world.name, runs, effects)]
         return Results(effects, (), noise_effects_figure(effects), 150, shown)
 
-    about = {"runs": runs, "seed": seed}
-    return Study((world.name, f"{runs}-runs"), about, run)
+    return Study((world.name, f"{runs}-runs"), {"runs": runs, "seed": seed}, run)
 
 
 def write_study(study: Study, out: Path | None, reporter: Reporter) -> None:

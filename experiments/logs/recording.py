@@ -77,8 +77,7 @@ def record_episode(
     events: list[Event] = [*_scan(0.0, observation, info), *_fix(0.0, world, info)]
     poses = [info["pose"]]
     for step in range(world.steps):
-        action = controller.act(info["pose"], step)
-        observation, _, _, _, info = env.step(action)
+        observation, _, _, _, info = env.step(controller.act(info["pose"], step))
         distance, turn = observation["odometry"].tolist()
         t = float(step + 1)
         events.append(OdometryRow(t, distance, turn, dt=1.0))

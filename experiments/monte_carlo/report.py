@@ -100,8 +100,7 @@ def write_figures(
     """Write the figures of a report for print, 85 and 170 mm wide; return the names."""
     names = []
     for width in (85, 170):
-        figures = report_figures(dataset, summary, width_mm=width)
-        for name, figure in figures.items():
+        for name, figure in report_figures(dataset, summary, width_mm=width).items():
             names.append(f"{name}_{width}mm.{suffix}")
             with replace_own(folder / names[-1]) as partial:
                 style.draw_file(figure, partial, suffix)

@@ -392,8 +392,7 @@ def problem_with(block: Path, digest: str) -> str:
 
 def digest_of(identity: dict[str, Any]) -> str:
     """Return the digest that identifies a job in its blocks."""
-    text = json.dumps(identity, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
 
 
 def identity_in(path: Path) -> dict[str, Any]:

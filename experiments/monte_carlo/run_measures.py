@@ -444,8 +444,7 @@ def with_known_ids(
         Path errors (B,) [m], and the NEES of the pose (B, T) in both frames; nan in
         runs that fail.
     """
-    plain = settings.unmanaged()
-    trace = filter_runs(plain, runs.identified(), threads=threads).trace
+    trace = filter_runs(settings.unmanaged(), runs.identified(), threads=threads).trace
     gaps = trace.poses[:, :, :2] - runs.true_poses[:, :, :2]
     errors = np.sqrt((gaps**2).sum(axis=2).mean(axis=1))
     posed = runs.true_poses, trace.poses, trace.pose_covariances

@@ -235,9 +235,8 @@ def calibrate(
     noises[:, search.BEARING :] *= FACTORS[:, None]
     whole = replace(likelihood, most_landmarks=len(likelihood.events.readings))
     record = whole.record(noises)
-    frame = likelihood.filter.frame
     nees = [
-        _known_nees(truth, poses, covariances, frame)
+        _known_nees(truth, poses, covariances, likelihood.filter.frame)
         for poses, covariances in zip(
             record.poses, record.pose_covariances, strict=True
         )

@@ -177,8 +177,7 @@ def scores(likelihoods: Likelihoods, theta: Array) -> Scores:
     usable = np.isfinite(above) & np.isfinite(below)
     slopes = np.zeros_like(above)
     slopes[usable] = (above[usable] - below[usable]) / (2 * NARROW)
-    value = float(totals(around[:1])[0])
-    return Scores(value, slopes.sum(axis=1), slopes @ slopes.T)
+    return Scores(float(totals(around[:1])[0]), slopes.sum(axis=1), slopes @ slopes.T)
 
 
 def curvature(likelihoods: Likelihoods, theta: Array, widths: Array) -> Array:

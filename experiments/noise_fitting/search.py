@@ -364,16 +364,13 @@ class LogLikelihood:
 
     def of(self, noises: Array) -> Array:
         """Return the log likelihoods of the steps (B, S) under noises (B, 7)."""
-        return self._passes(noises, keep_beliefs=False).log_likelihoods
+        return self.record(noises, keep_beliefs=False).log_likelihoods
 
-    def record(self, noises: Array) -> DriveRecord:
-        """Return the full records of the passes under noises (B, 7).
+    def record(self, noises: Array, *, keep_beliefs: bool = True) -> DriveRecord:
+        """Return the records of the passes under noises (B, 7).
 
         The poses of each part begin where the filter does.
         """
-        return self._passes(noises, keep_beliefs=True)
-
-    def _passes(self, noises: Array, *, keep_beliefs: bool) -> DriveRecord:
         records = [
             drive_likelihood(
                 self.filter,

@@ -354,10 +354,9 @@ def _digest(code: bytes) -> str:
 
 def _code_of_methods(estimator: object) -> bytes:
     """Return the compiled code of a class's own methods."""
-    members = sorted(vars(estimator).items())
     return b"".join(
         marshal.dumps(member.__code__)
-        for _, member in members
+        for _, member in sorted(vars(estimator).items())
         if inspect.isfunction(member)
     )
 

@@ -206,8 +206,7 @@ def _repair_table(smoothed: SmoothedLog) -> dict[str, Any] | None:
 
 def _nees(smoothed: SmoothedLog) -> dict[str, Any] | None:
     """Summarise the NEES of the poses at the scans, in the invariant frame."""
-    times = smoothed.filtered.trace.t[smoothed.scan_steps]
-    truth = true_poses_of(smoothed.log, times)
+    truth = true_poses_of(smoothed.log, smoothed.filtered.trace.t[smoothed.scan_steps])
     if truth is None:
         return None
     drive, known = smoothed.drive, np.isfinite(truth).all(axis=1)

@@ -224,11 +224,10 @@ def empty_record(
 
     Arrays that the worlds do not have are left out.
     """
-    now = {name: getattr(worlds, name) for name in names}
     return {
         name: np.empty((len(array), times, *array.shape[1:]), array.dtype)
-        for name, array in now.items()
-        if array is not None
+        for name in names
+        if (array := getattr(worlds, name)) is not None
     }
 
 

@@ -330,8 +330,7 @@ def filtered_path(trajectory: Trajectory) -> tuple[Array, dict[int, Array]]:
     if not (np.isfinite(poses).all() and np.isfinite(belief.mean).all()):
         return dead_reckoning(start, trajectory.odometry, batch.motion), {}
     poses[0] = start
-    pairs = zip(belief.landmark_ids, belief.landmarks, strict=True)
-    return poses, dict(pairs)
+    return poses, dict(zip(belief.landmark_ids, belief.landmarks, strict=True))
 
 
 # --------------------------------------------------------------------------------------

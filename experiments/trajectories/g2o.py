@@ -64,8 +64,7 @@ def write(
         ]
         readings = list(_readings(each, smallest_std))
         positions = [position for position, _ in readings]
-        fixed = f"FIX {len(landmarks)}"
-        write_lines(path / f"{name}.g2o", [*graph, *positions, fixed])
+        write_lines(path / f"{name}.g2o", [*graph, *positions, f"FIX {len(landmarks)}"])
         write_lines(
             path / f"{name}_gtsam.g2o", [*graph, *(line for _, line in readings)]
         )

@@ -304,14 +304,12 @@ class ShardWork:
         seeds = [job.seed + episode for episode in episodes]
         driven = drive_episodes(job.scenario, job.controller, seeds, progress=progress)
         if job.estimator is not None:
-            name_of = job.estimator
-            driven = [with_beliefs(each, name_of) for each in driven]
+            driven = [with_beliefs(each, job.estimator) for each in driven]
         number = episodes.start // job.episodes_per_shard
         path = folder / f"shard_{number:05d}{layout.ENDING}"
         options = {name: getattr(job, name) for name in layout.OPTIONS}
         layout.write(driven, path, **options)
-        count = len(episodes)
-        entry = ShardEntry(path.name, episodes.start, count, digest(path))
+        entry = ShardEntry(path.name, episodes.start, len(episodes), digest(path))
         return MadeShard(entry, path)
 
 

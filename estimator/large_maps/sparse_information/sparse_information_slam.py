@@ -157,7 +157,7 @@ gate_probability, noise_at_rest, min_range
             If a covariance is not positive definite; the belief is then unchanged.
         """
         readings = argument_checks.scan(measurements)
-        ids = argument_checks.given_identities(landmark_ids, len(readings), self)
+        ids = argument_checks.identities(landmark_ids, len(readings), self)
         argument_checks.refuse_unusable(readings, ids)
         if isinstance(self._held, EkfSlam) and self._stays_dense(ids):
             return self._held.update(readings, ids)

@@ -191,7 +191,7 @@ class SubmapSlam:
                 f"submap_size must be >= {len(readings)}, the "
                 f"landmarks of one scan, got {self._rule.size}"
             )
-        ids = argument_checks.given_identities(landmark_ids, len(readings), self)
+        ids = argument_checks.identities(landmark_ids, len(readings), self)
         argument_checks.refuse_reserved(ids)
         argument_checks.refuse_unusable(readings, ids)
         self._claim_folder()

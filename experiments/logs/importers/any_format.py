@@ -99,8 +99,7 @@ def read_log(
 
 
 def _folder_of(folder: Path) -> str:
-    is_park = (folder / victoria_park.DRIVE).is_file()
-    return "victoria" if is_park else "utias"
+    return "victoria" if (folder / victoria_park.DRIVE).is_file() else "utias"
 
 
 def _format_of(line: log_lines.LogLine) -> str:
