@@ -118,9 +118,8 @@ class ActiveSlamTask(Restorable):
         self.grid = CoverageGrid(scenario)
         self.prior_std = landmark_prior_std(scenario)
         landmarks, cells = scenario.landmarks.count, len(self.grid.cells)
-        belief = belief_space(landmarks).items()
         flat: dict[str, spaces.Space[Any]] = {
-            **{key: flatten_space(box) for key, box in belief},
+            **{key: flatten_space(box) for key, box in belief_space(landmarks).items()},
             **{
                 key: spaces.Box(0.0 - (key == "goals"), 1.0, (size,), np.float64)
                 for key, size in _SIZES.items()
@@ -215,8 +214,7 @@ class ActiveSlamTask(Restorable):
             rows[:first],
             rows[first:last],
         )
-        plan = self.grid.plan
-        advance(worlds, moving, worlds_now, plan, self._rules, self._scratch)
+        advance(worlds, moving, worlds_now, self.grid.plan, self._rules, self._scratch)
         if self._form.rows:
             landmarks, mask = rows[last:]
             known = self.episodes.known

@@ -382,11 +382,8 @@ class VectorRandomWalk:
     def act(self, poses: ArrayLike, step: int) -> Array:
         """Continue the walks; see `VectorController.act`."""
         array = finite_poses(poses, len(self._state))
-        if step > 0:
-            noise = self._noise_std * self._next_noise()
-            self._state = self._correlation * self._state + noise
-        else:
-            self._state = 0.0 * self._state + self._next_noise()
+        kept, std = (self._correlation, self._noise_std) if step > 0 else (0.0, 1.0)
+        self._state = kept * self._state + std * self._next_noise()
         speed = np.clip(0.5 + self._state[:, 0] / 4, 0.0, 1.0)
         turn = np.clip(self._state[:, 1] / 3 + self._angles_to_home(array), -1.0, 1.0)
         return self._limits * np.column_stack([speed, turn])

@@ -551,9 +551,8 @@ def blame_association(pose: Array, mistakes: Array, known: Array | None) -> Blam
         return Blame(min(1.0, 2 * min(larger, more)), share, text, is_paired=False)
     excess = (pose - known).mean(axis=1) / POSE
     ratio = float(known.mean()) / POSE
-    matters = excess.mean() >= (LEAST_RATIO - 1) * max(1.0, ratio)
     larger = 1.0
-    if matters:
+    if excess.mean() >= (LEAST_RATIO - 1) * max(1.0, ratio):
         from scipy.stats import wilcoxon  # noqa: PLC0415 (slow to import)
 
         larger = float(wilcoxon(excess, alternative="greater").pvalue)

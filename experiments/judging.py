@@ -43,6 +43,7 @@ from .monte_carlo.run_measures import (
     by_id,
     measure_landmarks,
     measure_runs,
+    write_failures,
 )
 from .runs.simulated_runs import SimulatedRuns
 from .trajectories.manifest import MANIFEST, TrajectoryDataset, load_trajectories
@@ -378,12 +379,11 @@ def _measured(
     block = measure_runs(chunk.runs, filtered, chunk.bound, chunk.noise)
     block["readings"][:] = 0  # which of them corrected anything is not known
     for run, each in enumerate(files):
-        if isinstance(each, Estimate) and run not in failures:
-            problem = _add_map(block, run, chunk.runs, each, moved[run, -1])
-            if problem:
-                block["failed"][run], block["failed_at"][run] = True, steps - 1
-                block["message"] = block["message"].astype(object)
-                block["message"][run] = problem
+        if isinstance(each, str) or run in failures:
+            continue
+        if problem := _add_map(block, run, chunk.runs, each, moved[run, -1]):
+            failures[run] = Failure(steps - 1, problem)
+    write_failures(block, failures)
     return _Part(block, (truth, poses, claims, chunk.runs.initial_poses))
 
 

@@ -75,11 +75,7 @@ def broken_rule(message: str) -> PydanticCustomError:
 
 def expect(expectation: str) -> WrapValidator:
     """Replace every error inside a field by one message with the expectation."""
-
-    def validate(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
-        return _expected(value, handler, expectation)
-
-    return WrapValidator(validate)
+    return WrapValidator(lambda value, handler: _expected(value, handler, expectation))
 
 
 def _expected(

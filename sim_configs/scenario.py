@@ -597,15 +597,13 @@ def action_sequence(scenario: Scenario) -> Array:
 def _merge(table: dict[str, Any], changes: Mapping[str, object]) -> dict[str, Any]:
     merged = dict(table)
     for key, change in changes.items():
-        old = table.get(key)
+        merged[key], old = change, table.get(key)
         if isinstance(change, Mapping) and isinstance(old, dict):
             kind = {"landmarks": "layout", "controls": "sequence"}.get(key, "")
             same = change.get(kind, old.get(kind)) == old.get(kind)
             if key == "sensor" and _is_foreign(change, old):
                 old = {name: old[name] for name in old if name != "std"}
             merged[key] = {**old, **change} if same else change
-        else:
-            merged[key] = change
     return merged
 
 
@@ -642,8 +640,7 @@ def _between(ends: tuple[float, float], share: float, *, is_factor: bool) -> flo
 
 def _map_changes(layout: LandmarkLayout, scale: float, shifts: Array) -> dict[str, Any]:
     if layout.layout == "random" and layout.is_redrawn:
-        corners = np.reshape(layout.bounds, (2, 2))
-        bounds = _scaled(corners, scale).ravel().tolist()
+        bounds = _scaled(np.reshape(layout.bounds, (2, 2)), scale).ravel().tolist()
         return {"bounds": tuple(bounds), "min_distance": scale * layout.min_distance}
     positions = place_landmarks(layout, np.random.default_rng(0))  # draws nothing
     points = _scaled(positions, scale) + shifts

@@ -192,8 +192,7 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
         True
         """
         self._begun_worlds()
-        own = *self._generators(), *self._renderers
-        return (*super().state(), copied(own))
+        return (*super().state(), copied((*self._generators(), *self._renderers)))
 
     def restore(self, state: State) -> None:
         """Return to a state of these worlds, which stays usable for further calls."""

@@ -133,8 +133,7 @@ class WorldBatch(Restorable):
         if self._hides_identities:
             self.landmark_ids = np.full((count, rows), -1)
         self._start_estimates = np.zeros((count, 3))
-        shape = count, scenario.landmarks.count
-        self._landmarks = np.zeros(shape, dtype=np.complex128)
+        self._landmarks = np.zeros((count, scenario.landmarks.count), np.complex128)
 
     @property
     def observations(self) -> dict[str, AnyArray]:

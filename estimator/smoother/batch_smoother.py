@@ -17,7 +17,7 @@ from ...arrays import Array, IntArray
 from ..interface import Belief, SlamEstimator, SupportsSmoothing
 from ..map_management.hypotheses import HypothesisSlam
 from ..models.bearing_range import locate_landmark, wrap_angle
-from ..models.sensors import BEARING_RANGE, Sensor
+from ..models.sensors import BEARING_RANGE
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
 from .drive import Drive, Sightings, path_between
@@ -228,17 +228,14 @@ def _landmarks_at(
     """Return where the landmarks start, shape (2n,): as known, or as first read."""
     places = dict(known)
     if len(places) < len(order):
+        sensor = drive.sensor
+        locate = locate_landmark if sensor == BEARING_RANGE else sensor.locate
         for k in range(drive.poses):
             readings, ids = drive.sightings(k)
-            located = _located(drive.sensor, poses[k], readings)
+            located = locate(poses[k], readings).position
             for i, place in zip(ids.tolist(), located, strict=True):
                 places.setdefault(i, place)
     return np.concatenate([places[i] for i in order.tolist()])
-
-
-def _located(sensor: Sensor, pose: Array, readings: Array) -> Array:
-    locate = locate_landmark if sensor == BEARING_RANGE else sensor.locate
-    return locate(pose, readings).position
 
 
 class _Marginals(NamedTuple):

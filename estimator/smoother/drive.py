@@ -416,8 +416,7 @@ def landmark_order(ids: IntArray, firsts: IntArray) -> tuple[IntArray, IntArray]
     by_last = np.argsort(from_the_end, kind="stable")
     last_rows = len(ids) - 1 - from_the_end[by_last]
     last_poses = np.searchsorted(firsts, last_rows, side="right") - 1
-    poses = np.arange(len(firsts) - 1)
-    met = np.searchsorted(-last_poses, -poses, side="right")
+    met = np.searchsorted(-last_poses, -np.arange(len(firsts) - 1), side="right")
     return found[by_last], 2 * met
 
 

@@ -122,8 +122,7 @@ class Optimiser:
         self._robust = noise.kind, noise.scale
         std = rules.first_std, rules.second_std
         near, far = noise.sensor.stds(std, np.array([1.0, 2.0]))
-        varies = bool((near != far).any())
-        self._varies = varies and not rules.noise_as_read
+        self._varies = bool((near != far).any()) and not rules.noise_as_read
         self._owners = np.repeat(np.arange(poses), np.diff(drive.firsts))
         self._by_landmark = np.argsort(drive.columns, kind="stable")
 

@@ -484,14 +484,11 @@ def _toml_value(text: str) -> Any:
 def _refuse_log(name: str) -> None:
     """Refuse a file or folder that is no scenario, and name the command for logs."""
     path = Path(name)
-    if not name or name in list_presets():
-        return
-    if path.suffix == ".toml" or not path.exists():
-        return
-    raise BadInputError(
-        f"{name} is no scenario (a preset or a .toml file); to filter a log: slamgym "
-        f"replay {name}"
-    )
+    if name and name not in list_presets() and path.suffix != ".toml" and path.exists():
+        raise BadInputError(
+            f"{name} is no scenario (a preset or a .toml file); to filter a log: "
+            f"slamgym replay {name}"
+        )
 
 
 def note_noise(

@@ -224,8 +224,7 @@ def smoothing_figures(summary: dict[str, Any]) -> Table:
         ("misfit", f"{ratio} per degree of freedom; 1 is expected"),
     ]
     if (repair := summary["repair"]) is not None:
-        scores = _repaired(repair["first"], repair["last"])
-        rows.append(("association", scores))
+        rows.append(("association", _repaired(repair["first"], repair["last"])))
         rows.append(("unused", f"{repair['unused']} readings, given to no landmark"))
     return named_rows(rows)
 

@@ -109,8 +109,7 @@ def draw_against_truth(axes: Axes, trace: RunTrace) -> list[Artist]:
         keys.insert(1, line)
     if landmarks.any() and trace.true_landmarks is not None:
         truth = trace.true_landmarks[landmarks]
-        few = len(truth) <= _FEW
-        size = 9 if few else 5
+        size = 9 if len(truth) <= _FEW else 5
         (crosses,) = axes.plot(
             *truth.T, "+", color=style.INK, ms=size, mew=size / 7, label="true landmark"
         )

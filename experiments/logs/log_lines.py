@@ -149,8 +149,7 @@ def read_lines(path: str | PathLike[str]) -> list[LogLine]:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = LogLine(str(path), data.count(b"\n", 0, error.start) + 1, "")
-        wrong = f"byte 0x{data[error.start]:02x}"
-        raise line.error("UTF-8 text", wrong) from None
+        raise line.error("UTF-8 text", f"byte 0x{data[error.start]:02x}") from None
     return to_lines(text, str(path))
 
 

@@ -197,7 +197,7 @@ def measure_runs(
     block["position_bound_raw"][:], block["map_bound"][:] = bound[2:4]
     block["noise_sums"] = noise
     block["readings"] = runs.visible.sum(axis=(1, 2))
-    _write_failures(block, failures)
+    write_failures(block, failures)
     return block
 
 
@@ -221,7 +221,8 @@ def _try_to_measure_map(
         return Failure(runs.visible.shape[1] - 1, message)
 
 
-def _write_failures(block: Block, failures: Mapping[int, Failure]) -> None:
+def write_failures(block: Block, failures: Mapping[int, Failure]) -> None:
+    """Note in a block which runs failed, when and why."""
     messages = [""] * len(block["failed"])
     for run, failure in failures.items():
         block["failed"][run] = True

@@ -212,8 +212,7 @@ def consistency_of(
 
 def _unused_readings(scores: EstimatorScores) -> float | None:
     """Divide the readings that a gate or the least range rejected by all readings."""
-    attrs = scores.results.attrs
-    if KNOWN_IDS_ATE in scores.results or attrs.get("readings_may_wait"):
+    if KNOWN_IDS_ATE in scores.results or scores.results.attrs.get("readings_may_wait"):
         return None
     corrected = scores.per_run("nis_dof").sum(axis=1) / 2
     added = scores.per_run("relative_map_dof") / 2

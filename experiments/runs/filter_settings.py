@@ -113,16 +113,13 @@ class FilterSettings:
             ) from error
 
     def scaled(self, sigma: str, factor: float) -> FilterSettings:
-        """Return settings with one of `SIGMAS` multiplied by a factor."""
-        scaled = [
+        """Return settings with one of `SIGMAS` times a factor; "none" keeps all."""
+        stds = (*self.motion_std, *self.measurement_std)
+        scaled = tuple(
             std * factor if name == sigma else std
-            for name, std in zip(
-                SIGMAS, (*self.motion_std, *self.measurement_std), strict=True
-            )
-        ]
-        return replace(
-            self, motion_std=tuple(scaled[:3]), measurement_std=tuple(scaled[3:])
+            for name, std in zip(SIGMAS, stds, strict=True)
         )
+        return replace(self, motion_std=scaled[:3], measurement_std=scaled[3:])
 
     def unmanaged(self) -> FilterSettings:
         """Return the settings of the same filter without landmark management."""
@@ -431,9 +428,8 @@ def _name_of(label: str, what: str | Callable[..., Any]) -> str:
     if isinstance(what, str):
         return OFFLINE.get(what, what)
     module, name = getattr(what, "__module__", ""), getattr(what, "__qualname__", "")
-    path = f"{module}:{name}"
     if module != "__main__" and name.isidentifier():
-        return path
+        return f"{module}:{name}"
     name = label if label not in OWN_NAMES else f"{label} of yours"
     registry.register_estimator(name, what)
     return name

@@ -195,12 +195,11 @@ def _repair_table(smoothed: SmoothedLog) -> dict[str, Any] | None:
     found = smoothed.repair
     if found is None:
         return None
-    ids = np.concatenate(found.ids)
     return {
         "first": finite(found.first_score),
         "last": finite(found.score),
         "landmarks": len(found.drive.landmark_ids),
-        "unused": int((ids < 0).sum()),
+        "unused": int((np.concatenate(found.ids) < 0).sum()),
     }
 
 

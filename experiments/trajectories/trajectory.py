@@ -115,8 +115,7 @@ def array_of(trajectory: Trajectory, name: str) -> AnyArray:
 
 def arrays_to_write(trajectories: Sequence[Trajectory]) -> tuple[str, ...]:
     """Return the names of the arrays; landmark_ids only if identities are hidden."""
-    hidden = not trajectories[0].scenario.sensor.identities
-    names = ARRAYS if hidden else ARRAYS[:-1]
+    names = ARRAYS[:-1] if trajectories[0].scenario.sensor.identities else ARRAYS
     return names if trajectories[0].belief_poses is None else (*names, *BELIEFS)
 
 

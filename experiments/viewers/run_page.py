@@ -406,8 +406,7 @@ def correlations_of(view: MapView) -> Array:
     ndarray, shape (n (n + 1) / 2,)
         As in `CorrelationFrame`; 0 where a position is certain.
     """
-    size = 3 + 2 * len(view.ids)
-    columns = np.r_[0, 1, 3:size]
+    columns = np.r_[0, 1, 3 : 3 + 2 * len(view.ids)]
     P = np.asarray(view.covariance)[np.ix_(columns, columns)]
     count = len(columns) // 2
     one, other = np.tril_indices(count, -1)
