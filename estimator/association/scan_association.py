@@ -87,8 +87,10 @@ class ScanAssociation:
         density = self._density.after(self._readings, new, len(self.confirmed))
         heading = view.covariance[2, 2], len(view.mapped) > 0
         lost = self.detections.lost.with_heading(*heading)
-        strange = sum([label >= known for label in self.labels])
-        lost = lost.with_readings(strange, len(self.labels) - len(new), self._density)
+        if self._is_assigned:
+            strange = sum([label >= known for label in self.labels])
+            others = len(self.labels) - len(new)
+            lost = lost.with_readings(strange, others, self._density)
         detections = Detections(*self.detections[:3], lost, self.detections.path)
         if self._is_assigned and self._policy.association == "hypotheses":
             # A landmark that one scan confirms has no label, and costs nothing.

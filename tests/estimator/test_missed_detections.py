@@ -229,12 +229,14 @@ def test_a_saved_state_holds_the_poses_of_earlier_scans():
     np.testing.assert_array_equal(*paths)
 
 
-def test_a_scan_with_identities_remembers_no_pose():
+def test_a_scan_with_identities_remembers_no_pose_and_weighs_no_readings():
     slam = of_a_circle("hypotheses")
     for x in range(6):
         slam.update(scan_at(np.array([x, 0.0, 0.0])), range(5))
         slam.predict((1.0, 0.0))
-    assert len(slam.best.candidates.detections.path) == 0
+    detections = slam.best.candidates.detections
+    assert len(detections.path) == 0
+    assert (detections.lost.unexplained, detections.lost.explained) == (0, 0)
 
 
 def cost_of_misses(place, std, scans):
