@@ -56,8 +56,6 @@ in scans that change g by Δ, until g falls::
 
     s ← min(g, s + min(|Δ| / 0.3, 1) (g − s) / 5)
 
-s counts by a third more, since it lags behind g.
-
 A robot whose odometry fails where no landmark is in view for sure misses none.  Its
 readings are strange instead: they fit neither the map nor those of earlier scans.  A
 second sum compares the likelihoods of n strange readings and m others if as many are
@@ -129,9 +127,6 @@ LIMIT = 3.0
 #: each of them of this size.
 SCANS, TELLING = 5, 0.3
 
-#: The alarm counts s, which lags behind g, this many times.
-LAG = 4 / 3
-
 #: Half the width of what may hide a landmark, beyond two σ [rad].
 SHADOW = 0.1
 
@@ -194,7 +189,7 @@ class LostEvidence(NamedTuple):
             first_new = max(first_new, 1 + max(mapped, default=-1))
         share = min(abs(more) / TELLING, 1.0) / SCANS
         lasting = min(present, self.lasting + share * (present - self.lasting))
-        changed = present, lasting, max(self.largest, LAG * lasting), first_new
+        changed = present, lasting, max(self.largest, lasting), first_new
         return LostEvidence(*changed, *self[4:])
 
     def with_heading(self, variance: float, has_map: bool = True) -> LostEvidence:

@@ -14,7 +14,6 @@ from slamgym.estimator.association.detections import (
     FEWER,
     HIDDEN,
     HIDDEN_EACH,
-    LAG,
     LIMIT,
     LOST_SCORE,
     MARGIN,
@@ -122,7 +121,7 @@ def evidence_after(known, more, landmarks):
     return known._replace(
         present=present,
         lasting=lasting,
-        largest=max(known.largest, LAG * lasting),
+        largest=max(known.largest, lasting),
         first_new=max(known.first_new, 0 if present > 0 else landmarks),
     )
 
@@ -493,7 +492,7 @@ def test_the_alarm_stays_once_the_map_is_seen_again():
         scores.append(detections.lost.lasting)
     assert scores[39] == scores[-1] == 0
     assert scores[55] > LOST_SCORE
-    assert detections.lost.largest == LAG * max(scores)
+    assert detections.lost.largest == max(scores)
 
 
 def test_the_alarm_does_not_grow_in_scans_that_say_nothing():
