@@ -200,6 +200,22 @@ def test_a_map_stays_accurate_when_its_place_becomes_known(base, std):
     assert_accurate(slam, full, 1e-6)
 
 
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+@pytest.mark.parametrize("std", [0.0, 10.0])
+def test_it_stays_accurate_where_every_scan_changes_a_part_of_the_local_map(base, std):
+    """Two copies of one covariance would drift apart."""
+    rng, noise = np.random.default_rng(0), ((0.04, 0.001, 0.003), (0.001, 0.07))
+    start = {"initial_pose_std": (std, std, 0.1)}
+    slam = CompressedEkfSlam(*noise, base=base, local_size=12, **start)
+    full = BASES[base](*noise, **start)
+    for odometry, readings, ids in wander(60, 80, seen=20):
+        some = rng.choice(20, 6, replace=False)
+        for each in (slam, full):
+            each.predict(odometry)
+            each.update(readings[some], ids[some])
+    assert_accurate(slam, full, 1e-6)
+
+
 @pytest.mark.parametrize("base", BASES)
 def test_any_scale_of_a_phase_gives_the_same_belief(base, monkeypatch):
     """Also a diagonal one, which serves where a covariance is indefinite."""

@@ -234,6 +234,7 @@ class Exchanged(NamedTuple):
     new: IntArray  # ascending columns of the landmarks to store
     places: IntArray  # their rows among those needed
     entering: IntArray  # ascending columns of the landmarks that enter
+    staying: IntArray  # columns of the landmarks that stay, in the order of their rows
 
 
 def exchanged_rows(
@@ -274,6 +275,7 @@ def exchanged_rows(
         pairs([slots[old[k]] for k in new]),
         np.array([place[k] + c for k in new for c in (0, 1)], dtype=np.int64),
         pairs([slots[i] for i in entering]),
+        pairs([slots[old[k]] for k in staying]),
     )
     return rows, dict.fromkeys([old[k] for k in staying] + entering)
 
@@ -318,6 +320,10 @@ class Handover:
             last = min(self.done + self.group, count)
             self._exchange(stored, range(self.done, last))
             self.done = last
+        if self.done == count:  # two copies of a covariance would drift apart
+            rows, needed = self.rows, len(self.rows.needed)
+            across = self._values[rows.left + 3 : needed, rows.entering]
+            self._values[needed:, rows.staying] = across.T
 
     def beginning(self, stored: DeferredCovariance) -> Array:
         """Return the covariance with which a new phase begins, shape (a', a' - 3).
