@@ -69,27 +69,14 @@ def without_lost(view: MapView, rules: Constellations, within: float) -> MapView
     return _part(view, np.flatnonzero(~is_lost & is_near))
 
 
-def doubtful_after(
-    view: MapView, rules: Constellations, added: Collection[int], doubtful: set[int]
-) -> set[int]:
-    """Return the doubtful landmarks once some were added to the map."""
-    doubtful = doubtful & set(view.mapped)
-    new = np.array([k for k, i in enumerate(view.ids) if i in added], dtype=np.int64)
-    if not len(new) or not (is_lost := lost(view, rules)).any():
-        return doubtful
-    squared, _ = _offsets(view, new, np.flatnonzero(is_lost))
-    fitting = new[(squared <= OFFSET_GATE).any(axis=1)]
-    return doubtful | {view.ids[k] for k in fitting.tolist()}
-
-
 def same_landmarks(
     view: MapView,
     rules: Constellations,
     added: Collection[int],
     doubtful: set[int],
     within: float,
-) -> Pairs:
-    """Return landmarks to merge after a scan.
+) -> tuple[set[int], Pairs]:
+    """Return the doubtful landmarks after a scan, and the landmarks to merge.
 
     Parameters
     ----------
@@ -99,16 +86,23 @@ def same_landmarks(
     added : collection of int
         Landmarks that the scan has added to the map.
     doubtful : set of int
-        Landmarks that may be older, lost ones.
+        Those before the scan: landmarks that may be older, lost ones.
     within : float
         Reach of the readings [m].
     """
+    is_lost, doubtful = lost(view, rules), doubtful & set(view.mapped)
+    new = np.array([k for k, i in enumerate(view.ids) if i in added], dtype=np.int64)
+    if len(new) and is_lost.any():
+        squared, _ = _offsets(view, new, np.flatnonzero(is_lost))
+        fitting = new[(squared <= OFFSET_GATE).any(axis=1)]
+        doubtful |= {view.ids[k] for k in fitting.tolist()}
     slots = [k for k, i in enumerate(view.ids) if i in doubtful]
     if not slots:
-        return []
-    is_lost, accurate = lost(view, rules), ACCURATE * rules.lost_std
-    found = _found_again(view, np.array(slots), is_lost, accurate)
-    return found if found or not added else _recognised(view, is_lost, within, rules)
+        return doubtful, []
+    pairs = _found_again(view, np.array(slots), is_lost, ACCURATE * rules.lost_std)
+    if added and not pairs:
+        pairs = _recognised(view, is_lost, within, rules)
+    return doubtful, pairs
 
 
 def _found_again(

@@ -15,7 +15,7 @@ from ..association.scan_association import ScanAssociation
 from ..filters.conditioning import separation
 from ..interface import MapView
 from ..support import saved_states
-from .loop_closing import Pairs, doubtful_after, lost, same_landmarks, without_lost
+from .loop_closing import Pairs, lost, same_landmarks, without_lost
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy
 
@@ -199,8 +199,8 @@ class MapPruner:
         if rules is None or not (added or records.doubtful):
             return []
         within, view = self._policy.reach(readings), self.view_around(readings)
-        records.doubtful = doubtful_after(view, rules, added, records.doubtful)
-        pairs = same_landmarks(view, rules, added, records.doubtful, within)
+        found = same_landmarks(view, rules, added, records.doubtful, within)
+        records.doubtful, pairs = found
         return pairs if pairs and self._joined(pairs) else []
 
     def _keep_capacity(self, seen: set[int]) -> list[int]:
