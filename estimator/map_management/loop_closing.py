@@ -121,10 +121,7 @@ def _found_again(
     best = squared.argmin(axis=1)
     rows = np.arange(len(doubtful))
     good = (squared[rows, best] <= SAME_GATE) & (squared.argmin(axis=0)[best] == rows)
-    return [
-        (view.ids[older[best[row]]], view.ids[doubtful[row]])
-        for row in np.flatnonzero(good).tolist()
-    ]
+    return _named(view, older[best[good]], doubtful[good])
 
 
 def _recognised(
@@ -150,10 +147,13 @@ def _recognised(
     match = match_constellations(places, feasible, rules)
     if match is None:
         return []
-    return [
-        (view.ids[older[p]], view.ids[local[i]])
-        for i, p in zip(match.local.tolist(), match.older.tolist(), strict=True)
-    ]
+    return _named(view, older[match.older], local[match.local])
+
+
+def _named(view: MapView, kept: IntArray, gone: IntArray) -> Pairs:
+    """Return the identities of landmarks, given by their places in a view."""
+    pairs = zip(kept.tolist(), gone.tolist(), strict=True)
+    return [(view.ids[i], view.ids[j]) for i, j in pairs]
 
 
 @jit
