@@ -49,7 +49,7 @@ from ..support.undo import Undo, attributes, undo_all, undone_on_error
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy
 from .pruning import MapPruner
-from .recent_scans import RecentScan, RecentScans
+from .recent_scans import FedScans, RecentScans
 
 
 class ManagedSlam:
@@ -274,26 +274,21 @@ class ManagedSlam:
         with undone_on_error(self.bookmark_views(), unless_moved=self):
             plan = associate()
             missed = self._pruner.expected(readings) - plan.explained
-            scans, first = self._recent.with_scan(readings, plan)
-            step = partial(self._recent.feed, scans, first, plan)
-            follow = partial(self._follow, readings, plan, missed, scans, first)
-            if first is None:
+            fed = self._recent.with_scan(readings, plan)
+            step = partial(self._recent.feed, fed)
+            follow = partial(self._follow, readings, fed, missed)
+            if fed.first is None:
                 return advance(self._filter, step, follow, undo_all(), self.bookmark)
             # The filter repeats its steps since a saved state, in new arrays.
             with undone_on_error(self.bookmark()):
                 return follow(step())
 
     def _follow(
-        self,
-        readings: Array,
-        plan: ScanAssociation,
-        missed: set[int],
-        scans: list[RecentScan],
-        first: int | None,
-        report: UpdateReport,
+        self, readings: Array, fed: FedScans, missed: set[int], report: UpdateReport
     ) -> UpdateReport:
         """Do what follows an update of the filter; return the whole report."""
-        self._recent.note_scan(plan, scans, first, report)
+        plan = fed.plan
+        self._recent.note_scan(fed, report)
         self._editor.expire()
         view = self._pruner.view_around(readings)
         self.candidates = plan.candidates_after(view)

@@ -101,27 +101,25 @@ class RecentScans(Restorable):
                     removed=(*last.removed, *removed), merged=(*last.merged, *merged)
                 )
 
-    def with_scan(
-        self, readings: Array, plan: ScanAssociation
-    ) -> tuple[list[RecentScan], int | None]:
-        """Return the last scans with a new one, and the first to repeat, if any."""
+    def with_scan(self, readings: Array, plan: ScanAssociation) -> FedScans:
+        """Return what to feed to the filter: a new scan, and earlier ones to repeat."""
         decided = tuple(plan.row_ids), tuple(plan.labels)
         # The caller may reuse the array of readings.
         scan = RecentScan(plan.scan, self.motions, readings.copy(), *decided)
         if not self._window:
-            return [scan], None
+            return FedScans(plan, [scan], None)
         if scan.begins:
             scan = scan._replace(before=self._slam.state_dict())
         scans = [*self.scans, scan][-self._window - 1 :]
-        return scans, _relabel(scans, plan.confirmed) if plan.confirmed else None
+        first = _relabel(scans, plan.confirmed) if plan.confirmed else None
+        return FedScans(plan, scans, first)
 
-    def feed(
-        self, scans: list[RecentScan], first: int | None, plan: ScanAssociation
-    ) -> UpdateReport:
+    def feed(self, fed: FedScans) -> UpdateReport:
         """Update the filter with the last scan, and with earlier sightings if any.
 
         The scans are repeated until no sighting contradicts those before it.
         """
+        plan, scans, first = fed
         if first is None:
             return scans[-1].feed(self._slam)
         reports = self._repeat(scans, first)
@@ -129,14 +127,9 @@ class RecentScans(Restorable):
             reports = self._repeat(scans, first)
         return reports[-1]
 
-    def note_scan(
-        self,
-        plan: ScanAssociation,
-        scans: list[RecentScan],
-        first: int | None,
-        report: UpdateReport,
-    ) -> None:
+    def note_scan(self, fed: FedScans, report: UpdateReport) -> None:
         """Remember a scan that the filter has taken in."""
+        plan, scans, first = fed
         if self._window:
             self.scans, self.motions = scans, ()
         self.decisions.append(_decided(plan, report))
@@ -184,6 +177,17 @@ class RecentScans(Restorable):
         ]
         self.motions = _as_tuples(saved["motions"].tolist())
         self.decisions = []
+
+
+class FedScans(NamedTuple):
+    """What one update feeds to a filter: a new scan, and earlier ones once more."""
+
+    #: Association of the present scan.
+    plan: ScanAssociation
+    #: The scans kept, the present one last.
+    scans: list[RecentScan]
+    #: Index of the first scan to repeat, if any.
+    first: int | None
 
 
 def _decided(plan: ScanAssociation, report: UpdateReport) -> ScanDecisions:
