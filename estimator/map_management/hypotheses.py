@@ -274,20 +274,15 @@ class HypothesisSlam:
                     (h.cost, k, partial(h.slam.as_given, readings, given))
                     for k, h in enumerate(self.hypotheses)
                 ]
-            plans = [complete() for _, _, complete in options]
-            slams = self._branches([k for _, k, _ in options])
-            return self._take(readings, [cost for cost, *_ in options], plans, slams)
+            return self._take(readings, options)
 
-    def _take(
-        self,
-        readings: Array,
-        costs: Sequence[float],
-        plans: Sequence[ScanAssociation],
-        slams: Sequence[ManagedSlam],
-    ) -> UpdateReport:
+    def _take(self, readings: Array, options: Sequence[Option]) -> UpdateReport:
         """Update filters by their associations, and continue with the best of them."""
         errors: dict[int, Exception] = {}
         before = self._slams
+        costs, origins, completions = zip(*options, strict=True)
+        plans = [complete() for complete in completions]
+        slams = self._branches(origins)
 
         def take(k: int) -> None:
             try:
