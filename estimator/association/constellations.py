@@ -255,11 +255,8 @@ def moved_gaps(places: TwoPlaces, match: Match) -> Array:
 
 def is_plausible(places: TwoPlaces, match: Match) -> bool:
     """Test shape and displacement of a match, with the heading free."""
-    fit = misfit(places, match)
-    freedom = 2 * len(match.local) - 3
-    return bool(
-        fit.shape <= chdtri(freedom, TAIL) and fit.displacement <= chdtri(2, TAIL)
-    )
+    freedom = 2 * len(match.local) - 3, 2  # of the two parts of a misfit
+    return bool(np.all(misfit(places, match) <= chdtri(freedom, TAIL)))
 
 
 def misfit(places: TwoPlaces, match: Match) -> Misfit:
@@ -316,9 +313,8 @@ def is_filled(places: TwoPlaces, match: Match) -> bool:
     a, b = _matched(places, match)
     local, older = _complex(places.local) - a.mean(), _complex(places.older) - b.mean()
     radius = np.abs(older[match.older]).max()
-    k = len(match.local)
     inside = max(int((np.abs(x) <= radius).sum()) for x in (local, older))
-    return k >= PARTNERS * inside
+    return len(a) >= PARTNERS * inside
 
 
 def _offsets(places: TwoPlaces, match: Match, phi: float) -> tuple[Array, Array]:
