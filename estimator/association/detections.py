@@ -155,8 +155,6 @@ Scan = tuple[IntArray, IntArray, Array]
 
 EMPTY: Scan = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2))
 
-NO_PATH = np.empty((0, 13))
-
 #: Variance of a heading that is equally likely everywhere [rad²].
 UNIFORM = np.pi**2 / 3
 
@@ -251,7 +249,7 @@ class Detections(NamedTuple):
     lost: LostEvidence = LostEvidence()
     #: Beliefs about poses of scans: rows of the number of the scan, (x, y, θ), and P,
     #: shape (p, 13).
-    path: Array = NO_PATH
+    path: Array = np.empty((0, 13))
 
     def after(
         self, view: MapView, scan: Scan, longest: float

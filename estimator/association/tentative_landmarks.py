@@ -39,8 +39,6 @@ Masks = NDArray[np.uint64]
 #: Cells over the bearings, and over the ranges up to the longest reading.
 SECTORS, RINGS = 16, 8
 
-NO_COUNTS = np.zeros((SECTORS, RINGS))
-
 #: Weight of a scan relative to the one after it, in running averages.
 MEMORY = 0.98
 
@@ -178,7 +176,7 @@ class UnexplainedDensity(NamedTuple):
     #: Longest range read of a landmark that was seen before; 0: none yet [m].
     known: float = 0.0
     #: How many readings each sector and ring has shown, shape (SECTORS, RINGS).
-    cells: Array = NO_COUNTS
+    cells: Array = np.zeros((SECTORS, RINGS))
 
     def at(self, readings: Array) -> Array:
         """Return the density at readings (m, 2), shape (m,) [1 / (rad m)].
