@@ -139,7 +139,7 @@ class ScanAssociation:
         first sighting of that landmark may have been an outlier.
         """
         tentative, readings = self._tentative, self._readings
-        density = _assumed_density(self._policy, self._density, readings[rows])
+        density = self._density.at(readings[rows], self._policy.density)
         view = tentative.view()
         found = assign_scan(self._policy, view, readings[rows], noise, density, most=1)
         slots = found.ranked[0].slots
@@ -317,7 +317,7 @@ def _unexplained_density(
     A tentative landmark of one sighting is a landmark with the probability that the
     scans so far suggest; one of more sightings surely is.
     """
-    density = _assumed_density(policy, candidates.density, readings)
+    density = candidates.density.at(readings, policy.density)
     if policy.association in ("nearest", "compatibility"):  # they use none
         return density
     tentative = candidates.tentative.next_scan(policy.confirm[1])
@@ -327,12 +327,3 @@ def _unexplained_density(
     share = np.where(tentative.sightings > 1, 1.0, candidates.density.landmark_share)
     again = share * np.exp(-fit.unlikelihood / 2) / (2 * np.pi)
     return np.asarray(density + again.max(axis=1))
-
-
-def _assumed_density(
-    policy: AssociationPolicy, learned: UnexplainedDensity, readings: Array
-) -> Array:
-    """Return the density that the policy gives, or else the learned one."""
-    if policy.density is not None:
-        return np.full(len(readings), policy.density)
-    return learned.at(readings)

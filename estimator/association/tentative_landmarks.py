@@ -178,8 +178,10 @@ class UnexplainedDensity(NamedTuple):
     #: How many readings each sector and ring has shown, shape (SECTORS, RINGS).
     cells: Array = np.zeros((SECTORS, RINGS))
 
-    def at(self, readings: Array) -> Array:
+    def at(self, readings: Array, assumed: float | None = None) -> Array:
         """Return the density at readings (m, 2), shape (m,) [1 / (rad m)].
+
+        A density that the policy assumes replaces the one that the scans suggest.
 
         New landmarks come into view at certain bearings and ranges, most of them far
         ahead.  The density is the product of the shares p of its sector and its ring::
@@ -189,6 +191,8 @@ class UnexplainedDensity(NamedTuple):
         with n readings per scan, r the longest range, and half a reading added to every
         sector and ring.
         """
+        if assumed is not None:
+            return np.full(len(readings), assumed)
         mean = self.per_scan / (2 * np.pi * self.longest)
         density = np.empty(len(readings))
         _fill_density(self.cells, readings, self.longest, mean, density)
