@@ -96,7 +96,6 @@ class MapPruner:
         if ids:
             self._editor.remove(ids)
             self.records.follow(self._editor.map_view().mapped)
-            self.records.forget_pairs(ids)
         return ids
 
     def join(self, pairs: Pairs) -> None:
@@ -276,8 +275,7 @@ class LandmarkRecords(Restorable):
         """Adopt the order of the map: keep records of its landmarks, start new ones."""
         if self.ids == tuple(ids):
             return
-        old = {i: k for k, i in enumerate(self.ids)}
-        rows = np.array([old.get(i, -1) for i in ids], dtype=np.int64)
+        rows = np.array([self._slots.get(i, -1) for i in ids], dtype=np.int64)
         fresh = rows < 0
         for name in ("misses", "information"):
             before = getattr(self, name)
@@ -285,6 +283,7 @@ class LandmarkRecords(Restorable):
             after[~fresh] = before[rows[~fresh]]
             setattr(self, name, after)
         self._slots = {i: k for k, i in enumerate(ids)}
+        self.apart = {pair for pair in self.apart if self._slots.keys() >= {*pair}}
         self.ids = tuple(ids)  # last: an interrupted call begins anew
 
     def note_sightings(
@@ -332,11 +331,6 @@ class LandmarkRecords(Restorable):
         earlier = {i: kept for i, j in self.aliases.items() if j == gone}
         self.aliases = {**self.aliases, gone: kept, **earlier}
         self.apart = {_renamed(pair, gone, kept) for pair in self.apart}
-
-    def forget_pairs(self, ids: Sequence[int]) -> None:
-        """Drop which landmarks are known to differ from removed ones."""
-        gone = set(ids)
-        self.apart = {pair for pair in self.apart if gone.isdisjoint(pair)}
 
     def by_information(self, ids: Sequence[int]) -> list[int]:
         """Sort landmarks by information, the least first, of equals the newest."""
