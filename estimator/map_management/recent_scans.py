@@ -95,8 +95,7 @@ class RecentScans(Restorable):
         self.scans = [*self.scans]
         noted: tuple[list[Any], ...] = self.decisions, self.scans
         for scans in noted:
-            if scans:
-                last = scans[-1]
+            for last in scans[-1:]:
                 scans[-1] = last._replace(
                     removed=(*last.removed, *removed), merged=(*last.merged, *merged)
                 )
