@@ -42,8 +42,7 @@ class MapPruner:
 
     def __init__(self, policy: LandmarkPolicy, editor: MapEditor, noise: Noise) -> None:
         self._policy, self._editor = policy, editor
-        bearing_std, range_std, per_metre = np.maximum(noise[:3], 1e-12).tolist()
-        self._noise = bearing_std, range_std, per_metre, noise.bearing_std_metres
+        self._noise = *np.maximum(noise[:3], 1e-12).tolist(), noise.bearing_std_metres
         self.records = LandmarkRecords()
 
     def forget(self) -> None:
@@ -204,15 +203,12 @@ class MapPruner:
 
     def _keep_capacity(self, seen: set[int]) -> list[int]:
         """Remove the landmarks of least information, first among those not seen."""
-        capacity = self._policy.capacity
-        if capacity is None:
+        capacity, mapped = self._policy.capacity, self._editor.map_view().mapped
+        if capacity is None or len(mapped) <= capacity:
             return []
-        ids = list(self._editor.map_view().mapped)
-        if len(ids) <= capacity:
-            return []
-        ranked = self.records.by_information(ids)
+        ranked = self.records.by_information(mapped)
         ranked.sort(key=seen.__contains__)
-        return self.remove(ranked[: len(ids) - capacity])
+        return self.remove(ranked[: len(mapped) - capacity])
 
 
 def _distances(some: Array, others: Array) -> Array:
@@ -223,11 +219,6 @@ def _distances(some: Array, others: Array) -> Array:
 
 def _ordered(i: int, j: int) -> tuple[int, int]:
     return (i, j) if i < j else (j, i)
-
-
-def _renamed(pair: tuple[int, int], old: int, new: int) -> tuple[int, int]:
-    i, j = (new if landmark_id == old else landmark_id for landmark_id in pair)
-    return _ordered(i, j)
 
 
 class LandmarkRecords(Restorable):
@@ -330,13 +321,15 @@ class LandmarkRecords(Restorable):
         misses[i] = min(misses[i], misses[j])
         earlier = {i: kept for i, j in self.aliases.items() if j == gone}
         self.aliases = {**self.aliases, gone: kept, **earlier}
-        self.apart = {_renamed(pair, gone, kept) for pair in self.apart}
+        names = {gone: kept}
+        self.apart = {_ordered(*(names.get(i, i) for i in pair)) for pair in self.apart}
 
     def by_information(self, ids: Sequence[int]) -> list[int]:
         """Sort landmarks by information, the least first, of equals the newest."""
-        xx, xy, yy = self.information[self.slots(ids)[::-1]].T
+        newest_first = ids[::-1]
+        xx, xy, yy = self.information[self.slots(newest_first)].T
         order = np.argsort(xx * yy - xy * xy, kind="stable")
-        return [ids[len(ids) - 1 - k] for k in order.tolist()]
+        return [newest_first[k] for k in order.tolist()]
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all, as arrays."""
