@@ -292,8 +292,7 @@ class ManagedSlam:
         self._editor.expire()
         view = self._pruner.view_around(readings)
         self.candidates = plan.candidates_after(view)
-        used = {i for i in plan.row_ids if i is not None}
-        seen = used.intersection(view.ids)
+        seen = set(view.ids).intersection(plan.row_ids)
         seen -= {*report.rejected_ids, *report.skipped_ids}
         removed, merged = self._pruner.prune(readings, plan, seen, missed)
         self._recent.note_edits(removed, merged)
