@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from math import exp, inf
+from math import exp, inf, log, pi
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,8 +34,6 @@ from ..support import argument_checks
 BRANCH_SPREAD = 16.0
 
 TINY = float(np.finfo(np.float64).tiny)
-
-TWO_LN_2PI = float(2 * np.log(2 * np.pi))
 
 #: Beliefs with the same landmarks are one if no coordinate changes by more σ.
 SAME = 1.0
@@ -203,7 +201,7 @@ def missing_costs(density: Array) -> Array:
     >>> missing_costs(np.array([0.02])).round(2)
     array([4.15])
     """
-    return np.asarray(-2 * np.log(density) - TWO_LN_2PI)
+    return np.asarray(-2 * np.log(density) - 2 * log(2 * pi))
 
 
 ASSOCIATIONS = ("auto", "nearest", "joint", "compatibility", "hypotheses")
@@ -414,8 +412,7 @@ def innovation_distances(
     """
     shape = (len(readings), len(view.ids))
     fit = Distances(np.full(shape, np.inf), np.full(shape, np.inf))
-    if fit.squared.size:
-        _compare(*view[:2], readings, tuple(noise), largest, tuple(fit))
+    _compare(*view[:2], readings, tuple(noise), largest, tuple(fit))
     return fit
 
 
