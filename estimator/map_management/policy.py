@@ -209,10 +209,8 @@ class FieldOfView:
             aside = np.abs(wrap_angle(bearing[:, None] - readings[:, 0]))
             in_front = readings[:, 1] < distance[:, None]
             expected &= ~((aside <= self.shadow) & in_front).any(axis=1)
-        if self.visible is not None and expected.any():
-            expected[expected] = _checked_answer(
-                self.visible, pose, landmarks[expected]
-            )
+        if (visible := self.visible) is not None and expected.any():
+            expected[expected] = _checked_answer(visible, pose, landmarks[expected])
         return np.asarray(expected)
 
 
@@ -220,7 +218,7 @@ Visibility = Callable[[Array, Array], BoolArray]
 
 
 def _checked_answer(visible: Visibility, pose: Array, landmarks: Array) -> BoolArray:
-    answer = np.asarray(visible(pose.copy(), landmarks.copy()))
+    answer = np.asarray(visible(pose.copy(), landmarks))
     if answer.shape != (len(landmarks),) or answer.dtype != np.bool_:
         raise ValueError(
             f"visible must return {len(landmarks)} booleans, one per landmark, "
