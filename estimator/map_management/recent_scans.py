@@ -118,11 +118,11 @@ class RecentScans(Restorable):
 
         The scans are repeated until no sighting contradicts those before it.
         """
-        plan, scans, first = fed
+        _, scans, first = fed
         if first is None:
             return scans[-1].feed(self._slam)
         reports = self._repeat(scans, first)
-        while _drop_contradicted(scans, reports, {*plan.confirmed}, self._gate):
+        while _drop_contradicted(fed, reports, self._gate):
             reports = self._repeat(scans, first)
         return reports[-1]
 
@@ -228,24 +228,20 @@ def _relabel(scans: list[RecentScan], confirmed: Mapping[int, int]) -> int | Non
 
 
 def _drop_contradicted(
-    scans: list[RecentScan],
-    reports: Sequence[UpdateReport],
-    confirmed: set[int],
-    gate: float,
+    fed: FedScans, reports: Sequence[UpdateReport], gate: float
 ) -> bool:
     """Drop the sightings before one that contradicts them; return whether any were.
 
     Parameters
     ----------
-    scans : list of RecentScan
-        The scans kept.
+    fed : FedScans
+        The scans, which are changed in place.
     reports : sequence of UpdateReport
         Of the last ones of them.
-    confirmed : set of int
-        The landmarks confirmed in the present scan.
     gate : float
         Largest νᵀ S⁻¹ ν of a sighting, given the other readings of its scan.
     """
+    scans, confirmed = fed.scans, {*fed.plan.confirmed}
     first = len(scans) - len(reports)
     for k, report in enumerate(reports):
         if len(report.innovation) != len(report.associated_ids):
