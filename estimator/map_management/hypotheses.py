@@ -264,7 +264,7 @@ class HypothesisSlam:
         """
         readings = argument_checks.scan(measurements)
         views = (h.slam.bookmark_views() for h in self.hypotheses)
-        undo = undo_all(*views, self._pool.bookmark())
+        undo = undo_all(*views, attributes(self._pool))
         with undone_on_error(undo, unless_moved=self):
             if landmark_ids is None:
                 options = self._options(readings)
@@ -407,7 +407,7 @@ class HypothesisSlam:
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
         slams = (h.slam.bookmark() for h in self.hypotheses)
-        return undo_all(*slams, attributes(self), self._pool.bookmark())
+        return undo_all(*slams, attributes(self, self._pool))
 
     def report(self) -> UpdateReport | None:
         """Return the report of the last update once more."""
@@ -479,10 +479,6 @@ class FilterPool:
         copied = self.fresh()
         copied.resume(slam.snapshot())
         return copied
-
-    def bookmark(self) -> Undo:
-        """Return what takes back which filters nobody uses."""
-        return attributes(self)
 
     def free(self, slams: Iterable[ManagedSlam]) -> None:
         """Take filters back."""
