@@ -283,9 +283,8 @@ def extended(places: TwoPlaces, match: Match) -> Match:
 
     A pair is added if it passes the gate and each landmark is the other's nearest.
     """
-    m, n = len(places.local), len(places.older)
-    left = np.setdiff1d(np.arange(m), match.local)
-    free = np.setdiff1d(np.arange(n), match.older)
+    left = np.setdiff1d(np.arange(len(places.local)), match.local)
+    free = np.setdiff1d(np.arange(len(places.older)), match.older)
     gaps = moved_gaps(places, match)[np.ix_(left, free)]
     if not gaps.size:
         return match
