@@ -102,21 +102,46 @@ def match_constellations(
     >>> match.local.tolist(), match.older.tolist()
     ([0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 4, 5])
     """
-    pairs = _candidates(feasible)
-    if len(np.unique(pairs[:, 0])) < rules.least:
+    found = agreeing_pairs(places, feasible, rules, most=2)
+    if len(found) != 1 or not len(found[0].local):
         return None
+    match = extended(places, found[0])
+    is_same = is_plausible(places, match) and is_filled(places, match)
+    return match if is_same else None
+
+
+def agreeing_pairs(
+    places: TwoPlaces, feasible: BoolArray, rules: Constellations, most: int
+) -> list[Match]:
+    """Return the largest sets of pairs that agree, each with another displacement.
+
+    The second and later ones are those that are nearly as large as the first.  An empty
+    one at the end says that the search has reached its limit.
+    """
+    pairs, found = _candidates(feasible), list[Match]()
+    if len(np.unique(pairs[:, 0])) < rules.least:
+        return found
     local, older = tables(places)
     agree = np.zeros((len(pairs), len(pairs)), dtype=np.bool_)
     compare_pairs(pairs, local, older, DISTANCE_GATE, places.largest_turn, agree)
-    clique = largest_clique(pairs, agree, rules.least - 1, rules.search_nodes)
-    if not len(clique):
-        return None
-    match = Match(*pairs[clique].T)
-    if _has_rival(places, match, pairs, agree, rules):
-        return None
-    match = extended(places, match)
-    is_same = is_plausible(places, match) and is_filled(places, match)
-    return match if is_same else None
+    floor = rules.least - 1
+    while len(found) < most:
+        clique = np.zeros(len(places.local) + 1, dtype=np.int64)
+        size, visited = search_clique(pairs, agree, floor, rules.search_nodes, clique)
+        is_complete = visited < rules.search_nodes
+        if not size and is_complete:
+            break
+        match = Match(*pairs[clique[: size if is_complete else 0]].T)
+        found.append(match)
+        if not is_complete:
+            break
+        gaps = moved_gaps(places, match)
+        worst = gaps[match.local, match.older].max()
+        others = gaps[pairs[:, 0], pairs[:, 1]] > RIVAL_GAP * worst
+        pairs, agree = pairs[others], agree[np.ix_(others, others)]
+        k = len(found[0].local)
+        floor = max(min(k - rules.margin, int(RIVAL_SHARE * k)), 2)
+    return found
 
 
 def _candidates(feasible: BoolArray) -> IntArray:
@@ -150,28 +175,6 @@ def largest_clique(
     clique = np.zeros(pairs[:, 0].max(initial=-1) + 2, dtype=np.int64)
     size, visited = search_clique(pairs, agree, floor, nodes, clique)
     return clique[: size if visited < nodes else 0]
-
-
-def _has_rival(
-    places: TwoPlaces,
-    match: Match,
-    pairs: IntArray,
-    agree: BoolArray,
-    rules: Constellations,
-) -> bool:
-    """Return whether another displacement explains nearly as many landmarks.
-
-    The pairs that the displacement of the match explains are left out.
-    """
-    gaps = moved_gaps(places, match)
-    worst = gaps[match.local, match.older].max()
-    others = gaps[pairs[:, 0], pairs[:, 1]] > RIVAL_GAP * worst
-    k = len(match.local)
-    floor = max(min(k - rules.margin, int(RIVAL_SHARE * k)), 2)
-    clique = np.zeros(len(places.local) + 1, dtype=np.int64)
-    rest = pairs[others], agree[np.ix_(others, others)]
-    size, visited = search_clique(*rest, floor, rules.search_nodes, clique)
-    return size > 0 or visited >= rules.search_nodes
 
 
 def _blocks(covariance: Array) -> Array:

@@ -47,6 +47,9 @@ PER_BASIN = 3
 #: Least variance of a pose that counts [m², rad²].
 NIL = 1e-12
 
+#: Covariance around a place that a scan shows [m², rad²].
+AROUND = np.diag([0.25, 0.25, 0.0225])
+
 #: Two poses overlap up to this Bhattacharyya distance in every coordinate.
 OVERLAP = 0.5
 
@@ -266,23 +269,26 @@ class HypothesisSlam:
         views = (h.slam.bookmark_views() for h in self.hypotheses)
         undo = undo_all(*views, attributes(self._pool))
         with undone_on_error(undo, unless_moved=self):
+            known = self.hypotheses
             if landmark_ids is None:
-                options = self._options(readings)
+                known = [*known, *self._at_places(readings)]
+                options = self._options(known, readings)
             else:
                 given = argument_checks.identities(landmark_ids, len(readings))
                 options = [
                     (h.cost, k, partial(h.slam.as_given, readings, given))
-                    for k, h in enumerate(self.hypotheses)
+                    for k, h in enumerate(known)
                 ]
-            return self._take(readings, options)
+            return self._take(readings, options, [h.slam for h in known])
 
-    def _take(self, readings: Array, options: Sequence[Option]) -> UpdateReport:
+    def _take(
+        self, readings: Array, options: Sequence[Option], before: Sequence[ManagedSlam]
+    ) -> UpdateReport:
         """Update filters by their associations, and continue with the best of them."""
         errors: dict[int, Exception] = {}
-        before = self._slams
         costs, origins, completions = zip(*options, strict=True)
         plans = [complete() for complete in completions]
-        slams = self._branches(origins)
+        slams = self._branches([before[k] for k in origins])
 
         def take(k: int) -> None:
             try:
@@ -413,11 +419,26 @@ class HypothesisSlam:
         """Return the report of the last update once more."""
         return self._report
 
-    def _options(self, readings: Array) -> list[Option]:
+    def _at_places(self, readings: Array) -> list[Hypothesis]:
+        """Return the parts of the hypotheses around the places that a scan shows.
+
+        The part around a pose c is the prior N(x; x̂, P) times exp(−½ ‖x − c‖²) in the
+        metric of R.  Its weight is N(c; x̂, P + R) relative to N(0; 0, R).
+        """
+        parts = []
+        for h in self.hypotheses:
+            for pose in h.slam.poses_of_scan(readings):
+                slam = self._pool.copy(h.slam)
+                report = slam.observe_pose(pose, np.eye(3), AROUND)
+                cost = cost_of(report) - log(np.linalg.det(AROUND))
+                parts.append(Hypothesis(h.cost + cost, slam))
+        return parts
+
+    def _options(self, known: Sequence[Hypothesis], readings: Array) -> list[Option]:
         """Return cost, hypothesis and association of the best, the cheapest first."""
         options: list[Option] = []
         most, ceiling = TRIED * self._policy.hypotheses, np.inf
-        for k, h in enumerate(self.hypotheses):
+        for k, h in enumerate(known):
             found = h.slam.alternatives(readings, ceiling - h.cost)
             options += [(h.cost + cost, k, plan) for cost, plan in found]
             options.sort(key=lambda option: option[:2])
@@ -427,11 +448,10 @@ class HypothesisSlam:
                 ceiling = options[-1][0]
         return options
 
-    def _branches(self, origins: Sequence[int]) -> list[ManagedSlam]:
+    def _branches(self, origins: Sequence[ManagedSlam]) -> list[ManagedSlam]:
         """Return a filter for each option, copied where a hypothesis splits."""
         slams: list[ManagedSlam] = []
-        for k in origins:
-            slam = self.hypotheses[k].slam
+        for slam in origins:
             slams.append(self._pool.copy(slam) if slam in slams else slam)
         return slams
 

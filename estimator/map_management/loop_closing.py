@@ -12,18 +12,39 @@ copy.  Once a constellation around the robot is recognised among the lost landma
 both are merged by one measurement.  Where the loop has been closed otherwise, the older
 landmark is no longer lost, and a doubtful one is merged with it if their offset is
 accurate and passes the gate.
+
+A robot that knows the relative position of no landmark accurately, as after a gap in
+the readings, is too far from its estimate for linearised innovations: they exclude the
+right landmarks.  The readings of one scan then form the constellation, and each place
+where it fits becomes a part of the belief, as in a Gaussian sum filter [1]_.
+
+References
+----------
+.. [1] D. Alspach, H. Sorenson, Nonlinear Bayesian estimation using Gaussian sum
+   approximations, IEEE Transactions on Automatic Control 17, 1972.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit
-from ..association.constellations import Constellations, TwoPlaces, match_constellations
+from ..association.constellations import (
+    Constellations,
+    TwoPlaces,
+    agreeing_pairs,
+    is_plausible,
+    match_constellations,
+    turn_between,
+)
+from ..association.scan_assignments import Noise
 from ..interface import MapView
+from ..models.bearing_range import locate_landmark, wrap_angle
+from ..models.rigid_motion import rotation
 
 #: Landmarks that are the same: (kept, gone).
 Pairs = list[tuple[int, int]]
@@ -43,6 +64,8 @@ NEAR_STDS = 10.0
 TURN_STDS = 4.0
 #: The heading may be wrong by this number of σ, and by this angle [rad].
 SLACK = 0.2
+#: Least number of readings that recognise a place, and most places of a scan.
+FEWEST_READINGS, MOST_POSES = 3, 4
 
 
 def lost(view: MapView, rules: Constellations | None) -> BoolArray:
@@ -137,14 +160,7 @@ def _recognised(
     feasible = _offsets(view, local, older)[0] <= OFFSET_GATE
     used = feasible.any(axis=0)
     older, feasible = older[used], feasible[:, used]
-    turn = TURN_STDS * float(np.sqrt(view.covariance[2, 2])) + SLACK
-    places = TwoPlaces(
-        view.landmarks[local],
-        view.landmarks[older],
-        _invariant(view, np.concatenate([local, older])),
-        min(turn, np.pi),
-    )
-    match = match_constellations(places, feasible, rules)
+    match = match_constellations(_two_places(view, local, older), feasible, rules)
     if match is None:
         return []
     return _named(view, older[match.older], local[match.local])
@@ -154,6 +170,71 @@ def _named(view: MapView, kept: IntArray, gone: IntArray) -> Pairs:
     """Return the identities of landmarks, given by their places in a view."""
     pairs = zip(kept.tolist(), gone.tolist(), strict=True)
     return [(view.ids[i], view.ids[j]) for i, j in pairs]
+
+
+def poses_of_scan(
+    view: MapView, readings: Array, noise: Noise, rules: Constellations | None
+) -> list[Array]:
+    """Return where the robot may be if it knows no landmark accurately.
+
+    Parameters
+    ----------
+    view : MapView
+        The map around the robot.
+    readings : ndarray, shape (m, 2)
+        The scan, rows (β, r) [rad, m].
+    noise : Noise
+        Of the sensor.
+    rules : Constellations or None
+        None: the answer is empty.
+
+    Returns
+    -------
+    list of ndarray, shape (3,)
+        Poses (x, y, θ) at which the readings show landmarks [m, m, rad].
+    """
+    n, m = len(view.ids), len(readings)
+    if rules is None or min(n, m) < FEWEST_READINGS:
+        return []
+    accurate = ACCURATE * rules.lost_std
+    if _find_lost(*view[:2], accurate, np.zeros(n, dtype=np.bool_))[1]:
+        return []
+    both = _with_readings(view, readings, noise)
+    local, older = np.arange(n, n + m), np.arange(n)
+    places = _two_places(both, local, older)
+    feasible = _offsets(both, local, older)[0] <= OFFSET_GATE
+    rules = replace(rules, least=FEWEST_READINGS)
+    poses = []
+    for match in agreeing_pairs(places, feasible, rules, most=MOST_POSES):
+        if len(match.local) and is_plausible(places, match):
+            turn = turn_between(places, match)
+            a, b = places.local[match.local], places.older[match.older]
+            shift = rotation(turn) @ (view.mean[:2] - a.mean(axis=0))
+            heading = wrap_angle(float(view.mean[2]) + turn)
+            poses.append(np.array([*(b.mean(axis=0) + shift), heading]))
+    return poses
+
+
+def _with_readings(view: MapView, readings: Array, noise: Noise) -> MapView:
+    """Return a map with a new landmark for each reading."""
+    places, to_pose, to_reading = locate_landmark(view.mean[:3], readings)
+    known, m = 3 + 2 * len(view.ids), len(readings)
+    P = view.covariance[:known, :known]
+    J = to_pose.reshape(2 * m, 3)
+    cross = J @ P[:3]
+    own = cross[:, :3] @ J.T
+    spread = to_reading * noise.variances(readings[:, 1])[:, None]
+    own.reshape(m, 2, m, 2)[range(m), :, range(m)] += spread @ to_reading.mT
+    P = np.block([[P, cross.T], [cross, own]])
+    mean = np.append(view.mean[:known], places)
+    return MapView(mean, P, range(len(view.ids) + m))
+
+
+def _two_places(view: MapView, local: IntArray, older: IntArray) -> TwoPlaces:
+    turn = TURN_STDS * float(np.sqrt(view.covariance[2, 2])) + SLACK
+    covariance = _invariant(view, np.concatenate([local, older]))
+    points = view.landmarks[local], view.landmarks[older]
+    return TwoPlaces(*points, covariance, min(turn, np.pi))
 
 
 @jit

@@ -29,6 +29,7 @@ from ..interface import (
     MapView,
     ScanDecisions,
     SlamEstimator,
+    SupportsPoses,
     UpdateReport,
     advance,
     bookmark,
@@ -46,6 +47,7 @@ from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
+from .loop_closing import poses_of_scan
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy
 from .pruning import MapPruner
@@ -266,6 +268,13 @@ class ManagedSlam:
         argument_checks.refuse_not_finite(readings)
         known, view = self.candidates, self._pruner.view_for(readings)
         return associate(self._policy, known, readings, view, self._sensor, ceiling)
+
+    def poses_of_scan(self, readings: Array) -> list[Array]:
+        """Return poses (3,) at which a scan (m, 2) shows the map, if it is needed."""
+        if not isinstance(self._filter, SupportsPoses):
+            return []
+        view, rules = self._pruner.view_around(readings), self._policy.constellations
+        return poses_of_scan(view, readings, self._sensor.noise, rules)
 
     def take(
         self, readings: Array, associate: Callable[[], ScanAssociation]
