@@ -3,12 +3,19 @@
 import numpy as np
 import pytest
 from comparison import assert_same_bits
+from scipy.stats import multivariate_normal
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import LandmarkPolicy, make_estimator
 from slamgym.estimator.association.constellations import Constellations
+from slamgym.estimator.association.scan_assignments import Noise
 from slamgym.estimator.interface import MapView
-from slamgym.estimator.map_management.loop_closing import lost
+from slamgym.estimator.map_management.hypotheses import AROUND
+from slamgym.estimator.map_management.loop_closing import (
+    _with_readings,
+    lost,
+    poses_of_scan,
+)
 from slamgym.estimator.map_management.policy import as_policy
 from slamgym.sim_configs import action_sequence, load_scenario
 
@@ -91,7 +98,12 @@ def lost_and_seen_again(scans=3, given=None, name="invariant", **changes):
         name,
         motion_std=(0.01, 0.01, 0.005),
         measurement_std=(0.01, 0.03),
-        management={"constellations": {"always": True}, "confirm": (2, 3)} | changes,
+        management={
+            "association": "joint",
+            "constellations": {"always": True},
+            "confirm": (2, 3),
+        }
+        | changes,
         **OPTIONS[name],
     )
     for _ in range(3):
@@ -213,3 +225,83 @@ def test_landmarks_are_lost_only_where_a_constellation_can_be_recognised(local):
     assert always.tolist() == [True] * 14 + [False] * local
     found = lost(view, Constellations())
     assert found.tolist() == (always.tolist() if local >= 6 else [False] * count)
+
+
+def lost_alone(places, where, **changes):
+    """Map some places, lose the way by noise alone, and take one scan of them."""
+    slam = make_estimator(
+        "ekf",
+        motion_std=(0.01, 0.01, 0.005),
+        measurement_std=(0.01, 0.03),
+        management={"confirm": (2, 3)} | changes,
+    )
+    for _ in range(3):
+        slam.update(readings_of(places))
+    slam.predict((0.0, 0.0), dt=15_000.0)  # σ = 1.2 m and 0.6 rad
+    slam.update(readings_of(places, where))
+    return slam
+
+
+@pytest.mark.parametrize("where", [(0.9, -1.0, 0.5), (-1.4, 0.6, -0.9)])
+def test_one_scan_finds_the_place_of_a_robot_that_has_lost_its_map(where):
+    slam = lost_alone(PLACE, where)
+    assert slam.landmark_ids == tuple(range(7))
+    assert None not in slam.decisions[-1].row_ids
+    np.testing.assert_allclose(slam.belief().pose, where, atol=0.05)
+    blind = lost_alone(PLACE, where, constellations=False)
+    assert np.abs(blind.belief().pose - where).max() > 0.1
+
+
+def test_a_scan_that_fits_two_places_continues_at_both():
+    group = np.array([(3, 0.5), (4, 1.5), (3.5, -1), (6, 0.2), (5, -1.2)])
+    two = np.vstack([group, group + np.array((0.0, 4.0))])
+    slam = lost_alone(two, (0.0, 0.0, 0.0))
+    slam.predict((0.0, 0.0), dt=15_000.0)
+    slam.update(readings_of(group))
+    found = [h.slam.belief(()).pose[:2].round(1).tolist() for h in slam.hypotheses]
+    assert [0.0, 0.0] in found
+    assert [0.0, 4.0] in found
+
+
+def test_poses_are_sought_only_where_no_landmark_is_known_accurately():
+    mean = np.append(np.zeros(3), PLACE)
+    certain, noise = np.diag(np.full(len(mean), 1e-4)), Noise(0.01, 0.03)
+    lost_map = certain.copy()
+    lost_map[:2, :2], lost_map[2, 2] = np.eye(2), 0.25
+    where, rules = np.array([0.8, -0.9, 0.4]), Constellations()
+    readings = readings_of(PLACE, where)
+    view = MapView(mean, lost_map, range(7))
+    (found,) = poses_of_scan(view, readings, noise, rules)
+    np.testing.assert_allclose(found, where, atol=1e-9)
+    for seen in (view._replace(covariance=certain), view._replace(ids=range(2))):
+        assert poses_of_scan(seen, readings, noise, rules) == []
+    assert poses_of_scan(view, readings[:2], noise, rules) == []
+    assert poses_of_scan(view, readings, noise, None) == []
+    roomy = MapView(np.append(mean, 9.0), np.pad(lost_map, (0, 1)), range(7))
+    np.testing.assert_array_equal(
+        poses_of_scan(roomy, readings, noise, rules)[0], found
+    )
+
+
+def test_a_reading_extends_the_map_as_a_new_landmark_of_the_filter():
+    given = lost_alone(PLACE, (0.8, -0.9, 0.3)).filter
+    readings = np.array([[0.3, 4.0], [-2.0, 1.5]])
+    before = given.belief()
+    view = MapView(before.mean, before.covariance, before.landmark_ids)
+    extended = _with_readings(view, readings, Noise(0.01, 0.03))
+    given.update(readings, [90, 91])
+    np.testing.assert_allclose(extended.mean, given.belief().mean, atol=1e-9)
+    np.testing.assert_allclose(
+        extended.covariance, given.belief().covariance, atol=1e-9
+    )
+
+
+def test_a_part_of_the_belief_weighs_what_the_prior_holds_of_it():
+    slam = lost_alone(PLACE, (0.0, 0.0, 0.0))
+    slam.predict((0.0, 0.0), dt=15_000.0)
+    prior = slam.belief(())
+    where = np.array([0.8, -0.9, 0.3])
+    (part,) = slam._at_places(readings_of(PLACE, where))
+    held = multivariate_normal(prior.pose, prior.pose_covariance + AROUND).pdf(where)
+    held /= multivariate_normal(np.zeros(3), AROUND).pdf(np.zeros(3))
+    assert part.cost == pytest.approx(-2 * np.log(held), abs=1e-3)
