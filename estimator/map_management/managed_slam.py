@@ -271,6 +271,7 @@ class ManagedSlam:
 
     def poses_of_scan(self, readings: Array) -> list[Array]:
         """Return poses (3,) at which a scan (m, 2) shows the map, if it is needed."""
+        argument_checks.refuse_not_finite(readings)
         if not isinstance(self._filter, SupportsPoses):
             return []
         view, rules = self._pruner.view_around(readings), self._policy.constellations

@@ -10,7 +10,7 @@ from slamgym.estimator import LandmarkPolicy, make_estimator
 from slamgym.estimator.association.constellations import Constellations
 from slamgym.estimator.association.scan_assignments import Noise
 from slamgym.estimator.interface import MapView
-from slamgym.estimator.map_management.hypotheses import AROUND
+from slamgym.estimator.map_management.hypotheses import AROUND, HypothesisSlam
 from slamgym.estimator.map_management.loop_closing import (
     _with_readings,
     lost,
@@ -261,6 +261,41 @@ def test_a_scan_that_fits_two_places_continues_at_both():
     found = [h.slam.belief(()).pose[:2].round(1).tolist() for h in slam.hypotheses]
     assert [0.0, 0.0] in found
     assert [0.0, 4.0] in found
+
+
+class WithoutPoses:
+    """A filter that takes no readings of the pose."""
+
+    def __init__(self, **options):
+        self._slam = make_estimator("ekf", **options)
+
+    def __getattr__(self, name):
+        if name == "observe_pose":
+            raise AttributeError(name)
+        return getattr(self._slam, name)
+
+
+def test_a_filter_without_readings_of_the_pose_continues_as_it_is():
+    noise = (0.01, 0.01, 0.005), (0.01, 0.03)
+    slam = HypothesisSlam(WithoutPoses, *noise, management={"confirm": (2, 3)})
+    for dt in (0.0, 0.0, 0.0, 15_000.0):
+        slam.predict((0.0, 0.0), dt)
+        slam.update(readings_of(PLACE))
+    np.testing.assert_allclose(slam.belief().pose, 0.0, atol=0.01)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_bad_scan_changes_nothing_where_the_map_is_lost(bad):
+    slam, twin = (lost_alone(PLACE, (0.0, 0.0, 0.0)) for _ in range(2))
+    for each in (slam, twin):
+        each.predict((0.0, 0.0), dt=15_000.0)
+    scan = readings_of(PLACE, (0.9, -1.0, 0.5))
+    with pytest.raises(ValueError, match="must be finite"):
+        slam.update(np.vstack([scan, (0.1, bad)]))
+    for each in (slam, twin):
+        each.update(scan)
+    assert len(slam.hypotheses) == len(twin.hypotheses)
+    assert_same_bits(slam.belief(), twin.belief())
 
 
 def test_poses_are_sought_only_where_no_landmark_is_known_accurately():
