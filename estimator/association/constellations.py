@@ -126,12 +126,10 @@ def agreeing_pairs(
     compare_pairs(pairs, local, older, DISTANCE_GATE, places.largest_turn, agree)
     floor = rules.least - 1
     while len(found) < most:
-        clique = np.zeros(len(places.local) + 1, dtype=np.int64)
-        size, visited = search_clique(pairs, agree, floor, rules.search_nodes, clique)
-        is_complete = visited < rules.search_nodes
-        if not size and is_complete:
+        clique, is_complete = largest_clique(pairs, agree, floor, rules.search_nodes)
+        if is_complete and not len(clique):
             break
-        match = Match(*pairs[clique[: size if is_complete else 0]].T)
+        match = Match(*pairs[clique].T)
         found.append(match)
         if not is_complete:
             break
@@ -170,11 +168,15 @@ def _table(points: Array, P: Array) -> Array:
 
 def largest_clique(
     pairs: IntArray, agree: BoolArray, floor: int, nodes: int
-) -> IntArray:
-    """Return a largest clique of more than `floor` pairs; none at the limit."""
+) -> tuple[IntArray, bool]:
+    """Return a largest clique of more than `floor` pairs, and if all were searched.
+
+    The clique is empty if there is none, or if the search has reached its limit.
+    """
     clique = np.zeros(pairs[:, 0].max(initial=-1) + 2, dtype=np.int64)
     size, visited = search_clique(pairs, agree, floor, nodes, clique)
-    return clique[: size if visited < nodes else 0]
+    is_complete = visited < nodes
+    return clique[: size if is_complete else 0], is_complete
 
 
 def _blocks(covariance: Array) -> Array:

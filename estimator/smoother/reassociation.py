@@ -401,7 +401,7 @@ class _Search:
             pairs, *tables(places), constellations.DISTANCE_GATE, LARGEST_TURN, agree
         )
         for _ in range(MATCHES):
-            clique = largest_clique(pairs, agree, SMALLEST_CLIQUE - 1, NODES)
+            clique, _ = largest_clique(pairs, agree, SMALLEST_CLIQUE - 1, NODES)
             if not len(clique):
                 return
             chosen = pairs[clique]
