@@ -214,6 +214,8 @@ class Belief:
                 f"and covariance ({size}, {size}), got {mean.shape} and "
                 f"{covariance.shape}"
             )
+        if len(set(ids)) < len(ids):
+            raise ValueError(f"landmark_ids must differ, got {ids}")
         self._chosen(self.frame)
         mean[2] = wrap_angle(float(mean[2]))
         mean.flags.writeable = covariance.flags.writeable = False

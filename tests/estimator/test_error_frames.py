@@ -97,6 +97,8 @@ def test_a_belief_refuses_what_does_not_fit():
         belief.error(np.zeros(3), np.zeros(2), frame="local")
     with pytest.raises(ValueError, match="a belief with 1 landmarks has mean"):
         Belief(np.zeros(4), np.eye(4), (3,))
+    with pytest.raises(ValueError, match=r"landmark_ids must differ, got \(7, 7\)"):
+        Belief(np.zeros(7), np.eye(7), (7, 7))
     with pytest.raises(ValueError, match="read-only"):
         belief.mean[0] = 1.0
 
