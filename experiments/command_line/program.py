@@ -83,18 +83,30 @@ class OneLineErrors(TyperGroup):
                 parameter.display_type_rich = lambda ctx: None
         return command
 
+    def make_context(self, *args: Any, **kwargs: Any) -> Any:
+        """Read the arguments that precede the command."""
+        _remaining.clear()
+        with _naming_interrupts():
+            return super().make_context(*args, **kwargs)
+
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""
-        _remaining.clear()
-        try:
+        with _naming_interrupts():
             return super().invoke(ctx)
-        except BaseException as error:
-            cause: BaseException | None = error
-            while cause and not isinstance(cause, KeyboardInterrupt):
-                cause = cause.__context__  # another error in the clean-up hides it
-            if cause is None:
-                raise
-            raise InterruptedRunError(*_remaining[-1:]) from cause
+
+
+@contextlib.contextmanager
+def _naming_interrupts() -> Iterator[None]:
+    """Raise `InterruptedRunError` for an interrupt, which typer ends silently."""
+    try:
+        yield
+    except BaseException as error:
+        cause: BaseException | None = error
+        while cause and not isinstance(cause, KeyboardInterrupt):
+            cause = cause.__context__  # another error in the clean-up hides it
+        if cause is None:
+            raise
+        raise InterruptedRunError(*_remaining[-1:]) from cause
 
 
 class TerminationError(KeyboardInterrupt):

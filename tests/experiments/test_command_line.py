@@ -538,6 +538,17 @@ def test_ctrl_c_leaves_the_older_output_as_it_was(log, without_pictures, monkeyp
     assert message == "interrupted; nothing was written"
 
 
+@pytest.mark.parametrize(
+    ("error", "code"), [(KeyboardInterrupt, 130), (program.TerminationError, 143)]
+)
+def test_an_interrupt_before_the_command_begins_is_reported(error, code, monkeypatch):
+    def interrupt(*_):
+        raise error
+
+    monkeypatch.setattr(program.OneLineErrors, "parse_args", interrupt)
+    assert refused("scenarios", code=code) == "interrupted; nothing was written"
+
+
 def test_an_error_in_a_clean_up_does_not_hide_the_interrupt(
     log, without_pictures, monkeypatch
 ):
