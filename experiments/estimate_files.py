@@ -6,7 +6,7 @@ hold many. docs/judge.md defines the columns.
 
 import re
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -118,6 +118,8 @@ def paths_by_label(estimates: Any) -> dict[str, list[Path]]:
         return list(map(Path, [given] if isinstance(given, str | PathLike) else given))
 
     named: dict[str, list[Path]] = {}
+    if not isinstance(estimates, str | PathLike | Iterable):
+        raise TypeError(f"estimates must be paths of files, got {estimates!r}")
     if isinstance(estimates, Mapping):
         named = {str(label): paths_in(each) for label, each in estimates.items()}
     else:

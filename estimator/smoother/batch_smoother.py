@@ -102,6 +102,8 @@ def smooth(
     >>> np.round(smooth(drive).poses[-1], 3)
     array([1.933, 0.   , 0.   ])
     """
+    if not isinstance(drive, Drive):
+        raise TypeError(f"drive must be a Drive, got {drive!r}")
     argument_checks.whole("iterations", iterations, 1)
     argument_checks.above("tolerance", tolerance, 0.0)
     if associate:

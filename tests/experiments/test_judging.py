@@ -13,6 +13,7 @@ from commands import slamgym
 
 from slamgym import judge, load_scenario, load_trajectories, make_estimator, monte_carlo
 from slamgym.estimator.models.rigid_motion import invariant_covariance, invariant_error
+from slamgym.estimator.smoother import smooth
 from slamgym.evaluation.nees import normalised_squared_error
 from slamgym.experiments import (
     generate_trajectories,
@@ -721,3 +722,15 @@ def test_the_example_of_gtsam_names_the_frame(tmp_path):
     assert honest.startswith("honest: ")
     assert additive.startswith("covariances='additive': isam2: not consistent: ")
     assert cause.startswith("convention: covariances of the left-invariant error")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (judge, "estimates must be paths of files, got None"),
+        (smooth, "drive must be a Drive, got None"),
+    ],
+)
+def test_what_is_no_path_and_no_drive_is_named(call, message):
+    with pytest.raises(TypeError, match=message):
+        call(None)
