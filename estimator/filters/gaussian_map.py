@@ -90,8 +90,8 @@ class GaussianMap:
         capacity = self.capacity_for(FIRST_LANDMARKS)
         self._become(new_block(capacity, FIRST_READINGS, np.array(values)))
 
-    def _become(self, block: Array) -> None:
-        parts, nobody = parts_of(block), type(None)
+    def _become(self, block: Array, parts: Parts | None = None) -> None:
+        parts, nobody = parts or parts_of(block), type(None)
         vars(self).update(block=block, parts=parts, _slots={}, _last=nobody)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -227,7 +227,7 @@ class GaussianMap:
             array[tuple(slice(size) for size in content.shape)] = content
         parts.ids[: len(ids)] = [*ids]
         parts.numbers[LANDMARKS], parts.numbers[STEPS] = len(ids), self.steps + steps
-        self._become(block)
+        self._become(block, parts)
 
     def make_room(self, readings: int) -> None:
         """Grow the arrays where a scan of new landmarks could overflow them."""

@@ -379,6 +379,9 @@ def symmetric(covariance: Array) -> Array:
     return covariance
 
 
+_BOTH = np.arange(2)  # columns of a landmark
+
+
 def pairs(places: Sequence[int] | IntArray) -> IntArray:
     """Return the two columns of each landmark, in turn: 2 p, 2 p + 1.
 
@@ -387,4 +390,4 @@ def pairs(places: Sequence[int] | IntArray) -> IntArray:
     >>> pairs([0, 3])
     array([0, 1, 6, 7])
     """
-    return (2 * np.asarray(places, dtype=np.int64)[:, None] + (0, 1)).ravel()
+    return (2 * np.asarray(places, dtype=np.int64)[:, None] + _BOTH).ravel()

@@ -56,8 +56,10 @@ class CompressedMap:
         self._scale = np.zeros((0, 0))  # T of this phase
         self._origin = self.filter.map.mean[:2].copy()  # start of the phase
 
-    def add(self, ids: Sequence[int]) -> None:
+    def add(self) -> None:
         """Assign slots to landmarks that the filter has added."""
+        inside, known = self.filter.map, self._virtual + len(self.local)
+        ids = inside.parts.ids[known : inside.size // 2 - 1].tolist()
         if not ids:
             return
         reused = self.free[: -len(ids) - 1 : -1]
@@ -143,12 +145,11 @@ class CompressedMap:
             "take a smaller local_size",
         )
         self.finish_handover()
-        now, whole = self._phase(), not self._virtual
-        own = self._columns(list(self.local))
+        now, own = self._phase(), self._columns(list(self.local))
         self._make_room()
-        self._points, self._references = self._points.copy(), self._references.copy()
-        if not whole:
-            self._points += combine(now.unscaled(now.shift), self._strip)[0]
+        self._references = self._references.copy()
+        shift = combine(now.unscaled(now.shift), self._strip)[0]
+        self._points = self._points + shift
         self._points[own] = now.mean[now.first :]
         self._references[own] = now.reference[now.first :]
         ahead = now.mean[:2] + (now.mean[:2] - self._origin) / 2  # likely direction
@@ -156,7 +157,7 @@ class CompressedMap:
         chosen = choose_local(ahead, required, self.slots, points, size)
         self._origin = now.mean[:2].copy()
         rows, self.local = phase_update.exchanged_rows(
-            self.slots, self.local, chosen, self._stored, now.first
+            self.slots, self.local, chosen, self._stored, now.first, own
         )
         blocks = phase_update.blocks_in_a_step(self.deferred.width, hurried=hurried)
         self._handover = phase_update.Handover(now, self._strip, rows, blocks)
@@ -184,20 +185,20 @@ class CompressedMap:
         width = self.deferred.width
         share = phase_update.blocks_in_a_step(width, hurried=hurried)
         if hurried or (age - 3) * share * BLOCK >= width:
-            before = self.deferred.pending_rank
-            self.finish_handover()
-            added = self.deferred.pending_rank - before
+            added = self.finish_handover()
             self.deferred.work(max(rank, added) if hurried else rank * SHARE)
         elif self._handover is not None and age > 1:
             self._handover.advance(self.deferred, (age - 2) * share)
 
-    def finish_handover(self) -> None:
-        """Finish the change of the local map now."""
-        if self._handover is not None:
-            self._handover.advance(self.deferred, self.deferred.width // BLOCK)
-            self.deferred.defer(self._handover.lost)
-            self._strip = self._handover.next_strip
-            self._handover = None
+    def finish_handover(self) -> int:
+        """Finish the change of the local map now; return the rank that it defers."""
+        if self._handover is None:
+            return 0
+        self._handover.advance(self.deferred, self.deferred.width // BLOCK)
+        lost, self._strip = self._handover.lost, self._handover.next_strip
+        self.deferred.defer(lost)
+        self._handover = None
+        return len(lost.signs)
 
     @property
     def is_small(self) -> bool:

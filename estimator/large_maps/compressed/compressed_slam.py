@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ....arrays import LARGEST
 from ...filters.ekf import (
     EkfSlam,
     FirstEstimatesEkfSlam,
@@ -150,8 +149,6 @@ class CompressedEkfSlam:
 
         required = [i for i in ids if i in slots]
         changes = not self._is_adequate(required)
-        if changes:
-            changes = bool((np.abs(readings) <= LARGEST).all())  # otherwise refused
 
         def correct() -> UpdateReport:
             if changes:
@@ -169,7 +166,7 @@ class CompressedEkfSlam:
 
     def _follow(self, report: UpdateReport) -> UpdateReport:
         """Do what follows an update of the filter; return its report."""
-        self._map.add(report.added_ids)
+        self._map.add()
         if report.degrees_of_freedom:
             self._age += 1
             rank = report.degrees_of_freedom + 1

@@ -116,9 +116,10 @@ class DeferredCovariance:
                 continue
             start, end = columns.searchsorted((first, last)).tolist()
             weights, before = rows_of(root, columns[:end]) * signs, root[:last]
-            rows[start:end, : len(before)] -= weights[start:] @ before.T
+            _subtract_product(rows[start:end, : len(before)], weights[start:], before)
             if start:
-                rows[:start, first : len(before)] -= weights[:start] @ before[first:].T
+                others = rows[:start, first : len(before)]
+                _subtract_product(others, weights[:start], before[first:])
 
     def put(
         self, blocks: range, columns: IntArray, rows: Array, places: IntArray
@@ -141,7 +142,7 @@ class DeferredCovariance:
 
     def forget(self, columns: IntArray) -> None:
         """Drop the pending downdates of rows that are about to be put."""
-        for root, _, _ in self._pending:
+        for root, _, _ in self._pending if len(columns) else ():
             root[columns[columns < len(root)]] = 0.0
 
     def checkpoint(self) -> Undo:
@@ -342,6 +343,16 @@ def rows_of(root: Array, columns: IntArray) -> Array:
     inside = columns < len(root)
     rows[inside] = root[columns[inside]]
     return rows
+
+
+def _subtract_product(rows: Array, weights: Array, root: Array) -> None:
+    """Subtract weights Wᵀ from rows (c, ·); in place if these are contiguous."""
+    from scipy.linalg.blas import dgemm  # noqa: PLC0415 (slow to import)
+
+    if rows.flags.c_contiguous and rows.size:
+        dgemm(-1.0, root.T, weights.T, 1.0, rows.T, True, False, True)
+    else:
+        rows -= weights @ root.T
 
 
 def subtract(covariance: Array, root: Array, signs: Array) -> None:

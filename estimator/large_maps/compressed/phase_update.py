@@ -35,7 +35,6 @@ import numpy as np
 
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
-from ...filters.gaussian_map import parts_of
 from ..multifrontal import pairs
 from .deferred_covariance import BLOCK, DeferredCovariance, Downdate, fill_extended
 
@@ -112,7 +111,8 @@ def _by_pivots(loss: Array) -> tuple[Array, Array]:
 
     factor, pivots, rank, _ = dpstrf(loss, lower=True)
     root = np.empty((rank, len(loss)))
-    root[:, pivots - 1] = np.triu(factor.T[:rank])
+    order = np.arange(len(loss))
+    root[:, pivots - 1] = (factor.T * (order[:, None] <= order))[:rank]
     return root, np.ones(rank)
 
 
@@ -129,11 +129,11 @@ def _by_eigenvalues(loss: Array) -> tuple[Array, Array]:
 
 def _solve(scale: Array, rows: Array, side: int) -> Array:
     """Solve X T = rows, or T X = rows at side 1, for a lower triangular T."""
-    from scipy.linalg import get_blas_funcs  # noqa: PLC0415 (slow to import)
+    from scipy.linalg.blas import dtrsm, ztrsm  # noqa: PLC0415 (slow to import)
 
     if not rows.size:
         return rows
-    (trsm,) = get_blas_funcs(("trsm",), (scale, rows))
+    trsm = dtrsm if rows.dtype == np.float64 else ztrsm
     # The transposes are contiguous in Fortran order: BLAS copies none of them.
     solution: Array = trsm(1.0, scale.T, rows.T, side=side).T
     return solution
@@ -160,10 +160,10 @@ def scale_of(covariance: Array) -> Array:
     from scipy.linalg.lapack import dpotrf  # noqa: PLC0415 (slow to import)
 
     sums = covariance.copy()
-    variances = sums.diagonal().clip(0.0)
-    variances += np.where(variances > 0, ADDED * variances, EXACT)
-    np.fill_diagonal(sums, variances)
-    factor, status = dpotrf(sums.T, overwrite_a=True)
+    variances = sums.ravel()[:: len(sums) + 1]  # its diagonal
+    variances += ADDED * variances
+    variances[variances <= 0] = EXACT
+    factor, status = dpotrf(sums.T)
     return np.diag(np.sqrt(variances)) if status else factor.T
 
 
@@ -189,15 +189,16 @@ def begin_phase(
         Identities of the virtual landmarks, if any, then of the local ones.
     """
     gaussian, size = slam.map, 3 + 2 * len(ids)
-    block = gaussian.blank(len(ids), more=len(ids) // 2)
-    parts, virtual = parts_of(block), size - len(rows)
-    own = np.hstack([np.vstack([gaussian.covariance[:3, :3], rows[:3].T]), rows])
+    before, virtual = gaussian.arrays, size - len(rows)
+    own = np.empty((len(rows), len(rows)))
+    own[:3, :3], own[3:, :3] = before.covariance[:3, :3], rows[:3].T
+    own[:, 3:] = rows
     scale = scale_of(own) if virtual else np.zeros((0, 0))
-    rest = slice(3 + virtual, size)
-    parts.mean[:3], parts.mean[rest] = gaussian.mean[:3], mean
-    parts.reference[:3], parts.reference[rest] = gaussian.reference[:3], reference
-    fill_extended(parts.covariance, own, scale, virtual)
-    gaussian.hold(None, ids, block=block)
+    gaussian.hold(None, ids, block=gaussian.blank(len(ids), more=len(ids) // 2))
+    now, rest = gaussian.arrays, slice(3 + virtual, size)
+    now.mean[:3], now.mean[rest] = before.mean[:3], mean
+    now.reference[:3], now.reference[rest] = before.reference[:3], reference
+    fill_extended(now.covariance, own, scale, virtual)
     return scale
 
 
@@ -243,6 +244,7 @@ def exchanged_rows(
     chosen: Collection[int],
     stored: int,
     first: int,
+    own: IntArray,
 ) -> tuple[Exchanged, dict[int, None]]:
     """Return the rows of a change of the local map, and its landmarks in their order.
 
@@ -256,13 +258,14 @@ def exchanged_rows(
         How many old ones, the first, are in the stored covariance.
     first : int
         Row of the first old one in the belief of the filter.
+    own : ndarray of int
+        Columns of the old ones in the map's arrays.
     """
     old = list(local)
     staying = [k for k, i in enumerate(old) if i in chosen]
     leaving = [k for k in range(stored, len(old)) if old[k] not in chosen]
     left, before = 2 * len(leaving), set(old)
     entering = sorted((i for i in chosen if i not in before), key=slots.__getitem__)
-    own = pairs([slots[i] for i in old])
     order = own.argsort()
     place = {k: 2 * row for row, k in enumerate(leaving)}
     place |= {k: left + 3 + 2 * row for row, k in enumerate(staying)}
