@@ -180,7 +180,7 @@ def _checked_plans(plans: ArrayLike, count: int) -> Array:
         )
     if not np.isfinite(given).all():
         raise ValueError("plans must be finite")
-    return np.ascontiguousarray(np.broadcast_to(given, (count, *given.shape[-3:])))
+    return given if given.ndim == 4 else given[None].repeat(count, axis=0)
 
 
 def _checked_horizons(horizons: ArrayLike | None, steps: int) -> IntArray:

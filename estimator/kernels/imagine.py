@@ -14,7 +14,7 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
-from ..models.bearing_range import difference_jit, expected_reading_jit
+from ..models.bearing_range import expected_reading_jit
 from ..models.rigid_motion import predict
 from .kalman_gain import LEDGER_HEIGHT, SLOT, half_log_det, largest_variance
 from .scan_update import DONE, as_rules, update_belief
@@ -114,9 +114,10 @@ def imagine_plans(
                 d, turn = plans[b, k, t, 0], plans[b, k, t, 1]
                 if not imagine_step(room, size, d, turn, sensor):
                     break
-                found += look_for_new(
-                    room.mean, points, weights[b], sensor, missed, in_view
-                )
+                if len(missed):
+                    found += look_for_new(
+                        room.mean, points, weights[b], sensor, missed, in_view
+                    )
                 outcome.new_landmarks[b, k, t] = found
                 for i in range(3):
                     outcome.poses[b, k, t, i] = room.mean[i]
@@ -166,7 +167,10 @@ def imagine_step(
 def expect_readings(
     mean: Array, size: int, settings: Settings, readings: Array, ledger: IntArray
 ) -> int:
-    """Write the noise-free readings of mapped landmarks in view; return how many."""
+    """Write the noise-free readings of mapped landmarks in view; return how many.
+
+    Angles are not wrapped: the update wraps differences of readings.
+    """
     count, sight = 0, settings.sight
     if settings.dropout >= 1.0:
         return count
@@ -181,7 +185,7 @@ def expect_readings(
         if is_hidden(x, y, dx, dy, sight.walls):
             continue
         z0, z1 = expected_reading_jit(dx, dy, mean[2])
-        readings[count, 0], readings[count, 1] = difference_jit(z0, z1, 0.0, 0.0)
+        readings[count, 0], readings[count, 1] = z0, z1
         ledger[SLOT, count] = slot
         count += 1
     return count
