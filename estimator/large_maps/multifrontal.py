@@ -379,9 +379,6 @@ def symmetric(covariance: Array) -> Array:
     return covariance
 
 
-_BOTH = np.arange(2)  # columns of a landmark
-
-
 def pairs(places: Sequence[int] | IntArray) -> IntArray:
     """Return the two columns of each landmark, in turn: 2 p, 2 p + 1.
 
@@ -390,4 +387,4 @@ def pairs(places: Sequence[int] | IntArray) -> IntArray:
     >>> pairs([0, 3])
     array([0, 1, 6, 7])
     """
-    return (2 * np.asarray(places, dtype=np.int64)[:, None] + _BOTH).ravel()
+    return (2 * np.asarray(places, dtype=np.int64)[:, None] + np.arange(2)).ravel()

@@ -148,8 +148,7 @@ class CompressedMap:
         now, own = self._phase(), self._columns(list(self.local))
         self._make_room()
         self._references = self._references.copy()
-        shift = combine(now.unscaled(now.shift), self._strip)[0]
-        self._points = self._points + shift
+        self._points = self._points + combine(now.unscaled(now.shift), self._strip)[0]
         self._points[own] = now.mean[now.first :]
         self._references[own] = now.reference[now.first :]
         ahead = now.mean[:2] + (now.mean[:2] - self._origin) / 2  # likely direction
@@ -192,13 +191,12 @@ class CompressedMap:
 
     def finish_handover(self) -> int:
         """Finish the change of the local map now; return the rank that it defers."""
-        if self._handover is None:
+        if (handover := self._handover) is None:
             return 0
-        self._handover.advance(self.deferred, self.deferred.width // BLOCK)
-        lost, self._strip = self._handover.lost, self._handover.next_strip
-        self.deferred.defer(lost)
-        self._handover = None
-        return len(lost.signs)
+        handover.advance(self.deferred, self.deferred.width // BLOCK)
+        self.deferred.defer(handover.lost)
+        self._strip, self._handover = handover.next_strip, None
+        return len(handover.lost.signs)
 
     @property
     def is_small(self) -> bool:

@@ -317,8 +317,7 @@ class CompressedEkfSlam:
         size, mapped = self._local_size, len(self._map.slots)
         if size is None:
             extra = extra_landmarks(extra, len(required), mapped, self._age)
-            small = self._map.is_small
-            size = mapped if small else max(len(required), 4) + extra
+            size = mapped if self._map.is_small else max(len(required), 4) + extra
         self._map.change_local_map(required, size, hurried=not rests)
         self._extra, self._age, self._rests = extra, 0, rests
 
@@ -330,6 +329,5 @@ class CompressedEkfSlam:
             return False
         if is_free and self._map.is_small and len(local) == mapped:
             return True
-        size = len(required) + self._extra
-        size = self._local_size or max(size, SMALLEST_LOCAL_MAP)
+        size = self._local_size or max(len(required) + self._extra, SMALLEST_LOCAL_MAP)
         return all(i in local for i in required) and 2 * len(local) <= 3 * size

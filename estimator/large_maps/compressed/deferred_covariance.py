@@ -105,6 +105,8 @@ class DeferredCovariance:
         Pending downdates are subtracted, and one that is not pending yet.
         The columns (c,) are ascending.
         """
+        from scipy.linalg.blas import dgemm  # noqa: PLC0415 (slow to import)
+
         bounds = _bounds(columns, blocks)
         for k, start, end in zip(blocks, bounds, bounds[1:], strict=False):
             read_rows(self._blocks[k], k * BLOCK, columns[:end], start, rows)
@@ -116,10 +118,13 @@ class DeferredCovariance:
                 continue
             start, end = columns.searchsorted((first, last)).tolist()
             weights, before = rows_of(root, columns[:end]) * signs, root[:last]
-            _subtract_product(rows[start:end, : len(before)], weights[start:], before)
-            if start:
-                others = rows[:start, first : len(before)]
-                _subtract_product(others, weights[:start], before[first:])
+            for own, at in (slice(start, end), 0), (slice(start), first):
+                part = rows[own, at : len(before)]
+                if part.size and part.flags.c_contiguous:  # without another array
+                    factors = before[at:].T, weights[own].T
+                    dgemm(-1.0, *factors, 1.0, part.T, True, False, True)
+                else:
+                    part -= weights[own] @ before[at:].T
 
     def put(
         self, blocks: range, columns: IntArray, rows: Array, places: IntArray
@@ -343,16 +348,6 @@ def rows_of(root: Array, columns: IntArray) -> Array:
     inside = columns < len(root)
     rows[inside] = root[columns[inside]]
     return rows
-
-
-def _subtract_product(rows: Array, weights: Array, root: Array) -> None:
-    """Subtract weights Wᵀ from rows (c, ·); in place if these are contiguous."""
-    from scipy.linalg.blas import dgemm  # noqa: PLC0415 (slow to import)
-
-    if rows.flags.c_contiguous and rows.size:
-        dgemm(-1.0, root.T, weights.T, 1.0, rows.T, True, False, True)
-    else:
-        rows -= weights @ root.T
 
 
 def subtract(covariance: Array, root: Array, signs: Array) -> None:
