@@ -45,6 +45,7 @@ from ..association.scan_assignments import Noise
 from ..interface import MapView
 from ..models.bearing_range import locate_landmark, wrap_angle
 from ..models.rigid_motion import rotation
+from ..support import argument_checks
 
 #: Landmarks that are the same: (kept, gone).
 Pairs = list[tuple[int, int]]
@@ -192,6 +193,11 @@ def poses_of_scan(
     -------
     list of ndarray, shape (3,)
         Poses (x, y, θ) at which the readings show landmarks [m, m, rad].
+
+    Raises
+    ------
+    ValueError
+        If no landmark is known accurately, and a reading is not finite.
     """
     n, m = len(view.ids), len(readings)
     if rules is None or min(n, m) < FEWEST_READINGS:
@@ -199,6 +205,7 @@ def poses_of_scan(
     accurate = ACCURATE * rules.lost_std
     if _find_lost(*view[:2], accurate, np.zeros(n, dtype=np.bool_))[1]:
         return []
+    argument_checks.refuse_not_finite(readings)
     both = _with_readings(view, readings, noise)
     local, older = np.arange(n, n + m), np.arange(n)
     places = _two_places(both, local, older)

@@ -271,11 +271,10 @@ class ManagedSlam:
 
     def poses_of_scan(self, readings: Array) -> list[Array]:
         """Return poses (3,) at which a scan (m, 2) shows the map, if it is needed."""
-        argument_checks.refuse_not_finite(readings)
-        if not isinstance(self._filter, SupportsPoses):
-            return []
         view, rules = self._pruner.view_around(readings), self._policy.constellations
-        return poses_of_scan(view, readings, self._sensor.noise, rules)
+        poses = poses_of_scan(view, readings, self._sensor.noise, rules)
+        # Last, because the test of a protocol is slow.
+        return poses if poses and isinstance(self._filter, SupportsPoses) else []
 
     def take(
         self, readings: Array, associate: Callable[[], ScanAssociation]
