@@ -125,13 +125,13 @@ def agreeing_pairs(
     agree = np.zeros((len(pairs), len(pairs)), dtype=np.bool_)
     compare_pairs(pairs, local, older, DISTANCE_GATE, places.largest_turn, agree)
     floor = rules.least - 1
-    while len(found) < most:
+    while True:
         clique, is_complete = largest_clique(pairs, agree, floor, rules.search_nodes)
         if is_complete and not len(clique):
             break
         match = Match(*pairs[clique].T)
         found.append(match)
-        if not is_complete:
+        if not is_complete or len(found) == most:
             break
         gaps = moved_gaps(places, match)
         worst = gaps[match.local, match.older].max()

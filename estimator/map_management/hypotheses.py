@@ -425,13 +425,19 @@ class HypothesisSlam:
         The part around a pose c is the prior N(x; x̂, P) times exp(−½ ‖x − c‖²) in the
         metric of R.  Its weight is N(c; x̂, P + R) relative to N(0; 0, R).
         """
-        parts = []
-        for h in self.hypotheses:
+        parts, axes = [], np.eye(3)
+        for h in self.hypotheses[:PER_BASIN]:
             for pose in h.slam.poses_of_scan(readings):
                 slam = self._pool.copy(h.slam)
-                report = slam.observe_pose(pose, np.eye(3), AROUND)
-                cost = cost_of(report) - log(np.linalg.det(AROUND))
-                parts.append(Hypothesis(h.cost + cost, slam))
+                # The heading first: a large turn and a shift together are not linear.
+                turned = slam.observe_pose(pose[2:], axes[2:], AROUND[2:, 2:])
+                moved = slam.observe_pose(pose[:2], axes[:2], AROUND[:2, :2])
+                if turned.degrees_of_freedom and moved.degrees_of_freedom:
+                    cost = cost_of(turned) + cost_of(moved)
+                    cost -= log(np.linalg.det(AROUND))
+                    parts.append(Hypothesis(h.cost + cost, slam))
+                else:  # the gate of the filter refuses it
+                    self._pool.free([slam])
         return parts
 
     def _options(self, known: Sequence[Hypothesis], readings: Array) -> list[Option]:

@@ -15,8 +15,8 @@ accurate and passes the gate.
 
 A robot that knows the relative position of no landmark accurately, as after a gap in
 the readings, is too far from its estimate for linearised innovations: they exclude the
-right landmarks.  The readings of one scan then form the constellation, and each place
-where it fits becomes a part of the belief, as in a Gaussian sum filter [1]_.
+right landmarks.  The readings of one scan then form the constellation, and the places
+where it fits best become parts of the belief, as in a Gaussian sum filter [1]_.
 
 References
 ----------
@@ -178,6 +178,9 @@ def poses_of_scan(
 ) -> list[Array]:
     """Return where the robot may be if it knows no landmark accurately.
 
+    Only landmarks whose absolute position is accurate count, since a pose that they
+    suggest is then accurate, too.
+
     Parameters
     ----------
     view : MapView
@@ -206,10 +209,16 @@ def poses_of_scan(
     if _find_lost(*view[:2], accurate, np.zeros(n, dtype=np.bool_))[1]:
         return []
     argument_checks.refuse_not_finite(readings)
+    spread = np.trace(view.landmark_covariances, axis1=1, axis2=2)
+    older = np.flatnonzero(spread <= (accurate / 2) ** 2)
     both = _with_readings(view, readings, noise)
-    local, older = np.arange(n, n + m), np.arange(n)
-    places = _two_places(both, local, older)
-    feasible = _offsets(both, local, older)[0] <= OFFSET_GATE
+    feasible = _offsets(both, np.arange(n, n + m), older)[0] <= OFFSET_GATE
+    partners, used = feasible.sum(axis=1), feasible.any(axis=0)
+    rows = np.argsort(partners, kind="stable")[(partners == 0).sum() :]
+    if len(rows) < FEWEST_READINGS:
+        return []
+    places = _two_places(both, n + rows, older[used])
+    feasible = feasible[np.ix_(rows, used)]
     rules = replace(rules, least=FEWEST_READINGS)
     poses = []
     for match in agreeing_pairs(places, feasible, rules, most=MOST_POSES):

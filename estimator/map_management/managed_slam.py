@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array
+from ...arrays import LARGEST, Array
 from ..association.detections import LOST_SCORE
 from ..association.scan_assignments import Sensor
 from ..association.scan_association import (
@@ -272,7 +272,9 @@ class ManagedSlam:
     def poses_of_scan(self, readings: Array) -> list[Array]:
         """Return poses (3,) at which a scan (m, 2) shows the map, if it is needed."""
         view, rules = self._pruner.view_around(readings), self._policy.constellations
-        poses = poses_of_scan(view, readings, self._sensor.noise, rules)
+        r = readings[:, 1]
+        used = readings[(r >= self._sensor.min_range) & (r <= LARGEST)]
+        poses = poses_of_scan(view, used, self._sensor.noise, rules)
         # Last, because the test of a protocol is slow.
         return poses if poses and isinstance(self._filter, SupportsPoses) else []
 

@@ -1,5 +1,7 @@
 """Loops closed after long drift by constellations, in managed filters."""
 
+from types import MappingProxyType
+
 import numpy as np
 import pytest
 from comparison import assert_same_bits
@@ -227,13 +229,14 @@ def test_landmarks_are_lost_only_where_a_constellation_can_be_recognised(local):
     assert found.tolist() == (always.tolist() if local >= 6 else [False] * count)
 
 
-def lost_alone(places, where, **changes):
+def lost_alone(places, where, options=MappingProxyType({}), **changes):
     """Map some places, lose the way by noise alone, and take one scan of them."""
     slam = make_estimator(
         "ekf",
         motion_std=(0.01, 0.01, 0.005),
         measurement_std=(0.01, 0.03),
         management={"confirm": (2, 3)} | changes,
+        **options,
     )
     for _ in range(3):
         slam.update(readings_of(places))
@@ -340,3 +343,55 @@ def test_a_part_of_the_belief_weighs_what_the_prior_holds_of_it():
     held = multivariate_normal(prior.pose, prior.pose_covariance + AROUND).pdf(where)
     held /= multivariate_normal(np.zeros(3), AROUND).pdf(np.zeros(3))
     assert part.cost == pytest.approx(-2 * np.log(held), abs=1e-3)
+
+
+def view_of_a_lost_robot(places, std=(1.2, 1.2, 0.6), drift=0.0):
+    """Return a view of places whose common error is `drift`, and a lost robot."""
+    mean = np.append(np.zeros(3), places)
+    P = np.diag(np.append(np.square(std), np.full(len(mean) - 3, 1e-4)))
+    for axis in (0, 1):
+        both = np.r_[axis, 3 + axis : len(mean) : 2]
+        P[np.ix_(both, both)] += drift**2
+    return MapView(mean, P, range(len(places)))
+
+
+@pytest.mark.parametrize("drift", [0.1, 1.0])
+def test_only_landmarks_of_accurate_absolute_position_suggest_a_pose(drift):
+    where = np.array([0.8, -0.9, 0.4])
+    scan = readings_of(PLACE, where), Noise(0.01, 0.03), Constellations()
+    poses = poses_of_scan(view_of_a_lost_robot(PLACE, drift=drift), *scan)
+    assert len(poses) == (drift < 0.25)
+
+
+def test_the_order_of_the_readings_does_not_matter_in_a_large_map():
+    rng = np.random.default_rng(3)
+    places = rng.uniform(-12, 12, (150, 2))
+    where, noise = np.array([0.6, -0.9, 0.2]), Noise(0.002, 0.005)
+    known = readings_of(places[:7], where)
+    others = readings_of(rng.uniform(-12, 12, (5, 2)), where)
+    view = view_of_a_lost_robot(places, std=(3.0, 3.0, 0.3))
+    for scan in ([*others, *known], [*known, *others]):
+        poses = poses_of_scan(view, np.array(scan), noise, Constellations())
+        assert np.abs(np.array(poses) - where).max(axis=1).min() < 0.05
+
+
+def test_a_place_that_the_gate_refuses_is_left_out():
+    gate = {"gate_probability": 0.5}
+    slam = lost_alone(PLACE, (0.0, 0.0, 0.0), gate)
+    slam.predict((0.0, 0.0), dt=15_000.0)
+    spare = len(slam._pool)
+    assert slam._at_places(readings_of(PLACE, (2.4, -2.4, 1.0))) == []
+    assert len(slam._pool) <= spare + 1
+
+
+def test_readings_beside_the_robot_and_far_away_show_no_place_and_give_no_warning():
+    metres = {"bearing_std_metres": 0.01}
+    slam, twin = (lost_alone(PLACE, (0.0, 0.0, 0.0), metres) for _ in range(2))
+    scan = readings_of(PLACE, (0.9, -1.0, 0.5))
+    bad = [(0.1, 0.0), (0.2, 1e-4), (0.3, 1e150)]
+    for each in (slam, twin):
+        each.predict((0.0, 0.0), dt=15_000.0)
+    with np.errstate(all="raise"):
+        found = slam._at_places(np.vstack([bad, scan]))
+    (other,) = twin._at_places(scan)
+    assert_same_bits(found[0].slam.belief(), other.slam.belief())
