@@ -201,15 +201,12 @@ def mapped_identities(asked: LandmarkIds, mapped: Mapping[int, int]) -> list[int
 
 
 def refuse_not_finite(readings: Array) -> None:
-    """Refuse readings without identity that are not finite, naming the first."""
-    if not all(map(isfinite, readings.ravel().tolist())):  # faster than numpy's test
-        row = int(np.argmin(np.isfinite(readings).all(axis=1)))
-        raise ValueError(
-            f"measurements must be finite, got {readings[row].tolist()} in row {row}"
-        )
+    """Refuse readings without identity that are not finite or too large."""
+    if not sum(map(abs, readings.ravel().tolist())) <= LARGEST:  # fast, then exact
+        refuse_unusable(readings)
 
 
-def refuse_unusable(readings: Array, ids: Sequence[int]) -> None:
+def refuse_unusable(readings: Array, ids: Sequence[int] | None = None) -> None:
     """Refuse readings that are not finite or too large, naming the first."""
     for usable, rule in (
         (np.isfinite(readings), "must be finite"),
@@ -217,9 +214,9 @@ def refuse_unusable(readings: Array, ids: Sequence[int]) -> None:
     ):
         if not usable.all():
             row = int(np.argmin(usable.all(axis=1)))
+            of = "" if ids is None else f" (landmark {ids[row]})"
             raise ValueError(
-                f"measurements {rule}, got {readings[row].tolist()} in row {row} "
-                f"(landmark {ids[row]})"
+                f"measurements {rule}, got {readings[row].tolist()} in row {row}{of}"
             )
 
 

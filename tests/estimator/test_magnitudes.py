@@ -58,6 +58,16 @@ def test_the_largest_numbers_give_finite_beliefs(name):
     assert np.isfinite(belief.covariance).all()
 
 
+@pytest.mark.parametrize("reading", [(0.0, 1e200), (0.0, -1e200), (1e13, 1.0)])
+@pytest.mark.parametrize("hypotheses", [1, 3])
+def test_readings_without_identity_keep_the_bound(reading, hypotheses):
+    slam = make_estimator("ekf", **NOISE, management={"hypotheses": hypotheses})
+    slam.update([(0.0, 5.0)])
+    with pytest.raises(ValueError, match=r"measurements must not exceed.* in row 1$"):
+        slam.update([(0.0, 5.0), reading])
+    assert slam.update([(0.0, LARGEST), (1.0, LARGEST)]).tentative_rows == (0, 1)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
