@@ -192,11 +192,11 @@ class Belief:
     The state is (x, y, θ, l1x, l1y, …), landmarks in the order of ``landmark_ids``.
     """
 
-    #: Shape (3 + 2n,), heading in [-π, π); a column may be given.
+    #: Shape (3 + 2n,), heading in [-π, π), or nan; a column may be given.
     mean: Array
     #: Shape (3 + 2n, 3 + 2n), of the additive error.
     covariance: Array
-    #: Given as any sequence or array, kept as a tuple.
+    #: Given as any sequence or array, or as the keys of a dict; kept as a tuple.
     landmark_ids: tuple[int, ...]
     #: Coordinates in which the filter takes its error to be Gaussian.
     frame: rigid_motion.ErrorFrame = "additive"
@@ -204,8 +204,8 @@ class Belief:
     def __post_init__(self) -> None:
         mean = np.array(self.mean, dtype=np.float64).ravel()
         covariance = np.array(self.covariance, dtype=np.float64)
-        ids: Any = self.landmark_ids
-        ids = tuple(ids.tolist() if isinstance(ids, np.ndarray) else ids)
+        given: Any = self.landmark_ids
+        ids = tuple(given.tolist() if isinstance(given, np.ndarray) else given)
         object.__setattr__(self, "landmark_ids", ids)
         size = 3 + 2 * len(ids)
         if mean.shape != (size,) or covariance.shape != (size, size):
@@ -214,13 +214,13 @@ class Belief:
                 f"and covariance ({size}, {size}), got {mean.shape} and "
                 f"{covariance.shape}"
             )
-        if len(set(ids)) < len(ids):
+        if not isinstance(given, dict) and len(set(ids)) < len(ids):
             raise ValueError(f"landmark_ids must differ, got {ids}")
         self._chosen(self.frame)
         mean[2] = wrap_angle(float(mean[2]))
-        mean.flags.writeable = covariance.flags.writeable = False
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "covariance", covariance)
+        for name, array in (("mean", mean), ("covariance", covariance)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
 
     @classmethod
     def marginal(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cached_property, partial
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 from weakref import ref
 
 import numpy as np
@@ -300,8 +300,8 @@ class GaussianMap:
     ) -> Belief:
         """Return a snapshot of the whole map, or of the pose and some landmarks."""
         if ids is None:
-            P = self.covariance[: self.size, : self.size]
-            return Belief(self.mean[: self.size], P, tuple(self.slots), frame)
+            P, whole = self.covariance[: self.size, : self.size], cast(Any, self.slots)
+            return Belief(self.mean[: self.size], P, whole, frame)
         if not self.parts.numbers[LOWER] or 8 * len(ids) >= len(self.slots):
             return Belief.marginal(self.mean, self.covariance, self.slots, ids, frame)
         columns = np.array(columns_of(self.slots, ids))  # in the lower half of P

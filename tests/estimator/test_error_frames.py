@@ -99,8 +99,15 @@ def test_a_belief_refuses_what_does_not_fit():
         Belief(np.zeros(4), np.eye(4), (3,))
     with pytest.raises(ValueError, match=r"landmark_ids must differ, got \(7, 7\)"):
         Belief(np.zeros(7), np.eye(7), (7, 7))
-    with pytest.raises(ValueError, match="read-only"):
-        belief.mean[0] = 1.0
+    for part in (belief.mean, belief.covariance):
+        with pytest.raises(ValueError, match="read-only"):
+            part[0] = 1.0
+
+
+def test_a_belief_of_a_diverged_filter_may_be_nan():
+    belief = Belief([np.nan, 0.0, np.inf], np.full((3, 3), np.nan), ())
+    error = belief.error(np.zeros(3), np.zeros((0, 2)), frame="additive")
+    np.testing.assert_array_equal(error, [np.nan, 0.0, np.nan])
 
 
 def test_pose_nees_names_its_frame_and_averages_its_dimension():
