@@ -219,6 +219,8 @@ def _real_numbers(
         raise refusal(repr(value)) from None
     if array.shape != shape:
         raise refusal(f"shape {array.shape}")
+    if isinstance(value, np.ma.MaskedArray):  # what lies under a mask means nothing
+        raise refusal("a masked array")
     if array.dtype.char not in _REAL_NUMBERS:
         raise refusal(f"{array.dtype}")
     return array

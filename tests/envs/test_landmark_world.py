@@ -210,6 +210,7 @@ def test_double_precision_actions_keep_their_precision():
         [np.nan, 0.0], [0.0, np.inf], [0.0, -np.inf], [0.5], [0.1, 0.2, 0.3],
         [[0.1, 0.2]], 0.5, None, "ab", ["0.1", "0.2"], [True, False], [1j, 0.0],
         [[0.1], [0.2, 0.3]], [None, 0.1], {"v": 1.0}, [10**400, 0],
+        np.ma.array([0.1, 0.2], mask=[True, False]),
     ],
     ids=repr,
 )  # fmt: skip

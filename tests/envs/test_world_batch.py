@@ -281,6 +281,11 @@ def test_actions_of_another_kind_are_refused(dtype):
         begun().step(np.zeros((WORLDS, 2), dtype=dtype))
 
 
+def test_masked_actions_are_refused():
+    with pytest.raises(ValueError, match=r"actions must be .*, got a masked array"):
+        begun().step(np.ma.zeros((WORLDS, 2)))
+
+
 def test_the_layout_of_actions_compiles_no_further_kernel():
     batch, actions = begun(), np.linspace(-1, 1, 2 * WORLDS).reshape(WORLDS, 2)
     for given in (actions, np.asfortranarray(actions), actions.astype(np.float32)):
