@@ -111,7 +111,7 @@ def replay(
     TypeError
         If the estimator is no filter, but a class or a name, for example.
     numpy.linalg.LinAlgError
-        If its covariance degenerates, naming the time too.
+        If its covariance degenerates or is not finite, naming the time too.
     MemoryError
         If memory does not suffice for the landmarks that the log names.
 
@@ -289,12 +289,13 @@ class RunRecorder:
         is_last = step == self._steps - 1
         if is_last:
             self.belief = self._slam.belief()
-            if isinstance(self._slam, interface.SupportsJoin):
-                self._put(_UPDATED, step, self.belief)  # the joined map corrects it
+            self._put(_UPDATED, step, self.belief)  # a joined map corrects the pose
         is_due = is_last or self._history.is_due(step, self._ids)
         self._history.append(interface.view_map(self._slam) if is_due else None)
 
     def _put(self, track: int, step: int, belief: Belief) -> None:
+        if not np.isfinite(belief.mean.sum() + belief.covariance.sum()):
+            raise np.linalg.LinAlgError("the belief is not finite")
         self._poses[track, step] = belief.pose
         self._covariances[track, step] = belief.pose_covariance
 

@@ -268,6 +268,19 @@ def test_an_error_names_the_time_in_the_log():
         replay(SlamLog("drive", events=events), ekf())
 
 
+@pytest.mark.parametrize("part", ["mean", "covariance"])
+def test_a_belief_that_is_not_finite_is_refused_at_its_time(part):
+    class Diverging(Listener):
+        def belief(self):
+            mean, covariance = np.zeros(5), np.eye(5)
+            if len(self.calls) > 3:
+                {"mean": mean, "covariance": covariance}[part][4:] = np.nan
+            return Belief(mean, covariance, (7,))
+
+    with pytest.raises(np.linalg.LinAlgError, match=r"t = 3: the belief is not finite"):
+        replay(short_drive(), Diverging())
+
+
 def test_progress_is_told_after_every_step():
     told = []
     replay(short_drive(), ekf(), progress=lambda *numbers: told.append(numbers))
