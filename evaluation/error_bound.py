@@ -192,7 +192,7 @@ def _invariant_start(first: Array, std: Array) -> Array:
     return np.asarray(lever * std**2 @ lever.mT)
 
 
-_Run = tuple[Array, Array, BoolArray, Array, Array]
+_Run = tuple[Array, Array, BoolArray, Array, Array]  # path, map, visible, dt, fixes
 _Bounds = tuple[Array, Array, Array]  # rows of a `PosteriorBound`
 
 

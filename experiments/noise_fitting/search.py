@@ -367,7 +367,7 @@ class LogLikelihood:
         return self.record(noises, keep_beliefs=False).log_likelihoods
 
     def record(self, noises: Array, *, keep_beliefs: bool = True) -> DriveRecord:
-        """Return the records of the passes under noises (B, 7).
+        """Return the records of the passes under noises (B, 7); see `drive_likelihood`.
 
         The poses of each part begin where the filter does.
         """
