@@ -23,7 +23,7 @@ from ...evaluation.noise_findings import noise_sums
 from ...sim_configs import Scenario
 from ..runs.filter_settings import FilterSettings, refuse_large_maps
 from ..runs.simulated_runs import SimulatedRuns
-from ..runs.trace import DecisionRecorder, RunDecisions
+from ..runs.trace import DecisionRecorder, RunDecisions, is_finite
 
 _NOT_FINITE = "the pose, its covariance or the NIS is not finite"
 _MAP_NOT_FINITE = "the belief about the map is not finite"
@@ -111,7 +111,7 @@ def _in_a_batch(
     beliefs: list[interface.Belief | None] = [
         _renamed(batch.belief(run), runs) for run in range(count)
     ]
-    finite[:, -1] &= [belief is None or _is_finite_map(belief) for belief in beliefs]
+    finite[:, -1] &= [belief is None or is_finite(belief) for belief in beliefs]
     failures = {}
     for run in np.flatnonzero(~finite.all(axis=1)).tolist():
         # the single filter repeats the run, for its message
@@ -183,7 +183,7 @@ def _one_by_one(
             trace.nis[run], trace.degrees_of_freedom[run] = 0.0, 0
     except (Exception, SystemExit) as error:
         return Failure(step, f"{type(error).__name__}: {error}")
-    if not _is_finite_map(belief):
+    if not is_finite(belief):
         return Failure(step, _MAP_NOT_FINITE)
     found.beliefs[run] = belief
     if runs.true_ids is not None and (made := recorder.result()) is not None:
@@ -225,10 +225,6 @@ def _finite(trace: BatchTrace, where: Any = ...) -> BoolArray:
     poses, covariances = trace.poses[where], trace.pose_covariances[where]
     known = np.isfinite(poses).all(axis=-1) & np.isfinite(trace.nis[where])
     return np.asarray(known & np.isfinite(covariances).all(axis=(-2, -1)))
-
-
-def _is_finite_map(belief: interface.Belief) -> bool:
-    return bool(np.isfinite(belief.mean).all() and np.isfinite(belief.covariance).all())
 
 
 def _erase(trace: BatchTrace, run: int, step: int) -> None:

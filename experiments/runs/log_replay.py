@@ -18,7 +18,14 @@ from ...estimator.interface import Belief, MapView, SlamEstimator, UpdateReport
 from ...estimator.map_management import hypotheses, managed_slam
 from ..logs import ground_truth, recording, slamlog
 from .filter_settings import one_blas_thread, refuse_large_map
-from .trace import DecisionRecorder, MapEstimate, RunDecisions, RunTrace, alarm_of
+from .trace import (
+    DecisionRecorder,
+    MapEstimate,
+    RunDecisions,
+    RunTrace,
+    alarm_of,
+    is_finite,
+)
 
 Progress = Callable[[int, int], object]
 Watcher = Callable[[int, SlamEstimator, UpdateReport | None], object]
@@ -294,7 +301,7 @@ class RunRecorder:
         self._history.append(interface.view_map(self._slam) if is_due else None)
 
     def _put(self, track: int, step: int, belief: Belief) -> None:
-        if not np.isfinite(belief.mean.sum() + belief.covariance.sum()):
+        if not is_finite(belief):
             raise np.linalg.LinAlgError("the belief is not finite")
         self._poses[track, step] = belief.pose
         self._covariances[track, step] = belief.pose_covariance

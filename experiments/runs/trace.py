@@ -305,6 +305,11 @@ def alignment(
 # Statistics over the finite entries of arrays; None where there is none.
 
 
+def is_finite(belief: interface.Belief) -> bool:
+    """Return whether a belief holds neither nan nor infinity."""
+    return bool(np.isfinite(belief.mean).all() and np.isfinite(belief.covariance).all())
+
+
 def finite(value: float) -> float | None:
     """Return a number, or None for nan and infinity, which JSON does not know."""
     return float(value) if math.isfinite(value) else None

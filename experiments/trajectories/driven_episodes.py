@@ -24,6 +24,7 @@ from ..logs.slamlog import NO_LANDMARK
 from ..runs.filter_settings import FilterSettings, settings_for_scenario
 from ..runs.log_replay import replay
 from ..runs.simulated_runs import empty_record, take
+from ..runs.trace import is_finite
 from .formats import to_slamlog
 from .trajectory import Trajectory
 
@@ -149,13 +150,10 @@ def with_beliefs(trajectory: Trajectory, estimator: str) -> Trajectory:
     def watch(step: int, slam: SlamEstimator, _: UpdateReport | None) -> None:
         _record(arrays, step, slam, by_id=scenario.sensor.identities)
 
-    replay(to_slamlog(trajectory), slam, name=estimator, watch=watch)
-    for name, array in arrays.items():
-        if not np.isfinite(array).all():
-            raise ValueError(
-                f"the beliefs of '{estimator}' must be finite, got {name} of seed "
-                f"{trajectory.seed} with other numbers"
-            )
+    try:
+        replay(to_slamlog(trajectory), slam, name=estimator, watch=watch)
+    except ValueError as error:
+        raise type(error)(f"'{estimator}', seed {trajectory.seed}: {error}") from error
     return replace(trajectory, **arrays)
 
 
@@ -194,6 +192,8 @@ def _record(
         raise ValueError(
             f"a map of this data set holds at most {capacity} landmarks, got {len(ids)}"
         )
+    if not is_finite(belief):
+        raise np.linalg.LinAlgError(f"the belief is not finite after step {step}")
     rows = ids if by_id else np.arange(len(ids))
     arrays["belief_poses"][step] = belief.pose
     arrays["belief_pose_covariances"][step] = belief.pose_covariance

@@ -1,9 +1,12 @@
 """The beliefs of a filter beside the truth of generated trajectories."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from slamgym.estimator import make_estimator
+from slamgym.estimator import EkfSlam, make_estimator
+from slamgym.estimator.registry import register_estimator
 from slamgym.experiments.trajectories import (
     drive_episodes,
     generate_trajectories,
@@ -143,6 +146,23 @@ def test_what_cannot_be_is_refused_before_anything_is_written(job, message, tmp_
     with pytest.raises((ValueError, TypeError), match=message):
         generate_trajectories(KNOWN, tmp_path / "out", episodes=1, **job)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("own_registry")
+@pytest.mark.parametrize("column", [1, 4])
+def test_a_belief_that_is_not_finite_is_named_with_its_seed(column):
+    class Diverging(EkfSlam):
+        def belief(self, landmark_ids=None):
+            belief = super().belief(landmark_ids)
+            mean = belief.mean.copy()
+            mean[column:] = np.nan if 3 < self.steps < 9 else mean[column:]
+            return replace(belief, mean=mean)
+
+    register_estimator("diverging", Diverging)
+    (drive,) = drive_episodes(KNOWN, "waypoints", [6])
+    message = r"'diverging', seed 6: .*the belief is not finite"
+    with pytest.raises(np.linalg.LinAlgError, match=message):
+        with_beliefs(drive, "diverging")
 
 
 def test_a_manifest_with_another_kind_of_estimator_is_refused(tmp_path):
