@@ -101,7 +101,7 @@ def align_positions(estimate: ArrayLike, truth: ArrayLike) -> Alignment:
     e_centred, g_centred = e - e_mean, g - g_mean
     cross = e_centred[:, 0] @ g_centred[:, 1] - e_centred[:, 1] @ g_centred[:, 0]
     angle = float(np.arctan2(cross, np.sum(e_centred * g_centred)))
-    return Alignment(angle, g_mean - Alignment(angle, np.zeros(2)).apply(e_mean))
+    return Alignment(angle, g_mean - e_mean @ rotation(angle).T)
 
 
 def position_accuracy(estimate: ArrayLike, truth: ArrayLike) -> PositionAccuracy:

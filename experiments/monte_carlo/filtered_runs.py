@@ -108,18 +108,16 @@ def _in_a_batch(
     )
     trace = _run(batch, runs)
     finite = _finite(trace)
-    beliefs: list[interface.Belief | None] = [
-        _renamed(batch.belief(run), runs) for run in range(count)
-    ]
-    finite[:, -1] &= [belief is None or is_finite(belief) for belief in beliefs]
-    failures = {}
+    beliefs = [_renamed(batch.belief(run), runs) for run in range(count)]
+    finite[:, -1] &= [is_finite(belief) for belief in beliefs]
+    found = FilteredRuns(trace, [*beliefs], {}, {})
     for run in np.flatnonzero(~finite.all(axis=1)).tolist():
         # the single filter repeats the run, for its message
-        found = _one_by_one(settings, runs, run, FilteredRuns.unknown(runs))
-        failures[run] = found or Failure(int(finite[run].argmin()), _NOT_FINITE)
-        _erase(trace, run, failures[run].step)
-        beliefs[run] = None
-    return FilteredRuns(trace, beliefs, failures, {})
+        failure = _one_by_one(settings, runs, run, FilteredRuns.unknown(runs))
+        failure = failure or Failure(int(finite[run].argmin()), _NOT_FINITE)
+        _erase(trace, run, failure.step)
+        found.beliefs[run], found.failures[run] = None, failure
+    return found
 
 
 def _run(batch: BatchSlam, runs: SimulatedRuns) -> BatchTrace:

@@ -156,7 +156,8 @@ def replay(
                 report: UpdateReport | None = None
                 ids: list[int] | None = None
                 if step.scan is not None:
-                    ids = _ids(step.scan)
+                    named = step.scan.landmark_ids
+                    ids = None if named is None else named.tolist()
                     report = estimator.update(step.scan.measurements, ids)
                     decisions.add(report, ground_truth.true_ids_of(step.scan))
                 for fix_row in step.fixes:
@@ -225,10 +226,6 @@ def _naming_time(log: slamlog.SlamLog, step: recording.Step) -> Iterator[None]:
         is_numerical = isinstance(error, np.linalg.LinAlgError)
         kind = np.linalg.LinAlgError if is_numerical else ValueError
         raise kind(f"{log.name}, t = {step.t:g}: {error}") from error
-
-
-def _ids(scan: slamlog.Scan) -> list[int] | None:
-    return None if scan.landmark_ids is None else scan.landmark_ids.tolist()
 
 
 class ReadingCounts(NamedTuple):

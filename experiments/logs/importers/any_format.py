@@ -71,7 +71,7 @@ def read_log(
     """
     source = Path(path)
     if source.is_dir():
-        kind = _folder_of(source)
+        kind = "victoria" if (source / victoria_park.DRIVE).is_file() else "utias"
     else:
         path = log_lines.ReadFile(path)
         kind = _format_of(log_lines.read_lines(path)[0])
@@ -96,10 +96,6 @@ def read_log(
         landmark_ids=np.arange(len(positions)),
         landmarks=positions,
     )
-
-
-def _folder_of(folder: Path) -> str:
-    return "victoria" if (folder / victoria_park.DRIVE).is_file() else "utias"
 
 
 def _format_of(line: log_lines.LogLine) -> str:
