@@ -1,4 +1,4 @@
-"""Condition a Gaussian map: on a reading of the pose, or on landmarks being one.
+"""Condition a Gaussian map: on its pose, on a place, or on landmarks being one.
 
 `ObservesPoses` is a filter that takes readings of its pose.  Below it are pure
 functions of mean (3 + 2n,) and covariance P (3 + 2n, 3 + 2n) in the order
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import Array, IntArray
-from ..interface import UpdateReport
+from ..interface import Belief, UpdateReport
 from ..kernels.kalman_gain import ADDITIVE, INVARIANT, BeliefArrays, Rules
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import ErrorFrame, left_jacobian, points_of, state_of
@@ -204,7 +204,7 @@ def gate_of(rules: Rules, size: int) -> float:
 
 
 class ObservedMap(NamedTuple):
-    """A belief after a reading of the pose; all may have leading axes."""
+    """A belief after a reading of the pose or of a place; may have leading axes."""
 
     #: Shape (n,).
     mean: Array
@@ -249,7 +249,7 @@ def observe(
     mean, covariance : ndarray, shape (..., n) and (..., n, n)
         The beliefs; entries behind them must be zero.
     H : ndarray, shape (k, m)
-        ∂h of the first m components of the state; m = 3 in the invariant frame.
+        ∂h of the first m components of the state; m = 3 where it is iterated.
     R : ndarray, shape (k, k)
         Noise of the reading.
     innovation : callable
@@ -304,6 +304,45 @@ def slopes_at(H: Array, moved: Array) -> Array:
     slopes = np.broadcast_to(H, (*moved.shape[:-1], *H.shape)).copy()
     slopes[..., 2] += lever @ H[:, :2].T
     return slopes
+
+
+def observe_relative_pose(
+    belief: Belief, pose: Array, slots: IntArray, covariance: Array
+) -> ObservedMap:
+    """Condition a belief on a pose relative to the centroid and turn of landmarks.
+
+    With d = l − c of the landmarks l around their centroid c, a pose (p, θ) that keeps
+    its place among k landmarks moves with them by ::
+
+        e_θ = Σ (J d)ᵀ e_l / Σ ‖d‖²,    e_p = Σ e_l / k + J (p − c) e_θ
+
+    H are the slopes of the difference.  The innovation is taken at the given pose; in
+    the invariant frame it is an error of SE(2) and H that at the prior.
+
+    Parameters
+    ----------
+    belief : Belief
+    pose : ndarray, shape (3,)
+        (x, y, θ) if the landmarks are where they are estimated [m, m, rad].
+    slots : ndarray of int, shape (k,)
+        Places of the landmarks in the belief, two at least.
+    covariance : ndarray, shape (3, 3)
+        R, of the noise.
+    """
+    landmarks, k = belief.landmarks[slots], len(slots)
+    centre, nu, at = landmarks.mean(axis=0), pose - belief.pose, pose[:2]
+    nu[2] = wrap_angle(float(nu[2]))
+    if belief.frame == "invariant":
+        nu[:2] = state_of(points_of(nu) / left_jacobian(nu[2]), nu[2])[:2]
+        at = belief.pose[:2]
+    turned = (landmarks - centre)[:, ::-1] * (-1.0, 1.0)
+    turned = turned.ravel() / max((turned**2).sum(), 1e-12)
+    lever = (at - centre)[::-1] * (-1.0, 1.0)
+    H, columns = np.eye(3, len(belief.mean)), _columns(slots.tolist())
+    H[2, columns] = -turned
+    H[:2, columns] = -np.tile(np.eye(2) / k, k) - np.outer(lever, turned)
+    arguments = belief.mean, belief.covariance, H, covariance, lambda _: nu
+    return observe(*arguments, frame=belief.frame, once=True)
 
 
 # --------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo, attributes, to_the_end, undo_all, undone_on_error
+from .loop_closing import AROUND
 from .managed_slam import ManagedSlam
 from .map_editor import is_near
 from .policy import LandmarkPolicy, as_policy
@@ -46,9 +47,6 @@ PER_BASIN = 3
 
 #: Least variance of a pose that counts [m², rad²].
 NIL = 1e-12
-
-#: Covariance around a place that a scan shows [m², rad²].
-AROUND = np.diag([0.25, 0.25, 0.0225])
 
 #: Two poses overlap up to this Bhattacharyya distance in every coordinate.
 OVERLAP = 0.5
@@ -422,22 +420,17 @@ class HypothesisSlam:
     def _at_places(self, readings: Array) -> list[Hypothesis]:
         """Return the parts of the hypotheses around the places that a scan shows.
 
-        The part around a pose c is the prior N(x; x̂, P) times exp(−½ ‖x − c‖²) in the
-        metric of R.  Its weight is N(c; x̂, P + R) relative to N(0; 0, R).
+        The part around a pose c among landmarks is the prior times exp(−½ ‖z − c‖²) in
+        the metric of R, where z is the pose relative to them.  Its weight is that of c
+        in the prior of z with R added, relative to N(0; 0, R).
         """
-        parts, axes = [], np.eye(3)
+        parts = []
         for h in self.hypotheses[:PER_BASIN]:
-            for pose in h.slam.poses_of_scan(readings):
+            for place in h.slam.places_of_scan(readings):
                 slam = self._pool.copy(h.slam)
-                # The heading first: a large turn and a shift together are not linear.
-                turned = slam.observe_pose(pose[2:], axes[2:], AROUND[2:, 2:])
-                moved = slam.observe_pose(pose[:2], axes[:2], AROUND[:2, :2])
-                if turned.degrees_of_freedom and moved.degrees_of_freedom:
-                    cost = cost_of(turned) + cost_of(moved)
-                    cost -= log(np.linalg.det(AROUND))
-                    parts.append(Hypothesis(h.cost + cost, slam))
-                else:  # the gate of the filter refuses it
-                    self._pool.free([slam])
+                cost = sum(map(cost_of, slam.move_to(*place)))
+                cost -= log(np.linalg.det(AROUND))
+                parts.append(Hypothesis(h.cost + cost, slam))
         return parts
 
     def _options(self, known: Sequence[Hypothesis], readings: Array) -> list[Option]:

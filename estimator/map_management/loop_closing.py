@@ -65,8 +65,12 @@ NEAR_STDS = 10.0
 TURN_STDS = 4.0
 #: The heading may be wrong by this number of σ, and by this angle [rad].
 SLACK = 0.2
+#: Covariance of a pose around a place that a scan shows [m², rad²].
+AROUND = np.diag([0.25, 0.25, 0.0225])
+#: Added to variances that may be zero [m², rad²].
+TINY = 1e-12
 #: Least number of readings that recognise a place, and most places of a scan.
-FEWEST_READINGS, MOST_POSES = 3, 4
+FEWEST_READINGS, MOST_PLACES = 3, 4
 
 
 def lost(view: MapView, rules: Constellations | None) -> BoolArray:
@@ -173,13 +177,10 @@ def _named(view: MapView, kept: IntArray, gone: IntArray) -> Pairs:
     return [(view.ids[i], view.ids[j]) for i, j in pairs]
 
 
-def poses_of_scan(
+def places_of_scan(
     view: MapView, readings: Array, noise: Noise, rules: Constellations | None
-) -> list[Array]:
+) -> list[tuple[Array, IntArray]]:
     """Return where the robot may be if it knows no landmark accurately.
-
-    Only landmarks whose absolute position is accurate count, since a pose that they
-    suggest is then accurate, too.
 
     Parameters
     ----------
@@ -194,8 +195,9 @@ def poses_of_scan(
 
     Returns
     -------
-    list of ndarray, shape (3,)
-        Poses (x, y, θ) at which the readings show landmarks [m, m, rad].
+    list of (ndarray, ndarray), shapes (3,) and (k,)
+        Pose (x, y, θ) [m, m, rad], and the k landmarks that the scan shows there, by
+        their place in the view.
 
     Raises
     ------
@@ -209,26 +211,45 @@ def poses_of_scan(
     if _find_lost(*view[:2], accurate, np.zeros(n, dtype=np.bool_))[1]:
         return []
     argument_checks.refuse_not_finite(readings)
-    spread = np.trace(view.landmark_covariances, axis1=1, axis2=2)
-    older = np.flatnonzero(spread <= (accurate / 2) ** 2)
     both = _with_readings(view, readings, noise)
-    feasible = _offsets(both, np.arange(n, n + m), older)[0] <= OFFSET_GATE
-    partners, used = feasible.sum(axis=1), feasible.any(axis=0)
+    turned = _turned_gaps(view, readings, noise.variances(readings[:, 1])[:, 1])
+    shifted, _ = _offsets(both, np.arange(n, n + m), np.arange(n))
+    feasible = np.minimum(turned, shifted) <= OFFSET_GATE
+    partners, used = feasible.sum(axis=1), np.flatnonzero(feasible.any(axis=0))
     rows = np.argsort(partners, kind="stable")[(partners == 0).sum() :]
     if len(rows) < FEWEST_READINGS:
         return []
-    places = _two_places(both, n + rows, older[used])
+    places = _two_places(both, n + rows, used)
     feasible = feasible[np.ix_(rows, used)]
     rules = replace(rules, least=FEWEST_READINGS)
-    poses = []
-    for match in agreeing_pairs(places, feasible, rules, most=MOST_POSES):
+    found = []
+    for match in agreeing_pairs(places, feasible, rules, most=MOST_PLACES):
         if len(match.local) and is_plausible(places, match):
             turn = turn_between(places, match)
             a, b = places.local[match.local], places.older[match.older]
             shift = rotation(turn) @ (view.mean[:2] - a.mean(axis=0))
             heading = wrap_angle(float(view.mean[2]) + turn)
-            poses.append(np.array([*(b.mean(axis=0) + shift), heading]))
-    return poses
+            pose = np.array([*(b.mean(axis=0) + shift), heading])
+            found.append((pose, used[match.older]))
+    return found
+
+
+def _turned_gaps(view: MapView, readings: Array, variances: Array) -> Array:
+    """Return χ² of readings (m, 2) and landmarks with the scan turned, shape (m, n).
+
+    The scan is turned by φ about the robot until the reading points to the landmark.
+    χ² is that of φ and of what is then left, the difference of both distances; the
+    noise across the line of sight is neglected.
+    """
+    n, P = len(view.ids), view.covariance
+    d = view.landmarks - view.mean[:2]
+    turn = np.arctan2(d[:, 1], d[:, 0]) - view.mean[2] - readings[:, :1]
+    away = np.hypot(*d.T)
+    cross = P[3 : 3 + 2 * n, :2].reshape(n, 2, 2)
+    C = view.landmark_covariances + P[:2, :2] - cross - cross.mT
+    along = np.einsum("ni,nij,nj->n", d, C, d) / (away**2 + TINY)
+    squared = (readings[:, 1:] - away) ** 2 / (along + variances[:, None] + TINY)
+    return np.asarray(squared + wrap_angle(turn) ** 2 / (P[2, 2] + TINY))
 
 
 def _with_readings(view: MapView, readings: Array, noise: Noise) -> MapView:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import LARGEST, Array
+from ...arrays import LARGEST, Array, IntArray
 from ..association.detections import LOST_SCORE
 from ..association.scan_assignments import Sensor
 from ..association.scan_association import (
@@ -23,7 +23,7 @@ from ..association.scan_association import (
     ScanAssociation,
     associate,
 )
-from ..filters.conditioning import PoseReading
+from ..filters.conditioning import PoseReading, observe_relative_pose
 from ..interface import (
     Belief,
     MapView,
@@ -47,7 +47,7 @@ from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
-from .loop_closing import poses_of_scan
+from .loop_closing import AROUND, places_of_scan
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy
 from .pruning import MapPruner
@@ -269,14 +269,42 @@ class ManagedSlam:
         known, view = self.candidates, self._pruner.view_for(readings)
         return associate(self._policy, known, readings, view, self._sensor, ceiling)
 
-    def poses_of_scan(self, readings: Array) -> list[Array]:
-        """Return poses (3,) at which a scan (m, 2) shows the map, if it is needed."""
+    def places_of_scan(self, readings: Array) -> list[tuple[Array, IntArray]]:
+        """Return places that a scan (m, 2) shows, see :func:`places_of_scan`.
+
+        A filter whose belief cannot be moved observes its absolute pose there: only
+        landmarks of accurate absolute position count.
+        """
         view, rules = self._pruner.view_around(readings), self._policy.constellations
         r = readings[:, 1]
         used = readings[(r >= self._sensor.min_range) & (r <= LARGEST)]
-        poses = poses_of_scan(view, used, self._sensor.noise, rules)
-        # Last, because the test of a protocol is slow.
-        return poses if poses and isinstance(self._filter, SupportsPoses) else []
+        places = places_of_scan(view, used, self._sensor.noise, rules)
+        if not places or self._editor.can_move:
+            return places
+        if not isinstance(self._filter, SupportsPoses):
+            return []
+        spread = np.trace(view.landmark_covariances, axis1=1, axis2=2)
+        return [place for place in places if spread[place[1]].max() <= AROUND[0, 0] / 4]
+
+    def move_to(self, pose: Array, slots: IntArray) -> list[UpdateReport]:
+        """Correct the belief with a place that a scan has shown."""
+        if not self._editor.can_move:
+            # The heading first: a large turn and a shift together are not linear.
+            axes, parts = np.eye(3), (slice(2, 3), slice(2))
+            readings = [(pose[k], axes[k], AROUND[k, k]) for k in parts]
+            return [self.observe_pose(*reading) for reading in readings]
+        part = observe_relative_pose(self._filter.belief(), pose, slots, AROUND)
+        self._editor.replace_belief(part.mean, part.covariance)
+        # The scans before cannot be repeated, since the place would not be.
+        self._recent.scans, self._recent.motions = [], ()
+        return [
+            UpdateReport(
+                nis=float(part.nis),
+                degrees_of_freedom=len(part.innovation),
+                innovation=part.innovation,
+                factor=part.factor,
+            )
+        ]
 
     def take(
         self, readings: Array, associate: Callable[[], ScanAssociation]

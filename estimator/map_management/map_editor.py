@@ -19,15 +19,28 @@ What a filter lacks goes through ``belief()``, ``state_dict()`` and
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from ...arrays import Array
 from ..filters.conditioning import coincide
 from ..filters.gaussian_map import without_landmarks
-from ..interface import MapView, SlamEstimator, bookmark, hides_its_belief, view_map
+from ..interface import (
+    MapView,
+    SlamEstimator,
+    SupportsTruth,
+    bookmark,
+    hides_its_belief,
+    restore,
+    view_map,
+)
 from ..models.bearing_range import wrap_angle
 from ..support.undo import Undo
+
+#: What the saved state of a filter must hold so that its belief can be changed.
+DENSE = "mean", "covariance", "landmark_ids"
 
 
 class MapEditor:
@@ -59,12 +72,11 @@ class MapEditor:
         if self._has_methods:
             return
         can_save = hasattr(slam, "state_dict") and hasattr(slam, "load_state_dict")
-        needed = ("mean", "covariance", "landmark_ids")
-        if not can_save or not set(needed) <= set(slam.state_dict()):
+        if not can_save or not {*DENSE} <= set(slam.state_dict()):
             methods = "methods remove and merge" if merging else "method remove"
             raise TypeError(
                 f"{type(slam).__name__} cannot be managed so: it needs the {methods}, "
-                f"or state_dict() and load_state_dict() with {', '.join(needed)}"
+                f"or state_dict() and load_state_dict() with {', '.join(DENSE)}"
             )
 
     def map_view(self, within: float | None = None) -> MapView:
@@ -116,6 +128,24 @@ class MapEditor:
         else:
             for kept, gone in pairs:
                 self._slam.merge(kept, gone)
+
+    @cached_property
+    def can_move(self) -> bool:
+        """Whether :meth:`replace_belief` can change the belief."""
+        state, belief = self._slam.state_dict(), self._slam.belief()
+        if isinstance(self._slam, SupportsTruth) or not {*DENSE} <= set(state):
+            return False
+        ids, places = np.array(belief.landmark_ids), belief.mean[3:]
+        same = (ids, state["landmark_ids"]), (places, state["mean"][3:])
+        return all(np.array_equal(*both) for both in same)
+
+    def replace_belief(self, mean: Array, covariance: Array) -> None:
+        """Continue with another belief about the same landmarks, and its pose."""
+        self.expire()
+        state = self._slam.state_dict() | {"mean": mean, "covariance": covariance}
+        if "reference" in state:
+            state["reference"][:3] = mean[:3]
+        restore(self._slam, state)
 
     def _merge_in_state(self, pairs: Sequence[tuple[int, int]]) -> None:
         state = self._slam.state_dict()
