@@ -192,6 +192,8 @@ def condition(
     for j in range(size):
         belief.mean[j] += delta[j]
     gain.downdate(belief.covariance, size, system, 0, bottom)
+    for j in range(size):  # below zero by rounding alone
+        belief.covariance[j, j] = max(belief.covariance[j, j], 0.0)
     gain.restore_upper(belief.covariance, size)
     record(L, system, columns)
     return -1

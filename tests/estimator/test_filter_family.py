@@ -513,3 +513,12 @@ def test_a_robocentric_map_refuses_the_identities_of_its_own_places(name):
         slam.update([(0.1, 3.0), (0.2, 2.0)], [1, name])
     for key, value in slam.state_dict().items():
         np.testing.assert_array_equal(value, before[key])
+
+
+def test_the_unscented_filter_has_no_variance_below_zero():
+    noise = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.05, 0.1)}
+    slam = make_estimator("unscented", **noise)
+    slam.reset((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    slam.update([(0.0, 1.0), (0.0, 1.0)], [0, 1])
+    slam.update([(0.0, 1.0)], [0])
+    assert slam.belief().covariance.diagonal().min() >= 0.0
