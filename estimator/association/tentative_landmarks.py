@@ -121,9 +121,11 @@ class TentativeLandmarks(NamedTuple):
         (expected,), _, (H,) = predict_measurement(np.zeros(3), here)
         nu = reading - expected
         nu[0] = wrap_angle(float(nu[0]))
-        S = H @ C @ H.T + np.diag(noise.variances(reading[1:])[0])
+        variances = noise.variances(reading[1:])[0]
+        S = H @ C @ H.T + np.diag(variances)
         gain = np.linalg.solve(S, H @ C).T
-        unlikelihood = nu @ np.linalg.solve(S, nu) + np.log(np.linalg.det(S))
+        volume = max(np.linalg.det(S), variances.prod())  # less by rounding alone
+        unlikelihood = nu @ np.linalg.solve(S, nu) + np.log(volume)
         after = TentativeLandmarks._make(part.copy() for part in self)
         after.places[which] += gain @ nu
         after.covariances[which] = as_covariance(C - gain @ H @ C)

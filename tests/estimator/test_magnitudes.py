@@ -7,6 +7,8 @@ import pytest
 
 from slamgym.arrays import LARGEST
 from slamgym.estimator import list_estimators, make_batch, make_estimator
+from slamgym.estimator.association.scan_assignments import Noise
+from slamgym.estimator.association.tentative_landmarks import TentativeLandmarks
 
 NOISE = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
 
@@ -66,6 +68,18 @@ def test_readings_without_identity_keep_the_bound(reading, hypotheses):
     with pytest.raises(ValueError, match=r"measurements must not exceed.* in row 1$"):
         slam.update([(0.0, 5.0), reading])
     assert slam.update([(0.0, LARGEST), (1.0, LARGEST)]).tentative_rows == (0, 1)
+
+
+@pytest.mark.parametrize("distance", [1e9, 1e10, 1e11])
+def test_the_odds_of_a_landmark_that_is_too_far_for_its_noise_are_finite(distance):
+    noise = Noise(0.02, 0.1)
+    for bearing in np.linspace(-3, 3, 50):
+        first = np.array([[bearing, distance]])
+        held = TentativeLandmarks().with_new(first, noise, np.zeros(1, int), 0.1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            held = held.with_sighting(0, first[0] + (0.02, 0.1), noise, 1e-3)
+        assert np.isfinite(held.odds).all()
 
 
 @pytest.mark.parametrize(
