@@ -263,7 +263,7 @@ class RunRecorder:
         self._dof = np.zeros(steps, dtype=np.int64)
         self._history = history
         self._first: dict[int, tuple[Array, Array]] = {}
-        self._first_covariance: Array | None = None
+        self._first_covariance = self._covariances[_UPDATED, 0]  # until there is a map
         self._ids: tuple[int, ...] = ()
         #: The fields of `ReadingCounts` and of `MapChanges`.
         self.readings: Counter[str] = Counter()
@@ -322,9 +322,6 @@ class RunRecorder:
         belief = self.belief
         first = [self._first[i] for i in belief.landmark_ids]
         covariances = np.array([P for _, P in first]).reshape(-1, 2, 2)
-        first_covariance = self._first_covariance
-        if first_covariance is None:
-            first_covariance = self._covariances[_UPDATED, 0]
         return RunTrace(
             estimator=name,
             t=times,
@@ -345,7 +342,7 @@ class RunRecorder:
             true_landmarks=ground_truth.true_landmarks_of(
                 log, belief.landmark_ids, belief.landmarks, identities
             ),
-            first_covariance=first_covariance,
+            first_covariance=self._first_covariance,
             final_covariance=belief.covariance,
         )
 
@@ -355,7 +352,7 @@ class RunRecorder:
             return
         new = [i for i in ids if i not in self._first]
         belief = interface.marginal_without_joining(self._slam, new)
-        if self._first_covariance is None:
+        if not self._first:
             self._first_covariance = belief.covariance
         pairs = zip(belief.landmarks, belief.landmark_covariances, strict=True)
         self._first |= dict(zip(new, pairs, strict=True))

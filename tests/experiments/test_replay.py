@@ -246,6 +246,12 @@ def test_first_landmarks_are_those_of_the_step_they_entered_at():
     )
 
 
+def test_without_a_map_the_first_covariance_is_that_of_the_start():
+    trace = replay(short_drive(), make_estimator("ekf", **NOISE, min_range=9.0)).trace
+    np.testing.assert_array_equal(trace.first_covariance, np.zeros((3, 3)))
+    assert trace.final_covariance[0, 0] > 0
+
+
 def test_readings_are_counted_by_what_became_of_them():
     events = (
         scan(0.0, (0.0, 5.0), (1.0, 1e-6), ids=[1, 2]),
