@@ -428,9 +428,12 @@ class HypothesisSlam:
         for h in self.hypotheses[:PER_BASIN]:
             for place in h.slam.places_of_scan(readings):
                 slam = self._pool.copy(h.slam)
-                cost = sum(map(cost_of, slam.move_to(*place)))
-                cost -= log(np.linalg.det(AROUND))
-                parts.append(Hypothesis(h.cost + cost, slam))
+                reports = slam.move_to(*place)
+                if all(report.degrees_of_freedom for report in reports):
+                    cost = sum(map(cost_of, reports)) - log(np.linalg.det(AROUND))
+                    parts.append(Hypothesis(h.cost + cost, slam))
+                else:  # the gate of the filter refuses it
+                    self._pool.free([slam])
         return parts
 
     def _options(self, known: Sequence[Hypothesis], readings: Array) -> list[Option]:

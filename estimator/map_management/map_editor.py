@@ -132,9 +132,10 @@ class MapEditor:
     @cached_property
     def can_move(self) -> bool:
         """Whether :meth:`replace_belief` can change the belief."""
-        state, belief = self._slam.state_dict(), self._slam.belief()
+        state = self._slam.state_dict()
         if isinstance(self._slam, SupportsTruth) or not {*DENSE} <= set(state):
             return False
+        belief = self._slam.belief()
         ids, places = np.array(belief.landmark_ids), belief.mean[3:]
         same = (ids, state["landmark_ids"]), (places, state["mean"][3:])
         return all(np.array_equal(*both) for both in same)
