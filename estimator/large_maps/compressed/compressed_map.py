@@ -100,7 +100,9 @@ class CompressedMap:
             outside = 3 + pairs(np.flatnonzero(~is_local))
             columns = self._columns([i for i in ids if i not in order])
             strip = now.scaled(np.ascontiguousarray(self._strip[:, columns]))
-            mean[outside] = self._points[columns] + combine(now.shift, strip)[0]
+            moved = combine(now.shift, strip)[0]
+            mean[outside] = self._points[columns] + moved
+            strip = now.extended(strip, moved)
             cross = combine(now.gain(local), strip)
             covariance[np.ix_(inside, outside)] = cross
             covariance[np.ix_(outside, inside)] = cross.T
@@ -148,7 +150,8 @@ class CompressedMap:
         now, own = self._phase(), self._columns(list(self.local))
         self._make_room()
         self._references = self._references.copy()
-        self._points = self._points + combine(now.unscaled(now.shift), self._strip)[0]
+        before = self._points
+        self._points = before + combine(now.unscaled(now.shift), self._strip)[0]
         self._points[own] = now.mean[now.first :]
         self._references[own] = now.reference[now.first :]
         ahead = now.mean[:2] + (now.mean[:2] - self._origin) / 2  # likely direction
@@ -159,7 +162,9 @@ class CompressedMap:
             self.slots, self.local, chosen, self._stored, now.first, own
         )
         blocks = phase_update.blocks_in_a_step(self.deferred.width, hurried=hurried)
-        self._handover = phase_update.Handover(now, self._strip, rows, blocks)
+        self._handover = phase_update.Handover(
+            now, self._strip, self._points - before, rows, blocks
+        )
         self.deferred.forget(rows.new)
         columns = self._columns(list(self.local))
         if hurried:
@@ -317,7 +322,8 @@ class CompressedMap:
 
     def _phase(self) -> phase_update.Phase:
         parts = (*self.filter.map.used, 3 + 2 * self._virtual)
-        return phase_update.Phase(*parts, self._scale, self.is_invariant)
+        is_invariant = self.is_invariant and self._virtual > 0
+        return phase_update.Phase(*parts, self._scale, is_invariant)
 
     def _columns(self, ids: Sequence[int]) -> IntArray:
         """Return the columns of landmarks in the map's arrays."""

@@ -54,19 +54,37 @@ class Phase(NamedTuple):
     invariant: bool  # whether what refers to y is read as complex numbers
 
     def coefficients(self, numbers: Array) -> Array:
-        """Return rows (k, e) as the coefficients (k, s) of rows of S̃."""
+        """Return rows of :meth:`cross` as the coefficients of rows of S̃."""
         if self.invariant:
             return numbers.view(np.complex128)
         return numbers[:, : len(self.scale)]
 
+    def cross(self, rows: IntArray) -> Array:
+        """Return the covariance of rows with y; if invariant, with (ỹ, J e_θ)."""
+        if not self.invariant:
+            return self.covariance[rows, 3 : self.first]
+        turning = self.covariance[rows[:, None], self._virtual]
+        return turning - turning[:, -1:] * self._turn
+
     def gain(self, rows: IntArray) -> Array:
-        """Return rows of Φ, shape (k, s)."""
-        return self.coefficients(self.covariance[rows, 3 : self.first])
+        """Return rows of Φ, shape (k, s), or (k, s + 1) if invariant."""
+        return self.coefficients(self.cross(rows))
 
     @property
     def loss(self) -> Array:
-        """Ψ, shape (e, e)."""
-        return -self.covariance[3 : self.first, 3 : self.first]
+        """Ψ, shape (e, e), or (e + 2, e + 2) if invariant."""
+        loss = -self.cross(self._virtual)
+        return loss - self._turn[:, None] * loss[-1] if self.invariant else loss
+
+    @property
+    def _virtual(self) -> IntArray:
+        """Rows of y, and twice that of θ if invariant."""
+        return np.r_[3 : self.first, [2, 2] if self.invariant else []].astype(int)
+
+    @property
+    def _turn(self) -> Array:
+        """What the heading's error adds to y, J y; and 1 and 0, for J e_θ."""
+        return np.append((1j * self.shift).view(np.float64), [1.0, 0.0])
 
     @property
     def shift(self) -> Array:
@@ -95,7 +113,13 @@ class Phase(NamedTuple):
 
     def unscaled(self, coefficients: Array) -> Array:
         """Return Φ T⁻¹, whose product with S is that of Φ with S̃."""
-        return _solve(self.scale, coefficients, side=0)
+        size = len(self.scale)
+        solution = _solve(self.scale, coefficients[:, :size], side=0)
+        return np.hstack([solution, coefficients[:, size:]])
+
+    def extended(self, strip: Array, moved: Array) -> Array:
+        """Return S or S̃, with what the phase moved the points by if invariant."""
+        return np.vstack([strip, moved]) if self.invariant else strip
 
 
 def combine(coefficients: Array, strip: Array) -> Array:
@@ -116,13 +140,21 @@ def _by_pivots(loss: Array) -> tuple[Array, Array]:
 
 
 def _by_eigenvalues(loss: Array) -> tuple[Array, Array]:
-    """Eigenvalue decomposition of a symmetric matrix, without its rows of zeros."""
+    """Eigenvalue decomposition of a symmetric matrix, without its rows of zeros.
+
+    The last row is that of the heading, in a unit of its own.
+    """
+    diagonal, last, units = np.abs(loss.diagonal()), loss[-1], np.ones(len(loss))
+    largest = (diagonal + last**2 / (diagonal[-1] or 1.0))[:-1].max(initial=0.0)
+    units[-1] = np.sqrt(diagonal[-1] / (largest or 1.0)) or 1.0
+    loss = loss / units / units[:, None]
     used = np.flatnonzero(loss.any(axis=0))
     values, vectors = np.linalg.eigh(loss[used[:, None], used])
     least = np.finfo(np.float64).eps * len(used) * np.abs(values).max(initial=0.0)
     large = np.abs(values) > least
     root = np.zeros((large.sum(), len(loss)))
     root[:, used] = (vectors[:, large] * np.sqrt(np.abs(values[large]))).T
+    root *= units
     return root, np.sign(values[large])
 
 
@@ -292,6 +324,7 @@ class Handover:
 
     old: Phase  # the end of the old phase
     strip: Array  # S of the old phase, shape (s, width)
+    moved: Array  # by what the phase has moved all points, shape (width,)
     rows: Exchanged
     group: int  # number of blocks that are exchanged at a time
     done: int = 0  # number of blocks that have been exchanged
@@ -335,6 +368,7 @@ class Handover:
         """
         kept, entering = self.rows.needed[self.rows.left :], self.rows.entering
         S = self.old.scaled(np.ascontiguousarray(self.strip[:, entering]))
+        S = self.old.extended(S, self.moved[entering])
         block, P = stored.marginal(entering), self.old.covariance
         lost = combine(self.old.coefficients(self.old.loss), S).T.copy()
         block -= combine(self.old.coefficients(lost), S)  # S̃ᵀ Ψ S̃
@@ -358,7 +392,8 @@ class Handover:
 
     def _exchange(self, stored: DeferredCovariance, blocks: range) -> None:
         here = slice(blocks.start * BLOCK, blocks.stop * BLOCK)
-        rows, values, S = self.rows, self._values, self.strip[:, here]
+        rows, values = self.rows, self._values
+        S = self.old.extended(self.strip[:, here], self.moved[here])
         needed = len(rows.needed)
         gain, root = self._coefficients[:needed], self._coefficients[needed:]
         values[:needed, here] = combine(gain, S)
