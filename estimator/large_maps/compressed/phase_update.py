@@ -25,6 +25,11 @@ q⁺ = q + V(t) δq, and the covariance is transported, P ← G P Gᵀ, e_q⁺ =
 e_θ.  Both are linear in q read as a complex number, J = i.  There y is one complex
 number for each of the s coordinates, a *virtual landmark* at the origin.  With x_b and
 the rows of S read as complex numbers, the equations above hold unchanged.
+
+J y e_θ is then most of the error of y.  It is large where the heading is badly known,
+and its product with S̃ small, as is the distance m_b = S̃ᵀ y by which the points moved:
+rounding would spoil the difference.  It is therefore taken apart: with
+ỹ = y − J y e_θ in place of y, and with m_b as one more row of S̃, for J e_θ.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -54,36 +59,35 @@ class Phase(NamedTuple):
     invariant: bool  # whether what refers to y is read as complex numbers
 
     def coefficients(self, numbers: Array) -> Array:
-        """Return rows of :meth:`cross` as the coefficients of rows of S̃."""
+        """Return rows (k, e) as the coefficients (k, s) of rows of S̃."""
         if self.invariant:
             return numbers.view(np.complex128)
         return numbers[:, : len(self.scale)]
 
     def cross(self, rows: IntArray) -> Array:
-        """Return the covariance of rows with y; if invariant, with (ỹ, J e_θ)."""
-        if not self.invariant:
-            return self.covariance[rows, 3 : self.first]
-        turning = self.covariance[rows[:, None], self._virtual]
-        return turning - turning[:, -1:] * self._turn
+        """Return the covariance of rows with y, or with ỹ and J e_θ if invariant."""
+        cross = self.covariance[rows[:, None], self._virtual]
+        return cross - cross[:, -1:] * self._turn if self.invariant else cross
 
     def gain(self, rows: IntArray) -> Array:
-        """Return rows of Φ, shape (k, s), or (k, s + 1) if invariant."""
+        """Return rows of Φ, shape (k, s); one column more in the invariant frame."""
         return self.coefficients(self.cross(rows))
 
     @property
     def loss(self) -> Array:
-        """Ψ, shape (e, e), or (e + 2, e + 2) if invariant."""
+        """Ψ, shape (e, e); two rows more in the invariant frame."""
         loss = -self.cross(self._virtual)
         return loss - self._turn[:, None] * loss[-1] if self.invariant else loss
 
     @property
     def _virtual(self) -> IntArray:
-        """Rows of y, and twice that of θ if invariant."""
-        return np.r_[3 : self.first, [2, 2] if self.invariant else []].astype(int)
+        """Rows of y, and in the invariant frame twice that of θ."""
+        rows = np.arange(3, self.first)
+        return np.append(rows, (2, 2)) if self.invariant else rows
 
     @property
     def _turn(self) -> Array:
-        """What the heading's error adds to y, J y; and 1 and 0, for J e_θ."""
+        """J y, the multiple of e_θ in y; then 1 and 0, which leave (0, e_θ) = J e_θ."""
         return np.append((1j * self.shift).view(np.float64), [1.0, 0.0])
 
     @property
@@ -118,7 +122,7 @@ class Phase(NamedTuple):
         return np.hstack([solution, coefficients[:, size:]])
 
     def extended(self, strip: Array, moved: Array) -> Array:
-        """Return S or S̃, with what the phase moved the points by if invariant."""
+        """Return S or S̃, in the invariant frame with the row m_b."""
         return np.vstack([strip, moved]) if self.invariant else strip
 
 
@@ -142,20 +146,19 @@ def _by_pivots(loss: Array) -> tuple[Array, Array]:
 def _by_eigenvalues(loss: Array) -> tuple[Array, Array]:
     """Eigenvalue decomposition of a symmetric matrix, without its rows of zeros.
 
-    The last row is that of the heading, in a unit of its own.
+    The last row is that of the heading.  Its unit is one that fits the others.
     """
-    diagonal, last, units = np.abs(loss.diagonal()), loss[-1], np.ones(len(loss))
-    largest = (diagonal + last**2 / (diagonal[-1] or 1.0))[:-1].max(initial=0.0)
+    diagonal, units = np.abs(loss.diagonal()), np.ones(len(loss))
+    largest = (diagonal + loss[-1] ** 2 / (diagonal[-1] or 1.0))[:-1].max()
     units[-1] = np.sqrt(diagonal[-1] / (largest or 1.0)) or 1.0
-    loss = loss / units / units[:, None]
     used = np.flatnonzero(loss.any(axis=0))
-    values, vectors = np.linalg.eigh(loss[used[:, None], used])
+    scaled = (loss / units / units[:, None])[used[:, None], used]
+    values, vectors = np.linalg.eigh(scaled)
     least = np.finfo(np.float64).eps * len(used) * np.abs(values).max(initial=0.0)
     large = np.abs(values) > least
     root = np.zeros((large.sum(), len(loss)))
     root[:, used] = (vectors[:, large] * np.sqrt(np.abs(values[large]))).T
-    root *= units
-    return root, np.sign(values[large])
+    return root * units, np.sign(values[large])
 
 
 def _solve(scale: Array, rows: Array, side: int) -> Array:
@@ -324,7 +327,7 @@ class Handover:
 
     old: Phase  # the end of the old phase
     strip: Array  # S of the old phase, shape (s, width)
-    moved: Array  # by what the phase has moved all points, shape (width,)
+    moved: Array  # by which the phase has moved the points, shape (width,)
     rows: Exchanged
     group: int  # number of blocks that are exchanged at a time
     done: int = 0  # number of blocks that have been exchanged
@@ -378,7 +381,7 @@ class Handover:
     @property
     def nbytes(self) -> int:
         """Memory that the exchange holds, without the old strip [bytes]."""
-        arrays = [self._values, self.old.covariance]
+        arrays = [self._values, self.moved, self.old.covariance]
         if self.is_factored:
             arrays += [self._coefficients, self.lost.root]
         return sum(array.nbytes for array in arrays)
