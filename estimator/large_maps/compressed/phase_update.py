@@ -151,7 +151,8 @@ def _by_eigenvalues(loss: Array) -> tuple[Array, Array]:
     diagonal, units = np.abs(loss.diagonal()), np.ones(len(loss))
     largest = (diagonal + loss[-1] ** 2 / (diagonal[-1] or 1.0))[:-1].max()
     units[-1] = np.sqrt(diagonal[-1] / (largest or 1.0)) or 1.0
-    used = np.flatnonzero(loss.any(axis=0))
+    measured = loss[:-1, :-1].any()  # otherwise no point has moved
+    used = np.flatnonzero(loss.any(axis=0) & measured)
     scaled = (loss / units / units[:, None])[used[:, None], used]
     values, vectors = np.linalg.eigh(scaled)
     least = np.finfo(np.float64).eps * len(used) * np.abs(values).max(initial=0.0)
