@@ -18,7 +18,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -152,9 +152,8 @@ def marginal_covariance(
         Y = _solve(node.lower, right[:, used])
         total[used[:, None], used] += Y.T @ Y
         changed[node.rest] = True
-        for unknown, change in zip(
-            node.rest.tolist(), node.response.T @ Y, strict=True
-        ):
+        changes = node.response.T @ Y
+        for unknown, change in zip(node.rest.tolist(), changes, strict=True):
             if unknown not in live:
                 live[unknown] = np.zeros(size)
             live[unknown][used] -= change
@@ -207,15 +206,6 @@ class InformationMatrix:
 
     def __len__(self) -> int:
         return len(self._links)
-
-    def checkpoint(self) -> Callable[[], None]:
-        """Return what takes back later changes; rows are replaced, never changed."""
-        links, blocks = list(self._links), list(self._blocks)
-
-        def undo() -> None:
-            self._links, self._blocks = list(links), list(blocks)
-
-        return undo
 
     @property
     def nbytes(self) -> int:
@@ -287,8 +277,6 @@ class InformationMatrix:
 
     def neighbours(self, slots: IntArray) -> IntArray:
         """Return all landmarks linked with the given ones, without these."""
-        if not len(slots):
-            return slots
         return np.setdiff1d(self.rows(slots)[1], slots)
 
     def rows(self, slots: IntArray) -> tuple[IntArray, IntArray, Array]:

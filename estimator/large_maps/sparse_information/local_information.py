@@ -15,7 +15,7 @@ from scipy.linalg import cho_solve, lapack, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
 from ...models.motions import predict_pose
-from ...support.undo import Undo, contents, undo_all
+from ...support.undo import Undo, contents
 from ..elimination import LandmarkElimination, RestFactor
 from ..multifrontal import InformationMatrix, pairs
 
@@ -39,8 +39,7 @@ class SparseMap:
 
     def checkpoint(self) -> Undo:
         """Return what takes back later changes of means, information and order."""
-        parts = contents(self, self.elimination)
-        return undo_all(parts, self.information.checkpoint())
+        return contents(self, self.elimination, self.information)
 
 
 @dataclass(frozen=True)

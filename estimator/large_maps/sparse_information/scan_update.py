@@ -151,14 +151,8 @@ class ScanRules:
         **settings: Any,
     ) -> None:
         self.base = argument_checks.one_of("base", base, tuple(BASES))
-        unknown = set(settings) - {
-            "sensor",
-            "gate_probability",
-            "noise_at_rest",
-            "min_range",
-            "motion",
-        }
-        if unknown:
+        known = {"sensor", "gate_probability", "noise_at_rest", "min_range", "motion"}
+        if unknown := set(settings) - known:
             raise TypeError(f"SparseInformationSlam has no option {min(unknown)!r}")
         noise = np.array(motion_std), np.array(measurement_std)
         #: Makes the filter of the same belief in dense form.

@@ -164,10 +164,8 @@ class ClosedSubmaps:
         """
         if not len(slots):
             return slots, region
-        points = joining.points_seen(self.summaries, self.join(known).frames, count)[
-            slots
-        ]
-        chosen, region = region.chosen(points)
+        points = joining.points_seen(self.summaries, self.join(known).frames, count)
+        chosen, region = region.chosen(points[slots])
         return slots[chosen], region
 
     def discard_frames(self) -> None:

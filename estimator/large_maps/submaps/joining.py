@@ -18,7 +18,7 @@ from scipy.linalg import cho_solve
 from scipy.sparse import coo_array
 
 from ....arrays import Array, IntArray
-from ...models.rigid_motion import ErrorFrame, compose
+from ...models.rigid_motion import ErrorFrame, compose, points_of
 from ..elimination import Quadratic, SubmapElimination, dissect
 from ..multifrontal import pairs
 from .factor import (
@@ -292,10 +292,8 @@ def points_seen(summaries: Sequence[SubmapSummary], frames: Array, count: int) -
     """
     points = np.full((count, 2), np.nan)
     for summary, frame in zip(reversed(summaries), frames[len(summaries) - 1 :: -1]):  # noqa: B905
-        mean = summary.mean
-        seen = complex(*frame[:2]) + np.exp(1j * frame[2]) * (
-            mean[3::2] + 1j * mean[4::2]
-        )
+        landmarks = points_of(summary.mean)[1:]
+        seen = complex(*frame[:2]) + np.exp(1j * frame[2]) * landmarks
         points[summary.slots] = seen.view(np.float64).reshape(-1, 2)
     return points
 

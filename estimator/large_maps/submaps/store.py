@@ -148,11 +148,9 @@ class FolderStore:
     def clear(self) -> None:
         """Delete the files of the run."""
         if self.run and self._found_run() == self.run:
+            # Including files newer than a loaded state.
             for path in self.folder.glob("submap_[0-9]*"):
-                if path.suffix in (
-                    SUFFIX,
-                    PART,
-                ):  # including files newer than a loaded state
+                if path.suffix in (SUFFIX, PART):
                     path.unlink()
             (self.folder / MARKER).unlink()
         self.run, self.digests = "", []
@@ -322,10 +320,6 @@ class LandmarkIndex(Mapping[int, int]):
             for name, slot in zip(names, slots, strict=True)
         ]
         return np.array(known, dtype=np.int64)
-
-    def links(self, names: Iterable[int]) -> set[int]:
-        """Return the names in a submap that are not landmarks."""
-        return {name for name in names if name not in self._slots}
 
 
 def link_name(slot: int) -> int:

@@ -507,7 +507,7 @@ def saved_graph(
             store.append(submap)
         summaries.append(summarise(merged(submap, renamed, active.frame)))
     closed = ClosedSubmaps(store, active.frame, renamed, summaries)
-    links = index.links(names)
+    links = {i for i in names if i not in index}
     if unknown := {i for i in links if slot_of_link(i) not in closed.slots}:
         raise ValueError(
             f"state['local_landmark_ids'] must be in the map, got {min(unknown)}"
