@@ -228,7 +228,11 @@ def test_any_scale_of_a_phase_gives_the_same_belief(base, monkeypatch):
     rng = np.random.default_rng(0)
 
     def diagonal(covariance):
-        return scale_of(-np.eye(len(covariance)) + np.diag(covariance.diagonal()))
+        indefinite = 1e9 * np.eye(len(covariance), k=-1)
+        indefinite += np.diag(covariance.diagonal())
+        scale, std = scale_of(indefinite), np.sqrt(covariance.diagonal())
+        np.testing.assert_allclose(scale, np.diag(std))
+        return scale
 
     def triangular(covariance):
         size = covariance.shape

@@ -26,10 +26,11 @@ e_θ.  Both are linear in q read as a complex number, J = i.  There y is one com
 number for each of the s coordinates, a *virtual landmark* at the origin.  With x_b and
 the rows of S read as complex numbers, the equations above hold unchanged.
 
-J y e_θ is then most of the error of y.  It is large where the heading is badly known,
-and its product with S̃ small, as is the distance m_b = S̃ᵀ y by which the points moved:
-rounding would spoil the difference.  It is therefore taken apart: with
-ỹ = y − J y e_θ in place of y, and with m_b as one more row of S̃, for J e_θ.
+Where the heading is badly known, J y e_θ is most of the error e_y of y.  Its product
+with S̃ is J m_b e_θ, where m_b = S̃ᵀ y is how far the points have moved.  This is often
+far less than the terms of the product, whose rounding would hide the rest of the error.
+The two are therefore kept apart: ỹ = e_y − J y e_θ stands in place of e_y, and m_b is
+one more row of S̃, that of J e_θ.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -65,7 +66,7 @@ class Phase(NamedTuple):
         return numbers[:, : len(self.scale)]
 
     def cross(self, rows: IntArray) -> Array:
-        """Return the covariance of rows with y, or with ỹ and J e_θ if invariant."""
+        """Return the covariance of rows with e_y, or with ỹ and J e_θ if invariant."""
         cross = self.covariance[rows[:, None], self._virtual]
         return cross - cross[:, -1:] * self._turn if self.invariant else cross
 
@@ -87,7 +88,7 @@ class Phase(NamedTuple):
 
     @property
     def _turn(self) -> Array:
-        """J y, the multiple of e_θ in y; then 1 and 0, which leave (0, e_θ) = J e_θ."""
+        """J y, the multiple of e_θ in e_y; then 1 and 0: (0, e_θ) = J e_θ is left."""
         return np.append((1j * self.shift).view(np.float64), [1.0, 0.0])
 
     @property
@@ -104,7 +105,7 @@ class Phase(NamedTuple):
         Returns
         -------
         root : ndarray, shape (rank, s)
-            Uᵀ.
+            Uᵀ; one column more in the invariant frame.
         signs : ndarray, shape (rank,)
             σ, each 1 or -1.
         """
@@ -144,22 +145,15 @@ def _by_pivots(loss: Array) -> tuple[Array, Array]:
 
 
 def _by_eigenvalues(loss: Array) -> tuple[Array, Array]:
-    """Eigenvalue decomposition of a symmetric matrix, without its rows of zeros.
-
-    The last row is that of the heading.  Its unit is one that fits the others.
-    """
-    diagonal, units = np.abs(loss.diagonal()), np.ones(len(loss))
-    largest = (diagonal + loss[-1] ** 2 / (diagonal[-1] or 1.0))[:-1].max()
-    units[-1] = np.sqrt(diagonal[-1] / (largest or 1.0)) or 1.0
+    """Eigenvalue decomposition of a symmetric matrix, without its rows of zeros."""
     measured = loss[:-1, :-1].any()  # otherwise no point has moved
     used = np.flatnonzero(loss.any(axis=0) & measured)
-    scaled = (loss / units / units[:, None])[used[:, None], used]
-    values, vectors = np.linalg.eigh(scaled)
+    values, vectors = np.linalg.eigh(loss[used[:, None], used])
     least = np.finfo(np.float64).eps * len(used) * np.abs(values).max(initial=0.0)
     large = np.abs(values) > least
     root = np.zeros((large.sum(), len(loss)))
     root[:, used] = (vectors[:, large] * np.sqrt(np.abs(values[large]))).T
-    return root * units, np.sign(values[large])
+    return root, np.sign(values[large])
 
 
 def _solve(scale: Array, rows: Array, side: int) -> Array:
