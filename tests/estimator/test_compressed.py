@@ -219,6 +219,18 @@ def test_it_stays_accurate_where_every_scan_changes_a_part_of_the_local_map(
     assert_accurate(slam, full, 1e-7)
 
 
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_a_phase_without_a_reading_defers_no_work(base):
+    slam = run(CompressedEkfSlam(*NOISE, base=base, local_size=12), wander(100, 40))
+    ids, whole = slam.landmark_ids, map_of(slam)
+    assert len(ids) > 12
+    whole.change_local_map(ids[:6], 12, hurried=True)
+    assert whole.finish_handover() > 0
+    slam.predict((1.0, 0.2))
+    whole.change_local_map(ids[-6:], 12, hurried=True)
+    assert whole.finish_handover() == 0
+
+
 @pytest.mark.parametrize("base", BASES)
 def test_any_scale_of_a_phase_gives_the_same_belief(base, monkeypatch):
     """Also a diagonal one, which serves where a covariance is indefinite."""
