@@ -67,8 +67,11 @@ class Phase(NamedTuple):
 
     def cross(self, rows: IntArray) -> Array:
         """Return the covariance of rows with e_y, or with ỹ and J e_θ if invariant."""
-        cross = self.covariance[rows[:, None], self._virtual]
-        return cross - cross[:, -1:] * self._turn if self.invariant else cross
+        cross = self.covariance[rows, 3 : self.first]
+        if not self.invariant:
+            return cross
+        heading = self.covariance[rows, 2:3]  # J e_θ is (0, e_θ)
+        return np.hstack([cross - heading * self._turn, 0.0 * heading, heading])
 
     def gain(self, rows: IntArray) -> Array:
         """Return rows of Φ, shape (k, s); one column more in the invariant frame."""
@@ -77,19 +80,15 @@ class Phase(NamedTuple):
     @property
     def loss(self) -> Array:
         """Ψ, shape (e, e); two rows more in the invariant frame."""
-        loss = -self.cross(self._virtual)
-        return loss - self._turn[:, None] * loss[-1] if self.invariant else loss
-
-    @property
-    def _virtual(self) -> IntArray:
-        """Rows of y, and in the invariant frame twice that of θ."""
-        rows = np.arange(3, self.first)
-        return np.append(rows, (2, 2)) if self.invariant else rows
+        heading, loss = np.split(-self.cross(np.arange(2, self.first)), [1])
+        if not self.invariant:
+            return loss
+        return np.vstack([loss - self._turn.T * heading, 0.0 * heading, heading])
 
     @property
     def _turn(self) -> Array:
-        """J y, the multiple of e_θ in e_y; then 1 and 0: (0, e_θ) = J e_θ is left."""
-        return np.append((1j * self.shift).view(np.float64), [1.0, 0.0])
+        """J y, the multiple of e_θ in e_y, shape (1, e)."""
+        return (1j * self.shift).view(np.float64)
 
     @property
     def shift(self) -> Array:
