@@ -146,9 +146,8 @@ class LandmarkElimination:
         columns = pairs(order)
         upper = np.triu(done[1].update)
         C = -(upper + np.triu(upper, 1).T)[np.ix_(columns, columns)]
-        return RestFactor(
-            [part.node for part in done.values()], slots, border[order], C, len(nodes)
-        )
+        factors = [part.node for part in done.values()]
+        return RestFactor(factors, slots, border[order], C, len(nodes))
 
     def check(self, matrix: InformationMatrix, local: IntArray) -> None:
         """Raise a ValueError if linked landmarks, not both local, are unrelated."""

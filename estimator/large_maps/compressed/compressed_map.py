@@ -162,9 +162,8 @@ class CompressedMap:
             self.slots, self.local, chosen, self._stored, now.first, own
         )
         blocks = phase_update.blocks_in_a_step(self.deferred.width, hurried=hurried)
-        self._handover = phase_update.Handover(
-            now, self._strip, self._points - before, rows, blocks
-        )
+        moved = self._points - before
+        self._handover = phase_update.Handover(now, self._strip, moved, rows, blocks)
         self.deferred.forget(rows.new)
         columns = self._columns(list(self.local))
         if hurried:
