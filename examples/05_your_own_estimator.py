@@ -97,7 +97,10 @@ class TextbookEkf:
 
 
 class CarefulEkf(TextbookEkf):
-    """The same with what is recommended: refusals, and a state that can be saved."""
+    """The same with what is recommended: refusals, and a state that can be saved.
+
+    Landmark management edits the map in this state, by the three names in it.
+    """
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Refuse what is not two finite numbers before anything changes."""
@@ -115,12 +118,13 @@ class CarefulEkf(TextbookEkf):
 
     def state_dict(self) -> dict[str, Any]:
         """Copy the whole state."""
-        return {"x": self.x.copy(), "P": self.P.copy(), "ids": np.array(self.ids)}
+        ids = np.array(self.ids, dtype=int)
+        return {"mean": self.x.copy(), "covariance": self.P.copy(), "landmark_ids": ids}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a copied state."""
-        self.x, self.P = state["x"].copy(), state["P"].copy()
-        self.ids = state["ids"].tolist()
+        self.x, self.P = state["mean"].copy(), state["covariance"].copy()
+        self.ids = state["landmark_ids"].tolist()
 
 
 class TurnsFirst(TextbookEkf):

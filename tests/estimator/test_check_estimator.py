@@ -1,10 +1,12 @@
 import re
+import sys
 from functools import partial
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+from comparison import assert_close_beliefs
 
 from slamgym.estimator import (
     Belief,
@@ -31,6 +33,7 @@ from slamgym.estimator.covariance_checks import (
     _state,
 )
 from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.motions import predict_pose
 
 TEXTBOOK = Path(__file__).parents[2] / "examples" / "05_your_own_estimator.py"
 NOISE = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
@@ -494,6 +497,32 @@ def test_a_filter_that_forgets_to_wrap_the_innovation_is_named(
     complaint = rf"bearings {bearings}.* wrap the innovation to .* NIS 4\.9e\+04"
     with pytest.raises(EstimatorContractError, match=complaint):
         check_estimator(textbook.CarefulEkf)
+
+
+def test_the_example_can_be_managed(monkeypatch):
+    """Its own state is edited; an EKF with methods for this has the same beliefs."""
+    monkeypatch.setitem(sys.modules, "textbook", textbook_module())
+    noise = {"motion_std": (0.02, 0.02, 0.01), "measurement_std": (0.03, 0.05)}
+    own, shipped = (
+        make_estimator(name, management=True, **noise)
+        for name in ("textbook:CarefulEkf", "ekf")
+    )
+    landmarks = np.array([(4.0, 1.0), (2.0, -3.0), (-1.0, 4.0)])
+    rng, pose = np.random.default_rng(0), np.zeros(3)
+    for _ in range(12):
+        scan = predict_measurement(pose, landmarks).measurement
+        scan += rng.standard_normal((3, 2)) * noise["measurement_std"]
+        for slam in (own, shipped):
+            slam.update(scan)
+            slam.predict((0.3, 0.2))
+        pose = predict_pose(pose, np.array([0.3, 0.2])).pose
+    for slam in (own, shipped):
+        assert len(slam.belief().landmark_ids) == 3
+        one, other, last = slam.belief().landmark_ids
+        slam.remove([last])
+        slam.merge(one, other)
+    assert own.belief().landmark_ids == shipped.belief().landmark_ids == (one,)
+    assert_close_beliefs(own.belief(), shipped.belief())
 
 
 def textbook_module(old="", new=""):
