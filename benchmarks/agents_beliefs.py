@@ -6,7 +6,7 @@ For B worlds, in the same round and on the same scans::
 
     wrapped step    `BeliefObservationVector.step` with ``ekf``
     plain step      `step` of the same worlds, seeds and actions without the wrapper
-    kernels         time of `step_runs` within the wrapped steps: one predict and one
+    kernels         time of `drive_runs` within the wrapped steps: one predict and one
                     update with six readings in each world
 
 "Added" is therefore all Python and numpy code between the scans and the observed
@@ -29,7 +29,7 @@ from slamgym.estimator import imagine
 from slamgym.estimator.filters import batch
 from slamgym.estimator.filters.batch import BatchBeliefs, BatchSlam
 from slamgym.estimator.filters.imagine import SensorLimits
-from slamgym.estimator.kernels.batch import drive_runs, step_runs
+from slamgym.estimator.kernels.batch import drive_runs
 
 ID = "slamgym/LandmarkWorld-v0"
 GOAL = 3.0
@@ -72,8 +72,8 @@ def belief_rounds(count: int, steps: int, rounds: int = ROUNDS) -> list[Round]:
     plain, bare = (gymnasium.make_vec(ID, count, steps=EPISODE) for _ in range(2))
     wrapped = BeliefObservationVector(bare, estimator="ekf")
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (count, 2))
-    watch = Stopwatch(step_runs)
-    with mock.patch.object(batch, "step_runs", watch):
+    watch = Stopwatch(drive_runs)
+    with mock.patch.object(batch, "drive_runs", watch):
         for worlds in (plain, wrapped):
             worlds.reset(seed=0)
             _time(worlds, actions, steps)  # warm, and every landmark mapped

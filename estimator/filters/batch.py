@@ -23,7 +23,6 @@ from ..kernels.batch import (
     begin_runs,
     drive_runs,
     share_out,
-    step_runs,
 )
 from ..kernels.kalman_gain import Workspace
 from ..models.bearing_range import wrap_angle
@@ -240,6 +239,7 @@ class BatchSlam(BatchOfBeliefs):
         first = first_poses("initial_poses", initial_poses, self.runs)
         super().__init__(first, std, self.landmarks, FRAMES[self.rules.frame])
         self._kept_room: Workspace | None = None
+        self._last_step = BatchTrace.empty(self.runs, 1)  # of `step`, never read
 
     def run(
         self,
@@ -271,16 +271,17 @@ class BatchSlam(BatchOfBeliefs):
         -------
         BatchTrace
         """
-        data, durations = step_data(
-            odometry, measurements, visible, dt, (self.runs, self.landmarks)
-        )
-        data = data._replace(odometry=self.motion.displacements(data.odometry))
-        trace = BatchTrace.empty(*data.odometry.shape[:2])
-        chosen = chosen_runs(runs, self.runs)
-        failed_at = np.where(chosen, self.failed_at, 0)  # the kernel passes these over
-        drive = partial(self._drive, data, durations, trace, failed_at)
-        share_out(drive, self.runs, self._threads)
-        self.failed_at = np.where(chosen, failed_at, self.failed_at)
+        u = argument_checks.as_floats("odometry", odometry)
+        steps = u.shape[1] if u.ndim == 3 else 0
+        durations = _durations(dt)
+        if durations.shape not in ((), (1,), (steps,)):
+            raise ValueError(
+                f"dt must be one number or {steps}, got shape {durations.shape}"
+            )
+        durations = np.broadcast_to(durations, (self.runs, steps))
+        data = self._checked((self.runs, steps), u, measurements, visible, durations)
+        trace = BatchTrace.empty(self.runs, steps)
+        self._drive(data, trace, runs)
         trace.poses[..., 2] = wrap_angle(trace.poses[..., 2])
         return trace
 
@@ -302,11 +303,10 @@ class BatchSlam(BatchOfBeliefs):
         dt : array_like, shape (B,)
             Duration of the step of each run.
         """
-        shape = self.runs, self.landmarks
-        moved, *rest = step_scans(odometry, measurements, visible, dt, shape)
-        scans = self.motion.displacements(moved), *rest
-        drive = partial(self._step, scans, chosen_runs(runs, self.runs))
-        share_out(drive, self.runs, self._threads)
+        durations = _durations(dt)
+        data = self._checked((self.runs,), odometry, measurements, visible, durations)
+        one_step = StepData(*[part[:, None] for part in data])
+        self._drive(one_step, self._last_step, runs)
 
     def observe_pose(
         self,
@@ -362,29 +362,33 @@ class BatchSlam(BatchOfBeliefs):
         stopped = int((self.failed_at != NEVER).sum())
         return f"BatchSlam of {self.runs} runs, {landmarks} mapped, {stopped} stopped"
 
-    def _drive(
+    def _checked(
         self,
-        data: StepData,
-        dt: Array,
-        trace: BatchTrace,
-        failed_at: IntArray,
-        part: slice,
+        shape: tuple[int, ...],
+        odometry: ArrayLike,
+        measurements: ArrayLike,
+        visible: ArrayLike,
+        durations: Array,
+    ) -> StepData:
+        """Return the data of steps, of ``shape`` (B,) or (B, T), or refuse them."""
+        u = shaped("odometry", odometry, (*shape, 2))
+        z = shaped("measurements", measurements, (*shape, self.landmarks, 2))
+        seen = _shaped_flags("visible", visible, (*shape, self.landmarks))
+        dt = shaped("dt", durations, shape)
+        z, seen, dt = map(_writeable, (z, seen, dt))
+        return StepData(self.motion.displacements(u), z, seen, dt)
+
+    def _drive(self, data: StepData, trace: BatchTrace, runs: ArrayLike | None) -> None:
+        drive = partial(self._drive_part, data, trace, chosen_runs(runs, self.runs))
+        share_out(drive, self.runs, self._threads)
+
+    def _drive_part(
+        self, data: StepData, trace: BatchTrace, chosen: BoolArray, part: slice
     ) -> None:
         for_sensor(drive_runs, self.sensor)(
             _of(part, self._arrays()),
             _of(part, data),
-            dt,
             _of(part, trace),
-            failed_at[part],
-            self.motion_values,
-            self.rule_values,
-            _of(slice(None), self._room()),
-        )
-
-    def _step(self, scans: tuple[Any, ...], chosen: BoolArray, part: slice) -> None:
-        for_sensor(step_runs, self.sensor)(
-            _of(part, self._arrays()),
-            _of(part, scans),
             chosen[part],
             self.failed_at[part],
             self.motion_values,
@@ -411,61 +415,23 @@ def can_batch(estimator: object) -> bool:
 
 def _of(part: slice, arrays: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return views on some of the runs; a plain tuple, as kernels take it."""
-    return tuple(array[part] for array in arrays)
+    if part == slice(0, len(arrays[0])):  # all of them, without the time of a view
+        return tuple(arrays)
+    return tuple([array[part] for array in arrays])
 
 
 # --------------------------------------------------------------------------------------
 # The arguments of a batch of runs, checked, and its results.
 
 
-def step_data(
-    odometry: ArrayLike,
-    measurements: ArrayLike,
-    visible: ArrayLike,
-    dt: ArrayLike,
-    shape: tuple[int, int],
-) -> tuple[StepData, Array]:
-    """Return the data of T steps and their durations (T,), or refuse them.
-
-    ``shape`` is (B, L), the numbers of runs and landmarks.
-    """
-    (count, landmarks), u = shape, argument_checks.as_floats("odometry", odometry)
-    steps = u.shape[1] if u.ndim == 3 else 0
-    u = shaped("odometry", u, (count, steps, 2))
-    z = shaped("measurements", measurements, (count, steps, landmarks, 2))
-    seen = _shaped_flags("visible", visible, (count, steps, landmarks))
+def _durations(dt: ArrayLike) -> Array:
+    """Return durations, or refuse such as are not finite or below 0."""
     durations = argument_checks.as_floats("dt", dt)
-    if durations.shape not in ((), (1,), (steps,)):
-        raise ValueError(
-            f"dt must be one number or {steps}, got shape {durations.shape}"
-        )
-    durations = np.broadcast_to(durations, (steps,))
-    if not (np.isfinite(durations) & (durations >= 0)).all():
-        raise ValueError(f"dt must be finite numbers >= 0, got {dt!r}")
-    argument_checks.refuse_beyond("dt", durations, dt)
-    return StepData(*map(_writeable, (u, z, seen))), _writeable(durations)
-
-
-def step_scans(
-    odometry: ArrayLike,
-    measurements: ArrayLike,
-    visible: ArrayLike,
-    dt: ArrayLike,
-    shape: tuple[int, int],
-) -> tuple[Array, Array, BoolArray, Array]:
-    """Return the data of one step and its durations, or refuse them.
-
-    ``shape`` is (B, L), the numbers of runs and landmarks.
-    """
-    u = shaped("odometry", odometry, (shape[0], 2))
-    z = shaped("measurements", measurements, (*shape, 2))
-    seen = _shaped_flags("visible", visible, shape)
-    durations = shaped("dt", dt, shape[:1])
-    if not (durations.min() >= 0.0 and durations.max() <= LARGEST):
+    if not all(0.0 <= each <= LARGEST for each in durations.ravel().tolist()):
         raise ValueError(
             f"dt must be finite numbers >= 0 and at most {LARGEST:g}, got {dt!r}"
         )
-    return _writeable(u), _writeable(z), _writeable(seen), _writeable(durations)
+    return durations
 
 
 def _shaped_flags(name: str, value: ArrayLike, shape: tuple[int, ...]) -> BoolArray:

@@ -33,14 +33,15 @@ class StepData(NamedTuple):
     odometry: Array  # (B, T, 3), displacements (dx, dy, α) in the robot's frame
     measurements: Array  # (B, T, L, 2)
     visible: Bool  # (B, T, L)
+    dt: Array  # (B, T), duration of each step
 
 
 @jit
 def drive_runs(
     run_arrays: tuple[Array, Array, Array, IntArray, IntArray],
-    step_data: tuple[Array, Array, Bool],
-    dt: Array,
+    step_data: tuple[Array, Array, Bool, Array],
     trace: tuple[Array, Array, Array, IntArray],
+    chosen: Bool,
     failed_at: IntArray,
     motion_values: Array,
     rule_values: Array,
@@ -54,14 +55,14 @@ def drive_runs(
 
     Parameters
     ----------
-    dt : ndarray, shape (T,)
-        Duration of each step.
     trace
         On return: poses (B, T, 3), their covariances (B, T, 3, 3), NIS (B, T) and its
         degrees of freedom (B, T).
+    chosen : ndarray of bool, shape (B,)
+        The runs that take part.
     failed_at : ndarray, shape (B,)
-        On entry NEVER for the runs that take part.  On return the step at which a run
-        failed, NEVER if it did not.
+        On return the step at which a chosen run failed, 0 if that was in an earlier
+        call; NEVER if it did not.
     motion_values : ndarray, shape (4,)
         The variances (σx², σy², σα²), and 1 if a robot at rest has motion noise too.
     rule_values
@@ -70,16 +71,18 @@ def drive_runs(
     runs, data = RunArrays(*run_arrays), StepData(*step_data)
     poses, pose_covariances, nis, degrees_of_freedom = trace
     room = new_room(runs.slots.shape[1], workspace_arrays)
-    for b in range(len(failed_at)):
+    for b in range(len(chosen)):
+        if not chosen[b]:
+            continue
         if failed_at[b] != NEVER:
             failed_at[b] = 0
             continue
         mean, covariance = runs.means[b], runs.covariances[b]
-        for t in range(len(dt)):
+        for t in range(data.dt.shape[1]):
             odometry, visible = data.odometry[b, t], data.visible[b, t]
             scan = odometry, data.measurements[b, t], visible
             used, nis[b, t] = step_run(
-                b, runs, scan, dt[t], motion_values, rule_values, room
+                b, runs, scan, data.dt[b, t], motion_values, rule_values, room
             )
             if used < 0:
                 failed_at[b] = t
@@ -89,44 +92,6 @@ def drive_runs(
                 poses[b, t, i] = mean[i]
                 for j in range(3):
                     pose_covariances[b, t, i, j] = covariance[i, j]
-
-
-@jit
-def step_runs(
-    run_arrays: tuple[Any, ...],
-    scans: tuple[Any, ...],
-    chosen: Bool,
-    failed_at: IntArray,
-    motion_values: Array,
-    rule_values: Array,
-    workspace_arrays: tuple[Any, ...],
-) -> None:
-    """Take each chosen run, (B,), through one step, in place.
-
-    Parameters
-    ----------
-    scans
-        Displacements (B, 3), measurements (B, L, 2), which are visible (B, L), and the
-        duration of the step of each run (B,).
-    failed_at : ndarray, shape (B,)
-        On return 0 for a chosen run that failed, now or before.
-
-    See Also
-    --------
-    drive_runs : The other parameters.
-    """
-    runs = RunArrays(*run_arrays)
-    odometry, measurements, visible, dt = scans
-    room = new_room(runs.slots.shape[1], workspace_arrays)
-    for b in range(len(chosen)):
-        if not chosen[b]:
-            continue
-        used = -1
-        if failed_at[b] == NEVER:
-            scan = odometry[b], measurements[b], visible[b]
-            used, _ = step_run(b, runs, scan, dt[b], motion_values, rule_values, room)
-        if used < 0:
-            failed_at[b] = 0
 
 
 @jit_in_place
