@@ -371,9 +371,7 @@ class VectorRandomWalk:
             [(one.robot.max_speed, one.robot.max_turn_rate) for one in controllers]
         )
         self._correlation = np.array([[one.correlation] for one in controllers])
-        self._noise_std = np.array(
-            [[math.sqrt(1 - one.correlation**2)] for one in controllers]
-        )
+        self._noise_std = np.sqrt(1 - self._correlation**2)
         self._homes = np.array([one.home for one in controllers])
         self._reach = np.array([one.reach for one in controllers])
         self._state = np.zeros((len(controllers), 2))

@@ -317,7 +317,9 @@ class Belief:
         return chosen
 
 
-def columns_of(slots: Mapping[int, int], landmark_ids: Sequence[int]) -> list[int]:
+def columns_of(
+    slots: Mapping[int, int] | Sequence[int], landmark_ids: Sequence[int]
+) -> list[int]:
     """Return where the pose and some landmarks stand in a state."""
     firsts = [3 + 2 * slots[i] for i in landmark_ids]
     return [0, 1, 2, *(first + axis for first in firsts for axis in (0, 1))]
@@ -506,7 +508,7 @@ def marginal(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
         belief: Belief = slam.belief(landmark_ids=ids)  # type: ignore[call-arg]
         return belief
     whole = slam.belief()
-    return _part(whole, whole.landmark_ids, ids, whole.frame)
+    return part_of(whole, ids, whole.frame)
 
 
 def marginal_without_joining(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
@@ -521,7 +523,7 @@ def marginal_without_joining(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
     view = slam.local_view(0.0)
     if not set(ids) <= set(view.ids):
         return marginal(slam, ids)
-    return _part(view, view.ids, ids, "invariant")
+    return part_of(view, ids, "invariant")
 
 
 def hides_its_belief(slam: object) -> bool:
@@ -547,12 +549,11 @@ def _takes_landmark_ids(belief: Callable[..., Belief]) -> bool:
     return "landmark_ids" in inspect.signature(belief).parameters
 
 
-def _part(
-    whole: Belief | MapView,
-    order: Sequence[int],
-    ids: Sequence[int],
-    frame: rigid_motion.ErrorFrame,
+def part_of(
+    whole: Belief | MapView, ids: Sequence[int], frame: rigid_motion.ErrorFrame
 ) -> Belief:
+    """Return the marginal of the pose and some landmarks of a belief."""
+    order = whole.landmark_ids if isinstance(whole, Belief) else whole.ids
     slots = {i: slot for slot, i in enumerate(order)}
     return Belief.marginal(whole.mean, whole.covariance, slots, ids, frame)
 

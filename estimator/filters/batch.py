@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST, AnyArray, Array, BoolArray, IntArray
 from ...restorable import Restorable, State
-from ..interface import Belief
+from ..interface import Belief, columns_of
 from ..kernels.batch import (
     NEVER,
     RunArrays,
@@ -471,7 +471,7 @@ class LoadedBeliefs(NamedTuple):
     def write(self, run: int, arrays: RunArrays) -> None:
         """Replace the belief of a run; its landmarks are stored in order of id."""
         ids = np.flatnonzero(self.mapped[run])
-        at = [0, 1, 2, *(3 + 2 * i + axis for i in ids.tolist() for axis in (0, 1))]
+        at = columns_of(range(self.mapped.shape[1]), ids.tolist())
         size = len(at)
         for array in arrays[:3]:
             array[run] = 0.0
@@ -588,7 +588,7 @@ class BatchBeliefs(NamedTuple):
                 raise ValueError(
                     f"landmark ids must be below landmarks = {landmarks}, got {ids}"
                 )
-            at = [0, 1, 2, *(3 + 2 * i + axis for i in ids for axis in (0, 1))]
+            at = columns_of(range(landmarks), ids)
             means[run, at], mapped[run, list(ids)] = belief.mean, True
             covariances[run][np.ix_(at, at)] = belief.covariance
         return cls(means, covariances, mapped)

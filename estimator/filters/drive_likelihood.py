@@ -289,15 +289,11 @@ def follow_drive(
         size = len(start[0])  # a literal would compile all kernels anew
         for s in range(len(drive.first_motions) - 1):
             for k in range(drive.first_motions[s], drive.first_motions[s + 1]):
-                dx, dy, turn = (
-                    drive.motions[k, 0],
-                    drive.motions[k, 1],
-                    drive.motions[k, 2],
-                )
+                dx, dy, turn, dt = drive.motions[k]
                 moves = noise_at_rest or dx != 0 or dy != 0 or turn != 0
                 for i in range(3):
                     sigma = noises[b, MOTION + i]
-                    variance[i] = sigma * sigma * drive.motions[k, 3] * moves
+                    variance[i] = sigma * sigma * dt * moves
                 predict(
                     belief.mean,
                     belief.covariance,
@@ -372,16 +368,11 @@ def keep(belief: BeliefArrays, record: DriveRecord, b: int, s: int) -> None:
 def begin(belief: BeliefArrays, slots: IntArray, start: tuple[Array, Array]) -> None:
     """Empty the map, and put the robot at its start."""
     mean, covariance, reference = belief
-    for i in range(len(mean)):
-        mean[i] = reference[i] = 0.0
-        for j in range(len(mean)):
-            covariance[i, j] = 0.0
+    mean[:], covariance[:], reference[:], slots[:] = 0.0, 0.0, 0.0, -1
     for i in range(3):
         mean[i] = reference[i] = start[0][i]
         for j in range(3):
             covariance[i, j] = start[1][i, j]
-    for i in range(len(slots)):
-        slots[i] = -1
 
 
 @njit_internal

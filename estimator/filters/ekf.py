@@ -18,18 +18,8 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ..interface import Belief, MapView, UpdateReport, describe_filter
-from ..kernels.kalman_gain import (
-    ADDITIVE,
-    AT_ESTIMATE,
-    AT_REFERENCE,
-    INVARIANT,
-    OUTCOME,
-    PROJECTED,
-    USED,
-    WAITING,
-    BeliefArrays,
-    Rules,
-)
+from ..kernels import kalman_gain as gain
+from ..kernels.kalman_gain import BeliefArrays, Rules
 from ..kernels.scan_update import DONE, NOT_USABLE
 from ..models.motions import UNICYCLE, Motion, MotionNoise
 from ..models.sensors import (
@@ -118,7 +108,7 @@ class MapFilter(ObservesPoses):
         """
         kept, gone = landmark_pairs(pairs, self.slots)
         (mean, P, reference), slots = self.map.used, self.map.slots
-        at_estimate = self.rules.linearisation == AT_ESTIMATE
+        at_estimate = self.rules.linearisation == gain.AT_ESTIMATE
         merged = coincide(
             mean,
             P,
@@ -298,8 +288,8 @@ class EkfSlam(MapFilter):
     array([[3., 0.]])
     """
 
-    _linearisation: ClassVar[int] = AT_ESTIMATE
-    _frame: ClassVar[int] = ADDITIVE
+    _linearisation: ClassVar[int] = gain.AT_ESTIMATE
+    _frame: ClassVar[int] = gain.ADDITIVE
 
     #: The kernels of both steps.
     _update_map: ClassVar[UpdateKernel] = staticmethod(update_map)
@@ -409,7 +399,7 @@ class EkfSlam(MapFilter):
             if status != DONE:
                 self._refuse(status, readings, ids)
             report = self.map.report()
-            left = self.map.parts.ledger[OUTCOME, : len(ids)] == WAITING
+            left = self.map.parts.ledger[gain.OUTCOME, : len(ids)] == gain.WAITING
             new = Waiting(np.column_stack([ids, ids])[left], readings[left])
             self.waiting, placed = collect(
                 self.map, self.sensor, self.rules, waiting, new
@@ -443,7 +433,7 @@ class EkfSlam(MapFilter):
             argument_checks.refuse_repeated(given)
         if status == NOT_USABLE:
             argument_checks.refuse_unusable(readings, given)
-        used = self.map.parts.ledger[OUTCOME, : len(ids)] == USED
+        used = self.map.parts.ledger[gain.OUTCOME, : len(ids)] == gain.USED
         raise argument_checks.not_positive_definite(given[np.flatnonzero(used)[status]])
 
 
@@ -492,7 +482,7 @@ class InvariantEkfSlam(EkfSlam):
     0.3
     """
 
-    _frame: ClassVar[int] = INVARIANT
+    _frame: ClassVar[int] = gain.INVARIANT
 
     def __init__(
         self,
@@ -528,7 +518,7 @@ class FirstEstimatesEkfSlam(EkfSlam):
        designing consistent EKF SLAM estimators, IJRR 29(5), 2010.
     """
 
-    _linearisation: ClassVar[int] = AT_REFERENCE
+    _linearisation: ClassVar[int] = gain.AT_REFERENCE
 
 
 class ObservabilityConstrainedEkfSlam(EkfSlam):
@@ -551,7 +541,7 @@ class ObservabilityConstrainedEkfSlam(EkfSlam):
        improvement of vision-aided inertial navigation, IEEE T-RO 30(1), 2014.
     """
 
-    _linearisation: ClassVar[int] = PROJECTED
+    _linearisation: ClassVar[int] = gain.PROJECTED
 
 
 class IteratedEkfSlam(EkfSlam):
@@ -602,10 +592,10 @@ def checked_rules(
     measurement_std: ArrayLike,
     *,
     sensor: Sensor,
-    linearisation: int,
-    frame: int,
-    landmark_init: str,
-    gate_probability: float | None,
+    linearisation: int = gain.AT_ESTIMATE,
+    frame: int = gain.ADDITIVE,
+    landmark_init: str = "full",
+    gate_probability: float | None = None,
     min_range: float,
 ) -> Rules:
     """Return the rules of an update, from the arguments of :class:`.ekf.EkfSlam`."""

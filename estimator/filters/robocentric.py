@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ...jit import jit_in_place, njit_internal
-from ..interface import Belief, MapView
+from ..interface import Belief, MapView, part_of
 from ..kernels.scan_update import DONE
 from ..models.rigid_motion import as_covariance
 from ..models.sensors import only_placing
@@ -116,9 +116,8 @@ class RobocentricEkfSlam(EkfSlam):
         whole = Belief(mean, moved, ids)
         if landmark_ids is None:
             return whole
-        slots = {i: slot for slot, i in enumerate(ids)}
-        chosen = argument_checks.mapped_identities(landmark_ids, slots)
-        return Belief.marginal(whole.mean, whole.covariance, slots, chosen)
+        chosen = argument_checks.mapped_identities(landmark_ids, dict.fromkeys(ids, 0))
+        return part_of(whole, chosen, whole.frame)
 
     def map_view(self) -> MapView:
         """Return pose and map in the world's frame; a copy."""

@@ -14,8 +14,6 @@ from .scan_update import DONE, as_rules, update_belief, usable
 
 NEVER = -1
 
-Bool = BoolArray
-
 
 class RunArrays(NamedTuple):
     """The beliefs of B runs, each array with a leading run axis."""
@@ -32,16 +30,16 @@ class StepData(NamedTuple):
 
     odometry: Array  # (B, T, 3), displacements (dx, dy, α) in the robot's frame
     measurements: Array  # (B, T, L, 2)
-    visible: Bool  # (B, T, L)
+    visible: BoolArray  # (B, T, L)
     dt: Array  # (B, T), duration of each step
 
 
 @jit
 def drive_runs(
     run_arrays: tuple[Array, Array, Array, IntArray, IntArray],
-    step_data: tuple[Array, Array, Bool, Array],
+    step_data: tuple[Array, Array, BoolArray, Array],
     trace: tuple[Array, Array, Array, IntArray],
-    chosen: Bool,
+    chosen: BoolArray,
     failed_at: IntArray,
     motion_values: Array,
     rule_values: Array,
@@ -96,7 +94,7 @@ def drive_runs(
 
 @jit_in_place
 def begin_runs(
-    run_arrays: tuple[Any, ...], chosen: Bool, poses: Array, variances: Array
+    run_arrays: tuple[Any, ...], chosen: BoolArray, poses: Array, variances: Array
 ) -> None:
     """Restart the chosen runs, (B,), at poses (B, 3) with variances (3,)."""
     runs = RunArrays(*run_arrays)
@@ -135,7 +133,7 @@ def new_room(landmarks: int, workspace_arrays: tuple[Any, ...]) -> StepRoom:
 def step_run(
     b: int,
     runs: RunArrays,
-    scan: tuple[Array, Array, Bool],
+    scan: tuple[Array, Array, BoolArray],
     dt: float,
     motion_values: Array,
     rule_values: Array,
@@ -166,14 +164,17 @@ def step_run(
     )
     if status != DONE:
         return -1, np.nan
-    runs.mapped[b] += note_new(m, ids, ledger, slots, runs.mapped[b])
+    for k in range(m):
+        if ledger[OUTCOME, k] == ADDED:
+            slots[ids[k]] = runs.mapped[b]
+            runs.mapped[b] += 1
     return used, nis
 
 
 @njit_internal
 def gather(
     measurements: Array,
-    visible: Bool,
+    visible: BoolArray,
     slots: IntArray,
     readings: Array,
     ids: IntArray,
@@ -193,19 +194,6 @@ def gather(
             ledger[SLOT, m] = slots[i]
             m += 1
     return m
-
-
-@njit_internal
-def note_new(
-    m: int, ids: IntArray, ledger: IntArray, slots: IntArray, mapped: int
-) -> int:
-    """Give the added landmarks their places in the map; return their number."""
-    added = 0
-    for k in range(m):
-        if ledger[OUTCOME, k] == ADDED:
-            slots[ids[k]] = mapped + added
-            added += 1
-    return added
 
 
 # Small shares: a thread whose core is busy then delays the others little.

@@ -108,7 +108,11 @@ def imagine_plans(
     for b in range(len(means)):
         size = 3 + 2 * np.sum(slots[b] >= 0)
         for k in range(plans.shape[1]):
-            copy_belief(means[b], covariances[b], references[b], size, room)
+            room.mean[:size], room.reference[:size] = (
+                means[b, :size],
+                references[b, :size],
+            )
+            room.covariance[:size, :size] = covariances[b, :size, :size]
             missed[:], found, judged = 1.0, 0.0, 0
             for t in range(plans.shape[2]):
                 d, turn = plans[b, k, t, 0], plans[b, k, t, 1]
@@ -127,17 +131,6 @@ def imagine_plans(
                 if judged < len(horizons) and t + 1 == horizons[judged]:
                     judge((b, k, judged), room, size, slots[b], outcome)
                     judged += 1
-
-
-@njit_internal
-def copy_belief(
-    mean: Array, covariance: Array, reference: Array, size: int, room: Room
-) -> None:
-    """Start a plan from a belief."""
-    for i in range(size):
-        room.mean[i], room.reference[i] = mean[i], reference[i]
-        for j in range(size):
-            room.covariance[i, j] = covariance[i, j]
 
 
 @njit_internal

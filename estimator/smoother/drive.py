@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, IntArray
 from ..filters.conditioning import PoseReading
 from ..filters.ekf import checked_rules
-from ..kernels.kalman_gain import ADDITIVE, AT_ESTIMATE
+from ..kernels.kalman_gain import AT_ESTIMATE
 from ..models.bearing_range import wrap_angle
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.motions import Motion as DriveMotion
@@ -109,13 +109,7 @@ class Drive:
         self.motion_noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
         self.sensor = find_sensor(sensor)
         self.rules = rules = checked_rules(
-            measurement_std,
-            sensor=self.sensor,
-            linearisation=AT_ESTIMATE,
-            frame=ADDITIVE,
-            landmark_init="full",
-            gate_probability=None,
-            min_range=min_range,
+            measurement_std, sensor=self.sensor, min_range=min_range
         )
         std = rules.first_std, rules.second_std
         if not (self.sensor.stds(std, 1.0) > 0).all():
@@ -309,11 +303,7 @@ class Drive:
 
     def _composed(self, steps: Sequence[tuple[float, float, float]]) -> Motion:
         """Compose readings of odometry as a filter predicts from a certain pose 0."""
-        pose, covariance = np.zeros(3), np.zeros((3, 3))
-        for *odometry, dt in steps:
-            moved = self.motion_noise.motion.moved(odometry)
-            variance = self.motion_noise.over(moved, dt)
-            predict(pose, covariance, pose, 3, *moved, variance, AT_ESTIMATE)
+        *_, (pose, covariance) = _along(steps, self.motion_noise)
         return Motion(tuple(steps), pose, covariance)
 
     def __repr__(self) -> str:
@@ -472,13 +462,21 @@ def _between(first: Array, last: Array, motion: Motion, noise: MotionNoise) -> A
     gap[2] = wrap_angle(gap[2])
     pull = np.linalg.pinv(motion.covariance, hermitian=True) @ gap
     path = np.empty((len(motion.steps), 3))
-    pose, covariance = np.zeros(3), np.zeros((3, 3))
-    for i, (*odometry, dt) in enumerate(motion.steps):
-        moved = noise.motion.moved(odometry)
-        predict(pose, covariance, pose, 3, *moved, noise.over(moved, dt), AT_ESTIMATE)
+    for i, (pose, covariance) in enumerate(_along(motion.steps, noise)):
         onward = np.eye(3)
         onward[0, 2] = -(motion.increment[1] - pose[1])
         onward[1, 2] = motion.increment[0] - pose[0]
         path[i] = first + turn @ (pose + covariance @ onward.T @ pull)
     path[-1] = last
     return path
+
+
+def _along(
+    steps: Sequence[tuple[float, float, float]], noise: MotionNoise
+) -> Iterator[tuple[Array, Array]]:
+    """Yield pose and covariance after each step, in the frame before the first."""
+    pose, covariance = np.zeros(3), np.zeros((3, 3))
+    for *odometry, dt in steps:
+        moved = noise.motion.moved(odometry)
+        predict(pose, covariance, pose, 3, *moved, noise.over(moved, dt), AT_ESTIMATE)
+        yield pose, covariance

@@ -15,7 +15,7 @@ from scipy.linalg import cho_factor, cho_solve
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
 from ..filters.ekf import InvariantEkfSlam
-from ..interface import Belief
+from ..interface import Belief, part_of
 from ..kernels.kalman_gain import Rules
 from ..kernels.scan_update import as_rules, variances
 from ..models.bearing_range import (
@@ -456,23 +456,16 @@ def start_of(
 def _take_map(slam: InvariantEkfSlam, drive: Drive, known: Belief) -> None:
     """Give a filter at its start the landmarks of a belief that a drive reads."""
     read = set(drive.landmark_ids)
-    columns = [
-        3 + 2 * slot + axis
-        for slot, i in enumerate(known.landmark_ids)
-        if i in read
-        for axis in (0, 1)
-    ]
-    mean = np.concatenate([drive.initial_pose, known.mean[columns]])
-    covariance = np.zeros((len(mean), len(mean)))
+    part = part_of(known, [i for i in known.landmark_ids if i in read], known.frame)
+    mean, covariance = part.mean.copy(), part.covariance.copy()
+    mean[:3], covariance[:3], covariance[:, :3] = drive.initial_pose, 0.0, 0.0
     covariance[:3, :3] = np.diag(drive.initial_pose_std**2)
-    covariance[3:, 3:] = known.covariance[np.ix_(columns, columns)]
-    ids = [i for i in known.landmark_ids if i in read]
     slam.load_state_dict(
         slam.state_dict()
         | {
             "mean": mean,
             "covariance": covariance,
-            "landmark_ids": np.array(ids, dtype=np.int64),
+            "landmark_ids": np.array(part.landmark_ids, dtype=np.int64),
             "reference": mean,
         }
     )

@@ -276,9 +276,7 @@ def above(name: str, value: float, least: float) -> float:
     """Return a number above ``least``, up to the largest, or refuse it."""
     if not (_is_finite(value) and value > least):
         raise ValueError(f"{name} must be a finite number > {least:g}, got {value!r}")
-    if value > LARGEST:
-        raise ValueError(f"{name} must not exceed {LARGEST:g}, got {value!r}")
-    return float(value)
+    return at_least(name, value, least)
 
 
 def positive(name: str, value: float) -> float:
