@@ -15,7 +15,7 @@ from ..arrays import Array, BoolArray, IntArray
 from ..estimator.kernels.imagine import View, is_hidden, is_in_view
 from ..estimator.kernels.kalman_gain import half_log_det, largest_variance
 from ..jit import fma, jit, jit_in_place, njit_allocating, njit_internal, njit_reordered
-from .belief_features import FeatureArrays, Rectangle, write_belief_features
+from .belief_features import Bounds, FeatureArrays, write_belief_features
 
 CELLS = 8.0  # that weigh as much as one landmark
 D, A, _ = range(3)  # criteria of the map, in the order of `CRITERIA`
@@ -278,7 +278,7 @@ class Floor(NamedTuple):
 
     cells: Array  # x and y of the centres of the cells, shape (2, C) [m]
     walls: Array  # rows (x0, y0, x1, y1), shape (W, 4) [m]
-    bounds: Rectangle
+    bounds: Bounds
     diagonal: float  # of the bounds [m]
     sight: View
 

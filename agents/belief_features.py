@@ -214,8 +214,6 @@ def live_storage(estimator: EkfSlam, size: int) -> BatchStorage:
 # --------------------------------------------------------------------------------------
 # The kernels: one pass over all worlds.
 
-Rectangle = tuple[float, float, float, float]
-
 # Of B worlds, in the alphabetical order of their keys, see `belief_features`.
 FeatureArrays = tuple[Array, Array, Array, Array, BoolArray, Array, Array, Array]
 
@@ -282,7 +280,7 @@ correlation_jit, turned_jit = njit_internal(correlation), njit_internal(turned)
 
 @njit_internal
 def write_pose_features(
-    mean: Array, P: Array, bounds: Rectangle, pose: Array, correlated: Array, std: Array
+    mean: Array, P: Array, bounds: Bounds, pose: Array, correlated: Array, std: Array
 ) -> None:
     """Write the features of one pose."""
     left, bottom, right, top = bounds
@@ -322,7 +320,7 @@ def relative_spread(
 
 @njit_internal
 def write_belief_features(
-    b: int, mean: Array, P: Array, slots: IntArray, box: Rectangle, into: FeatureArrays
+    b: int, mean: Array, P: Array, slots: IntArray, box: Bounds, into: FeatureArrays
 ) -> None:
     """Write the features of one belief into row b, see `belief_features`."""
     corr, map_std, std, landmarks, mask, poses, pose_corr, pose_std = into
@@ -354,7 +352,7 @@ def write_features(
     means: Array,
     covariances: Array,
     slots: IntArray,
-    bounds: Rectangle,
+    bounds: Bounds,
     features: FeatureArrays,
 ) -> None:
     """Write the features of all beliefs, see `belief_features`."""

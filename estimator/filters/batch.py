@@ -24,47 +24,99 @@ from ..kernels.batch import (
     drive_runs,
     share_out,
 )
-from ..kernels.kalman_gain import Workspace
+from ..kernels.kalman_gain import Workspace, workspace_for
 from ..models.bearing_range import wrap_angle
-from ..models.rigid_motion import ErrorFrame
 from ..models.sensors import for_sensor, only_placing
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import aligned_zeros, shaped, usable_cores
 from .conditioning import FRAMES, ObservedMap, PoseReading, gate_of
 from .ekf import EkfSlam
-from .gaussian_map import GaussianMap, workspace_for
+from .gaussian_map import GaussianMap
 
 
-class BatchOfBeliefs(Restorable):
-    """The beliefs of B runs about their poses and up to L landmarks.
+class BatchSlam(Restorable):
+    """B runs of one filter, each with its own data, visibility and map.
+
+    Run i has the same bits as a single filter with the data of run i, up to rounding
+    of readings of the pose.  Landmark ids
+    are the rows 0 … L−1 of the measurement arrays.  The runs are distributed over
+    threads.  A run fails if its data is not finite or exceeds 1e12, or if its
+    innovation covariance is not positive definite.  It is nan from this step on, and
+    the other runs continue.
 
     Parameters
     ----------
-    poses : ndarray, shape (B, 3)
+    estimator : EkfSlam
+        Filter to copy rules and noise from; an ``ekf``, ``invariant``, ``iterated``,
+        ``first_estimates`` or ``observability_constrained``.
+    runs, landmarks : int
+        B, and L, the most landmarks a run can meet.
+    initial_poses : array_like, shape (3,) or (B, 3)
         Means of the first poses [m, m, rad].
-    std : ndarray, shape (3,)
+    initial_pose_std : array_like, shape (3,)
         Their standard deviation.
-    landmarks : int
-        L.
-    frame : ErrorFrame
-        Of the filters.
+    threads : int, optional
+        By default, the number of cores.
+
+    Raises
+    ------
+    ValueError
+        If the filter cannot run in batches, or an argument has the wrong shape.
+
+    Examples
+    --------
+    >>> from slamgym.estimator import make_batch
+    >>> batch = make_batch(
+    ...     "ekf", runs=2, landmarks=1, motion_std=(0, 0, 0), measurement_std=(0.1, 0.1)
+    ... )
+    >>> trace = batch.run(
+    ...     odometry=np.array([[(1.0, 0.0)], [(2.0, 0.0)]]),
+    ...     measurements=np.full((2, 1, 1, 2), 1.0),
+    ...     visible=np.ones((2, 1, 1), dtype=bool),
+    ... )
+    >>> trace.poses[:, -1, 0]
+    array([1., 2.])
     """
 
     def __init__(
-        self, poses: Array, std: Array, landmarks: int, frame: ErrorFrame
+        self,
+        estimator: EkfSlam,
+        runs: int,
+        landmarks: int,
+        *,
+        initial_poses: ArrayLike = (0.0, 0.0, 0.0),
+        initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
+        threads: int | None = None,
     ) -> None:
-        self.runs, self.landmarks, self._frame = len(poses), landmarks, frame
-        capacity = GaussianMap.capacity_for(landmarks)
+        if not can_batch(estimator):
+            raise ValueError(f"{type(estimator).__name__} cannot run in batches")
+        self.runs = argument_checks.whole("runs", runs, 1)
+        self.landmarks = argument_checks.whole("landmarks", landmarks, 0)
+        only_placing(estimator.sensor, "a batch")
+        self.sensor = estimator.sensor
+        #: What distinguishes this filter's updates from another's.
+        self.rules = estimator.rules
+        self.rule_values = estimator.rule_values.copy()
+        self.motion_values = estimator.motion_values
+        self.motion = estimator.motion
+        self._threads = argument_checks.whole("threads", threads or usable_cores(), 1)
+        std = argument_checks.standard_deviations(
+            "initial_pose_std", initial_pose_std, 3
+        )
+        first = first_poses("initial_poses", initial_poses, self.runs)
+        capacity = GaussianMap.capacity_for(self.landmarks)
         self._means = np.zeros((self.runs, capacity))
         self._references = np.zeros((self.runs, capacity))
         self._covariances = aligned_zeros(self.runs, capacity, capacity)
-        self._slots = np.full((self.runs, landmarks), -1, dtype=np.int64)
+        self._slots = np.full((self.runs, self.landmarks), -1, dtype=np.int64)
         self._mapped = np.zeros(self.runs, dtype=np.int64)
         #: Step of the last :meth:`run` at which a run stopped, -1 if it did not.
         #:
         #: A stopped run remains stopped, at step 0 of every later :meth:`run`.
         self.failed_at = np.full(self.runs, NEVER, dtype=np.int64)
-        begin_runs(tuple(self._arrays()), self.failed_at == NEVER, poses.copy(), std**2)
+        begin_runs(tuple(self._arrays()), self.failed_at == NEVER, first.copy(), std**2)
+        self._kept_room: Workspace | None = None
+        self._last_step = BatchTrace.empty(self.runs, 1)  # of `step`, never read
 
     def reset(
         self,
@@ -153,7 +205,7 @@ class BatchOfBeliefs(Restorable):
             self._means[run, :n],
             self._covariances[run, :n, :n],
             tuple(np.flatnonzero(slots >= 0)[order].tolist()),
-            self._frame,
+            FRAMES[self.rules.frame],
         )
 
     @property
@@ -165,81 +217,6 @@ class BatchOfBeliefs(Restorable):
         return RunArrays(
             self._means, self._covariances, self._references, self._slots, self._mapped
         )
-
-
-class BatchSlam(BatchOfBeliefs):
-    """B runs of one filter, each with its own data, visibility and map.
-
-    Run i has the same bits as a single filter with the data of run i, up to rounding
-    of readings of the pose.  Landmark ids
-    are the rows 0 … L−1 of the measurement arrays.  The runs are distributed over
-    threads.  A run fails if its data is not finite or exceeds 1e12, or if its
-    innovation covariance is not positive definite.  It is nan from this step on, and
-    the other runs continue.
-
-    Parameters
-    ----------
-    estimator : EkfSlam
-        Filter to copy rules and noise from; an ``ekf``, ``invariant``, ``iterated``,
-        ``first_estimates`` or ``observability_constrained``.
-    runs, landmarks : int
-        B, and L, the most landmarks a run can meet.
-    initial_poses : array_like, shape (3,) or (B, 3)
-        Means of the first poses [m, m, rad].
-    initial_pose_std : array_like, shape (3,)
-        Their standard deviation.
-    threads : int, optional
-        By default, the number of cores.
-
-    Raises
-    ------
-    ValueError
-        If the filter cannot run in batches, or an argument has the wrong shape.
-
-    Examples
-    --------
-    >>> from slamgym.estimator import make_batch
-    >>> batch = make_batch(
-    ...     "ekf", runs=2, landmarks=1, motion_std=(0, 0, 0), measurement_std=(0.1, 0.1)
-    ... )
-    >>> trace = batch.run(
-    ...     odometry=np.array([[(1.0, 0.0)], [(2.0, 0.0)]]),
-    ...     measurements=np.full((2, 1, 1, 2), 1.0),
-    ...     visible=np.ones((2, 1, 1), dtype=bool),
-    ... )
-    >>> trace.poses[:, -1, 0]
-    array([1., 2.])
-    """
-
-    def __init__(
-        self,
-        estimator: EkfSlam,
-        runs: int,
-        landmarks: int,
-        *,
-        initial_poses: ArrayLike = (0.0, 0.0, 0.0),
-        initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
-        threads: int | None = None,
-    ) -> None:
-        if not can_batch(estimator):
-            raise ValueError(f"{type(estimator).__name__} cannot run in batches")
-        self.runs = argument_checks.whole("runs", runs, 1)
-        self.landmarks = argument_checks.whole("landmarks", landmarks, 0)
-        only_placing(estimator.sensor, "a batch")
-        self.sensor = estimator.sensor
-        #: What distinguishes this filter's updates from another's.
-        self.rules = estimator.rules
-        self.rule_values = estimator.rule_values.copy()
-        self.motion_values = estimator.motion_values
-        self.motion = estimator.motion
-        self._threads = argument_checks.whole("threads", threads or usable_cores(), 1)
-        std = argument_checks.standard_deviations(
-            "initial_pose_std", initial_pose_std, 3
-        )
-        first = first_poses("initial_poses", initial_poses, self.runs)
-        super().__init__(first, std, self.landmarks, FRAMES[self.rules.frame])
-        self._kept_room: Workspace | None = None
-        self._last_step = BatchTrace.empty(self.runs, 1)  # of `step`, never read
 
     def run(
         self,
@@ -305,7 +282,7 @@ class BatchSlam(BatchOfBeliefs):
         """
         durations = _durations(dt)
         data = self._checked((self.runs,), odometry, measurements, visible, durations)
-        one_step = StepData(*[part[:, None] for part in data])
+        one_step = tuple([part[:, None] for part in data])
         self._drive(one_step, self._last_step, runs)
 
     def observe_pose(
@@ -346,7 +323,7 @@ class BatchSlam(BatchOfBeliefs):
         found = given.of(rows).correct(
             self._means[rows, :n],
             self._covariances[rows, :n, :n],
-            frame=self._frame,
+            frame=FRAMES[self.rules.frame],
             once=self.rules.iterations == 1,
         )
         used = found.nis <= gate_of(self.rules, size)
@@ -378,12 +355,14 @@ class BatchSlam(BatchOfBeliefs):
         z, seen, dt = map(_writeable, (z, seen, dt))
         return StepData(self.motion.displacements(u), z, seen, dt)
 
-    def _drive(self, data: StepData, trace: BatchTrace, runs: ArrayLike | None) -> None:
+    def _drive(
+        self, data: tuple[Any, ...], trace: BatchTrace, runs: ArrayLike | None
+    ) -> None:
         drive = partial(self._drive_part, data, trace, chosen_runs(runs, self.runs))
         share_out(drive, self.runs, self._threads)
 
     def _drive_part(
-        self, data: StepData, trace: BatchTrace, chosen: BoolArray, part: slice
+        self, data: tuple[Any, ...], trace: BatchTrace, chosen: BoolArray, part: slice
     ) -> None:
         for_sensor(drive_runs, self.sensor)(
             _of(part, self._arrays()),
@@ -496,31 +475,25 @@ def checked_beliefs(
     if mapped.dtype != np.bool_:
         raise ValueError(f"beliefs.mapped must be booleans, got {mapped.dtype}")
     mapped = _shaped_flags("beliefs.mapped", mapped, (count, landmarks))
+    arrays = (
+        (means, "beliefs.means"),
+        (P, "beliefs.covariances"),
+        (points, "references"),
+    )
     for run in np.flatnonzero(runs).tolist():
-        problem = _problem(means[run], P[run], points[run])
-        if problem:
-            raise ValueError(f"{problem} in run {run}")
+        for array, name in arrays:
+            if not np.isfinite(array[run]).all():
+                raise ValueError(f"{name} must be finite, but is not in run {run}")
+        if not np.array_equal(P[run], P[run].T):
+            raise ValueError(
+                f"beliefs.covariances must be symmetric, but is not in run {run}"
+            )
+        if not saved_states.is_semidefinite(P[run]):
+            raise ValueError(
+                "beliefs.covariances must be positive semidefinite, but has the "
+                f"eigenvalue {np.linalg.eigvalsh(P[run])[0]:.3g} in run {run}"
+            )
     return LoadedBeliefs(means, P, points, mapped)
-
-
-def _problem(mean: Array, covariance: Array, reference: Array) -> str | None:
-    """Return the error of a belief, or None."""
-    for name, array in (
-        ("beliefs.means", mean),
-        ("beliefs.covariances", covariance),
-        ("references", reference),
-    ):
-        if not np.isfinite(array).all():
-            return f"{name} must be finite, but is not"
-    if not np.array_equal(covariance, covariance.T):
-        return "beliefs.covariances must be symmetric, but is not"
-    if not saved_states.is_semidefinite(covariance):
-        least = float(np.linalg.eigvalsh(covariance)[0])
-        return (
-            "beliefs.covariances must be positive semidefinite, but has the "
-            f"eigenvalue {least:.3g}"
-        )
-    return None
 
 
 def first_poses(name: str, poses: ArrayLike, count: int) -> Array:

@@ -33,7 +33,7 @@ from ..support import argument_checks
 from ..support.argument_checks import aligned_zeros, usable_cores
 from .batch import can_batch
 from .ekf import EkfSlam
-from .gaussian_map import GaussianMap, workspace_for
+from .gaussian_map import GaussianMap
 
 # NIS beyond which a reading is rejected: a share e⁻¹⁵ of them if the noise is right.
 GATE = 30.0
@@ -229,7 +229,7 @@ def _follow(
         np.array(rules),
         (first.mean[:3].copy(), first.covariance[:3, :3].copy()),
         belief,
-        tuple(workspace_for(rules, most, capacity)),
+        tuple(gain.workspace_for(rules, most, capacity)),
         np.empty(landmarks, dtype=np.int64),
         tuple(array[part] for array in record),
     )

@@ -28,6 +28,7 @@ from ..models.sensors import (
     find_sensor,
     for_sensor,
     former_noise,
+    two_stds,
 )
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds, covariance_bytes, landmark_pairs
@@ -599,10 +600,7 @@ def checked_rules(
     min_range: float,
 ) -> Rules:
     """Return the rules of an update, from the arguments of :class:`.ekf.EkfSlam`."""
-    if sensor.size == 1 and np.size(measurement_std) == 1:
-        given = argument_checks.as_floats("measurement_std", measurement_std)
-        measurement_std = float(given.ravel()[0]), 1.0
-    std = argument_checks.standard_deviations("measurement_std", measurement_std, 2)
+    std = two_stds(sensor, measurement_std)
     argument_checks.one_of("landmark_init", landmark_init, ("full", "independent"))
     return Rules(
         linearisation=linearisation,

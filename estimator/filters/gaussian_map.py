@@ -19,7 +19,7 @@ from ...arrays import Array, IntArray
 from ...jit import jit_in_place, njit_inlined, njit_internal
 from ..interface import Belief, MapView, UpdateReport, columns_of
 from ..kernels import kalman_gain as gain
-from ..kernels.kalman_gain import BeliefArrays, Rules, Workspace, new_workspace
+from ..kernels.kalman_gain import BeliefArrays, Rules
 from ..kernels.scan_update import DONE, update_lower_half
 from ..models.rigid_motion import ErrorFrame, predict
 from ..support import saved_states as saved
@@ -545,16 +545,6 @@ def without_landmarks(array: Array, slots: Iterable[int]) -> Array:
     for axis in range(array.ndim):
         array = np.delete(array, columns, axis=axis)
     return array
-
-
-def workspace_for(rules: Rules, readings: int, capacity: int) -> Workspace:
-    """Allocate what updates by these rules need, with this many readings at most."""
-    return new_workspace(
-        readings,
-        capacity,
-        iterated=rules.iterations > 1,
-        spoilable=readings > gain.BLOCK,
-    )
 
 
 class ScanRecord(NamedTuple):

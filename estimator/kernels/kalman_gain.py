@@ -67,7 +67,9 @@ def absorb(
     for first in range(0, bottom, 2 * block):
         last = min(first + 2 * block, bottom)
         if first > 0:
-            _refresh_for(covariance, size, columns[first // 2 : last // 2])
+            refresh_pose(covariance, size)
+            for column in columns[first // 2 : last // 2]:
+                refresh(covariance, size, column)
         for row in range(first, last, 2):
             c = columns[row // 2]
             if not whiten(covariance, size, rows, system, first, row, c):
@@ -229,14 +231,6 @@ def downdate(
             for k in range(np.uint64(first), np.uint64(last)):
                 rest = fma(-A[k, i], A[k, j], rest)
             P[i, j] = rest
-
-
-@njit_internal
-def _refresh_for(covariance: Array, size: int, columns: IntArray) -> None:
-    """Complete the rows of P that the next readings look at."""
-    refresh_pose(covariance, size)
-    for column in columns:
-        refresh(covariance, size, column)
 
 
 @njit_internal
@@ -501,22 +495,18 @@ class Workspace(NamedTuple):
     before: Array  # empty, or square with room for P, to restore it after a failure
 
 
-def new_workspace(
-    readings: int, capacity: int, *, iterated: bool, spoilable: bool
-) -> Workspace:
-    """Allocate the workspace of a belief.
+def workspace_for(rules: Rules, readings: int, capacity: int) -> Workspace:
+    """Allocate what updates by these rules need.
 
     Parameters
     ----------
+    rules : Rules
+        Whether updates may linearise more than once.
     readings, capacity : int
         Most readings in one scan, and length of the mean.
-    iterated : bool
-        Whether updates may linearise more than once.
-    spoilable : bool
-        Whether an update can fail after it has changed P.
     """
-    systems = (2 if iterated else 1) * (2 * readings + 2)
-    kept = capacity * spoilable
+    systems = (2 if rules.iterations > 1 else 1) * (2 * readings + 2)
+    kept = capacity * (readings > BLOCK)  # else no update fails after it has changed P
     return Workspace(
         aligned_zeros(FIRST + systems, (capacity + 7) // 8 * 8 + META_WIDTH),
         aligned_zeros(kept, kept),

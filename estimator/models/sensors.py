@@ -561,7 +561,7 @@ def check_sensor(
         At the first contradiction, naming the number and where it was seen.
     """
     checked = find_sensor(sensor)
-    noise = _two_stds(checked, measurement_std)
+    noise = two_stds(checked, measurement_std)
     rng = np.random.default_rng(0)
     r, turn = 10 ** rng.uniform(-1, 2, trials), rng.uniform(-np.pi, np.pi, trials)
     x, y = r * np.cos(turn), r * np.sin(turn)
@@ -581,10 +581,11 @@ def _name(sensor: Sensor, column: int) -> str:
     return sensor.columns[column] if column < sensor.size else "the unused number"
 
 
-def _two_stds(sensor: Sensor, measurement_std: ArrayLike) -> Array:
-    """Return the noise as two numbers; refuse what filters refuse."""
+def two_stds(sensor: Sensor, measurement_std: ArrayLike) -> Array:
+    """Return the noise as two numbers, the second without use where one is read."""
     if sensor.size == 1 and np.size(measurement_std) == 1:
-        measurement_std = np.resize(measurement_std, 2)
+        given = argument_checks.as_floats("measurement_std", measurement_std)
+        measurement_std = np.resize(given, 2)
     return argument_checks.standard_deviations("measurement_std", measurement_std, 2)
 
 
