@@ -8,7 +8,7 @@ of them.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import lru_cache, partial
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
@@ -244,7 +244,7 @@ class Belief:
         frame : {"additive", "invariant"}
             Coordinates in which the filter takes its error to be Gaussian.
         """
-        columns = columns_of(slots, landmark_ids)
+        columns = columns_of([slots[i] for i in landmark_ids])
         P = covariance[np.ix_(columns, columns)]
         return cls(mean[columns], P, tuple(landmark_ids), frame)
 
@@ -317,12 +317,9 @@ class Belief:
         return chosen
 
 
-def columns_of(
-    slots: Mapping[int, int] | Sequence[int], landmark_ids: Sequence[int]
-) -> list[int]:
-    """Return where the pose and some landmarks stand in a state."""
-    firsts = [3 + 2 * slots[i] for i in landmark_ids]
-    return [0, 1, 2, *(first + axis for first in firsts for axis in (0, 1))]
+def columns_of(slots: Iterable[int]) -> list[int]:
+    """Return where the pose and the landmarks in some slots stand in a state."""
+    return [0, 1, 2, *(3 + 2 * slot + axis for slot in slots for axis in (0, 1))]
 
 
 class MapView(NamedTuple):

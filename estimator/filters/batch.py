@@ -450,7 +450,7 @@ class LoadedBeliefs(NamedTuple):
     def write(self, run: int, arrays: RunArrays) -> None:
         """Replace the belief of a run; its landmarks are stored in order of id."""
         ids = np.flatnonzero(self.mapped[run])
-        at = columns_of(range(self.mapped.shape[1]), ids.tolist())
+        at = columns_of(ids.tolist())
         size = len(at)
         for array in arrays[:3]:
             array[run] = 0.0
@@ -561,7 +561,7 @@ class BatchBeliefs(NamedTuple):
                 raise ValueError(
                     f"landmark ids must be below landmarks = {landmarks}, got {ids}"
                 )
-            at = columns_of(range(landmarks), ids)
+            at = columns_of(ids)
             means[run, at], mapped[run, list(ids)] = belief.mean, True
             covariances[run][np.ix_(at, at)] = belief.covariance
         return cls(means, covariances, mapped)

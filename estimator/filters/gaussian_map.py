@@ -304,7 +304,8 @@ class GaussianMap:
             return Belief(self.mean[: self.size], P, whole, frame)
         if not self.parts.numbers[LOWER] or 8 * len(ids) >= len(self.slots):
             return Belief.marginal(self.mean, self.covariance, self.slots, ids, frame)
-        columns = np.array(columns_of(self.slots, ids))  # in the lower half of P
+        slots = [self.slots[i] for i in ids]
+        columns = np.array(columns_of(slots))  # in the lower half of P
         at = np.maximum.outer(columns, columns), np.minimum.outer(columns, columns)
         return Belief(self.mean[columns], self.parts.covariance[at], tuple(ids), frame)
 
