@@ -210,7 +210,7 @@ def places_of_scan(
     accurate = ACCURATE * rules.lost_std
     if _find_lost(*view[:2], accurate, np.zeros(n, dtype=np.bool_))[1]:
         return []
-    argument_checks.refuse_not_finite(readings)
+    argument_checks.refuse_unusable(readings)
     both = _with_readings(view, readings, noise)
     turned = _turned_gaps(view, readings, noise.variances(readings[:, 1])[:, 1])
     shifted, _ = _offsets(both, np.arange(n, n + m), np.arange(n))

@@ -265,7 +265,7 @@ class ManagedSlam:
 
         Of those that cost more than ``ceiling`` only the most likely is of interest.
         """
-        argument_checks.refuse_not_finite(readings)
+        argument_checks.refuse_unusable(readings)
         known, view = self.candidates, self._pruner.view_for(readings)
         return associate(self._policy, known, readings, view, self._sensor, ceiling)
 

@@ -200,14 +200,10 @@ def mapped_identities(asked: LandmarkIds, mapped: Mapping[int, int]) -> list[int
     return ids
 
 
-def refuse_not_finite(readings: Array) -> None:
-    """Refuse readings without identity that are not finite or too large."""
-    if not sum(map(abs, readings.ravel().tolist())) <= LARGEST:  # fast, then exact
-        refuse_unusable(readings)
-
-
 def refuse_unusable(readings: Array, ids: Sequence[int] | None = None) -> None:
     """Refuse readings that are not finite or too large, naming the first."""
+    if sum(map(abs, readings.ravel().tolist())) <= LARGEST:  # fast, then exact
+        return
     for usable, rule in (
         (np.isfinite(readings), "must be finite"),
         (np.abs(readings) <= LARGEST, f"must not exceed {LARGEST:g}"),
