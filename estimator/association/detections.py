@@ -265,10 +265,8 @@ class Detections(NamedTuple):
         longest : float
             Longest range read so far [m].
         """
-        ids, counts, evidence = view.ids, self.detected.copy(), self.lost
-        times = [self.shown.get(i, 0) for i in ids]
-        pairs = zip(ids, times, strict=True)
-        proven = [i < evidence.first_new and count >= PROVEN for i, count in pairs]
+        ids, counts, new = view.ids, self.detected.copy(), self.lost.first_new
+        proven = [i < new and self.shown.get(i, 0) >= PROVEN for i in ids]
         is_telling = np.array(proven, dtype=np.bool_)
         missed = np.array([self.missed.get(i, 1.0) for i in ids])
         cost, fewer = _count(view[:2], scan, is_telling, longest, counts, missed)
@@ -276,10 +274,11 @@ class Detections(NamedTuple):
         if left or min(chances, default=1.0) < 1:
             left = {**left, **dict(zip(ids, chances, strict=True))}
             left = {i: chance for i, chance in left.items() if chance < 1}
-        seen = [slot for slot in scan[0].tolist() if slot >= 0]
-        more = {ids[j]: times[j] + 1 for j in seen if times[j] < PROVEN}
+        seen = [ids[slot] for slot in scan[0].tolist() if slot >= 0]
+        times = {i: 1 + self.shown.get(i, 0) for i in seen}
+        more = {i: count for i, count in times.items() if count <= PROVEN}
         shown = {**self.shown, **more} if more else self.shown
-        evidence = evidence.after(fewer, view.mapped)
+        evidence = self.lost.after(fewer, view.mapped)
         return cost, Detections(counts, left, shown, evidence, self.path)
 
     def with_pose(self, scan: int, view: MapView, longest: float) -> Detections:

@@ -50,7 +50,7 @@ class ScanAssociation:
     ----------
     policy : AssociationPolicy
     candidates : Candidates
-        Before the scan.
+        Before the scan, except that `associate` has counted its detections.
     readings : ndarray, shape (m, 2)
         The scan, rows (β, r) [rad, m].
     """
@@ -63,8 +63,7 @@ class ScanAssociation:
         self._waiting = dict(candidates.waiting)
         self._next_id, self.scan = candidates.next_id, candidates.scan
         self._density, self._readings = candidates.density, readings
-        #: Which landmarks the scans have shown; `associate` adds this scan.
-        self.detections = candidates.detections
+        self._detections = candidates.detections
         #: For each row the landmark that the filter associates it with, if any.
         self.row_ids: list[int | None] = [None] * len(readings)
         #: Labels of landmarks that were tentative before this scan.
@@ -86,12 +85,12 @@ class ScanAssociation:
         new = [row for row in new if not 0 <= self.labels[row] < known]
         density = self._density.after(self._readings, new, len(self.confirmed))
         heading = view.covariance[2, 2], len(view.mapped) > 0
-        lost = self.detections.lost.with_heading(*heading)
+        lost = self._detections.lost.with_heading(*heading)
         if self._is_assigned:
             strange = sum([label >= known for label in self.labels])
             others = len(self.labels) - len(new)
             lost = lost.with_readings(strange, others, self._density)
-        detections = Detections(*self.detections[:3], lost, self.detections.path)
+        detections = Detections(*self._detections[:3], lost, self._detections.path)
         if self._is_assigned and self._policy.association == "hypotheses":
             # A landmark that one scan confirms has no label, and costs nothing.
             firsts = {i: label >> LABEL_BITS for i, label in self.confirmed.items()}
@@ -149,7 +148,7 @@ class ScanAssociation:
                 self.labels[row] = int(tentative.labels[slot])
                 reading = readings[row]
                 tentative = tentative.with_sighting(slot, reading, noise, density[n])
-        chance = self.detections.chance_to_miss(view, self._density.longest)
+        chance = self._detections.chance_to_miss(view, self._density.longest)
         tentative = tentative.with_misses(chance)
         needed = self._policy.confirm[0]
         enough = (tentative.sightings >= needed) & (tentative.odds > ENTRY_ODDS)
@@ -283,19 +282,18 @@ def associate(
     is of interest.  Readings closer than the sensor's least range have no usable
     bearing: they are ambiguous.
     """
-    usable = [distance >= sensor.min_range for distance in readings[:, 1].tolist()]
-    used, noise = readings if all(usable) else readings[usable], sensor.noise
+    usable, noise = readings[:, 1] >= sensor.min_range, sensor.noise
+    used = readings[usable]
     density = _unexplained_density(policy, candidates, used, noise)
     found = assign_scan(policy, view, used, noise, density, ceiling=ceiling)
 
     def complete(slots: IntArray, detections: Detections) -> ScanAssociation:
-        association = ScanAssociation(policy, candidates, readings)
-        association.detections = detections
+        counted = candidates._replace(detections=detections)
+        association = ScanAssociation(policy, counted, readings)
         association.explained = {view.ids[slot] for slot in found.explained.tolist()}
-        if used is not readings:
-            of_used, slots = slots, np.full(len(readings), AMBIGUOUS)
-            slots[usable] = of_used
-        association.assign(slots, view, noise)
+        every = np.full(len(readings), AMBIGUOUS)
+        every[usable] = slots
+        association.assign(every, view, noise)
         return association
 
     options = []
