@@ -17,7 +17,13 @@ from ...arrays import Array, IntArray
 from ..interface import Belief, UpdateReport
 from ..kernels.kalman_gain import ADDITIVE, INVARIANT, BeliefArrays, Rules
 from ..models.bearing_range import wrap_angle
-from ..models.rigid_motion import ErrorFrame, left_jacobian, points_of, state_of
+from ..models.rigid_motion import (
+    ErrorFrame,
+    left_jacobian,
+    points_of,
+    squared_offsets,
+    state_of,
+)
 from ..support import argument_checks
 from .gaussian_map import GaussianMap
 
@@ -92,17 +98,11 @@ class ObservesPoses:
         given = PoseReading.checked(reading, matrix, covariance)
         (mean, P, reference), map_ = self.map.used, self.map
         found = self._observe(given, mean, P)
-        size = found.innovation.size
-        if not found.nis <= gate_of(self.rules, size):
+        if not found.nis <= gate_of(self.rules, len(found.innovation)):
             return UpdateReport()
         after = BeliefArrays(found.mean, found.covariance, reference)
         map_.hold(after, map_.slots, block=map_.blank(map_.room), steps=1)
-        return UpdateReport(
-            nis=float(found.nis),
-            degrees_of_freedom=size,
-            innovation=found.innovation,
-            factor=found.factor,
-        )
+        return found.report()
 
     def _observe(
         self, given: PoseReading, mean: Array, covariance: Array
@@ -216,6 +216,15 @@ class ObservedMap(NamedTuple):
     factor: Array
     #: νᵀ S⁻¹ ν, shape ().
     nis: Array
+
+    def report(self) -> UpdateReport:
+        """Return the report of the reading."""
+        return UpdateReport(
+            nis=float(self.nis),
+            degrees_of_freedom=len(self.innovation),
+            innovation=self.innovation,
+            factor=self.factor,
+        )
 
 
 def observe(
@@ -358,12 +367,7 @@ class Separation(NamedTuple):
     @property
     def squared(self) -> float:
         """Dᵀ C⁻¹ D: χ² of 2 degrees of freedom if both are one; ∞ if C is singular."""
-        (a, b), (_, c) = self.covariance
-        determinant = a * c - b * b
-        if not determinant > 0:
-            return np.inf
-        x, y = self.offset
-        return float((c * x * x - 2 * b * x * y + a * y * y) / determinant)
+        return float(squared_offsets(self.offset, self.covariance))
 
     @property
     def largest_std(self) -> float:

@@ -175,7 +175,6 @@ class HypothesisSlam:
         self.hypotheses = [Hypothesis(0.0, self._pool.fresh())]
         #: Number of steps taken.
         self.steps = 0
-        self._report: UpdateReport | None = None
 
     @property
     def best(self) -> ManagedSlam:
@@ -240,13 +239,11 @@ class HypothesisSlam:
         before, slams = self.hypotheses, self._slams
 
         def then() -> UpdateReport:
-            reports = [slam.report() or UpdateReport() for slam in slams]
-            costs = [h.cost for h in before]
+            reports, after = [slam.report() for slam in slams], [*before]
             if reports[0].degrees_of_freedom:
-                pairs = zip(costs, reports, strict=True)
-                costs = [cost + cost_of(report) for cost, report in pairs]
-            order = np.argsort(costs, kind="stable").tolist()
-            return self._take_over([Hypothesis(costs[k], slams[k]) for k in order])
+                pairs = zip(before, reports, strict=True)
+                after = [Hypothesis(h.cost + cost_of(r), h.slam) for h, r in pairs]
+            return self._take_over(sorted(after, key=lambda h: h.cost))
 
         return self._carry_out(slams, lambda k: slams[k].observe_pose(*given), then)
 
@@ -286,7 +283,10 @@ class HypothesisSlam:
         errors: dict[int, Exception] = {}
         costs, origins, completions = zip(*options, strict=True)
         plans = [complete() for complete in completions]
-        slams = self._branches([before[k] for k in origins])
+        slams: list[ManagedSlam] = []
+        for slam in [before[k] for k in origins]:  # copied where a hypothesis splits
+            is_taken = slam in slams
+            slams.append(self._pool.resumed(slam.snapshot()) if is_taken else slam)
 
         def take(k: int) -> None:
             try:
@@ -311,8 +311,7 @@ class HypothesisSlam:
         """Continue with hypotheses, the best first; return the report of this one."""
         least = hypotheses[0].cost
         self.hypotheses = [Hypothesis(h.cost - least, h.slam) for h in hypotheses]
-        self._report = self.best.report() or UpdateReport()
-        return self._report
+        return self.report()
 
     def _carry_out(
         self,
@@ -396,26 +395,21 @@ class HypothesisSlam:
     def snapshot(self) -> tuple[Any, ...]:
         """Return the present state of every hypothesis, for :meth:`resume`."""
         kept = [(h.cost, h.slam.snapshot()) for h in self.hypotheses]
-        return kept, self.steps, self._report
+        return kept, self.steps
 
     def resume(self, before: tuple[Any, ...]) -> None:
         """Return to a :meth:`snapshot` of a filter with the same settings."""
-        kept, self.steps, self._report = before
-        slams = self._slams
-        slams += [self._pool.fresh() for _ in kept[len(slams) :]]
-        for (_, own), slam in zip(kept, slams, strict=False):
-            slam.resume(own)
-        costs = [cost for cost, _ in kept]
-        self._keep([*map(Hypothesis, costs, slams)])
+        kept, self.steps = before
+        self._keep([Hypothesis(cost, self._pool.resumed(own)) for cost, own in kept])
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
         slams = (h.slam.bookmark() for h in self.hypotheses)
         return undo_all(*slams, attributes(self, self._pool))
 
-    def report(self) -> UpdateReport | None:
+    def report(self) -> UpdateReport:
         """Return the report of the last update once more."""
-        return self._report
+        return self.best.report()
 
     def _at_places(self, readings: Array) -> list[Hypothesis]:
         """Return the parts of the hypotheses around the places that a scan shows.
@@ -427,7 +421,7 @@ class HypothesisSlam:
         parts = []
         for h in self.hypotheses[:PER_BASIN]:
             for place in h.slam.places_of_scan(readings):
-                slam = self._pool.copy(h.slam)
+                slam = self._pool.resumed(h.slam.snapshot())
                 reports = slam.move_to(*place)
                 if all(report.degrees_of_freedom for report in reports):
                     cost = sum(map(cost_of, reports)) - log(np.linalg.det(AROUND))
@@ -449,13 +443,6 @@ class HypothesisSlam:
             if len(options) == most:
                 ceiling = options[-1][0]
         return options
-
-    def _branches(self, origins: Sequence[ManagedSlam]) -> list[ManagedSlam]:
-        """Return a filter for each option, copied where a hypothesis splits."""
-        slams: list[ManagedSlam] = []
-        for slam in origins:
-            slams.append(self._pool.copy(slam) if slam in slams else slam)
-        return slams
 
     @property
     def _slams(self) -> list[ManagedSlam]:
@@ -496,11 +483,11 @@ class FilterPool:
         *self._spare, slam = self._spare or [self._make()]
         return slam
 
-    def copy(self, slam: ManagedSlam) -> ManagedSlam:
-        """Return another filter that continues from the same state."""
-        copied = self.fresh()
-        copied.resume(slam.snapshot())
-        return copied
+    def resumed(self, before: tuple[Any, ...]) -> ManagedSlam:
+        """Return a filter that nobody uses, and that continues from a snapshot."""
+        slam = self.fresh()
+        slam.resume(before)
+        return slam
 
     def free(self, slams: Iterable[ManagedSlam]) -> None:
         """Take filters back."""

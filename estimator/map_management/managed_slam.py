@@ -126,7 +126,7 @@ class ManagedSlam:
         self.candidates = Candidates()
         #: Number of steps taken.
         self.steps = 0
-        self._report: UpdateReport | None = None
+        self._report = UpdateReport()
         self._recent = RecentScans(self._filter, self._editor, self._policy)
         for name, member in optional_members(self._filter).items():
             setattr(self, name, member)
@@ -297,14 +297,7 @@ class ManagedSlam:
         self._editor.replace_belief(part.mean, part.covariance)
         # The scans before cannot be repeated, since the place would not be.
         self._recent.scans, self._recent.motions = [], ()
-        return [
-            UpdateReport(
-                nis=float(part.nis),
-                degrees_of_freedom=len(part.innovation),
-                innovation=part.innovation,
-                factor=part.factor,
-            )
-        ]
+        return [part.report()]
 
     def take(
         self, readings: Array, associate: Callable[[], ScanAssociation]
@@ -417,7 +410,7 @@ class ManagedSlam:
         """Return what takes back that associations have looked at the map."""
         return self._editor.bookmark()
 
-    def report(self) -> UpdateReport | None:
+    def report(self) -> UpdateReport:
         """Return the report of the last update once more."""
         return self._report
 
