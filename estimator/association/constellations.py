@@ -29,7 +29,7 @@ from scipy.special import chdtri
 
 from ...arrays import Array, BoolArray, ComplexArray, IntArray
 from ..kernels.assignment_search import compare_pairs, search_clique
-from ..models.rigid_motion import left_jacobian
+from ..models.rigid_motion import left_jacobian, rotation, squared_offsets
 from ..support import argument_checks
 
 #: Most pairs of landmarks that are compared.
@@ -125,20 +125,18 @@ def agreeing_pairs(
     agree = np.zeros((len(pairs), len(pairs)), dtype=np.bool_)
     compare_pairs(pairs, local, older, DISTANCE_GATE, places.largest_turn, agree)
     floor = rules.least - 1
-    while True:
+    while len(found) < most:
+        if found:
+            gaps = moved_gaps(places, found[-1])
+            worst = gaps[found[-1].local, found[-1].older].max()
+            others = gaps[pairs[:, 0], pairs[:, 1]] > RIVAL_GAP * worst
+            pairs, agree = pairs[others], agree[np.ix_(others, others)]
+            k = len(found[0].local)
+            floor = max(min(k - rules.margin, int(RIVAL_SHARE * k)), 2)
         clique, is_complete = largest_clique(pairs, agree, floor, rules.search_nodes)
-        if is_complete and not len(clique):
-            break
-        match = Match(*pairs[clique].T)
-        found.append(match)
-        if not is_complete or len(found) == most:
-            break
-        gaps = moved_gaps(places, match)
-        worst = gaps[match.local, match.older].max()
-        others = gaps[pairs[:, 0], pairs[:, 1]] > RIVAL_GAP * worst
-        pairs, agree = pairs[others], agree[np.ix_(others, others)]
-        k = len(found[0].local)
-        floor = max(min(k - rules.margin, int(RIVAL_SHARE * k)), 2)
+        if not len(clique):
+            return found if is_complete else [*found, Match(clique, clique)]
+        found.append(Match(*pairs[clique].T))
     return found
 
 
@@ -247,15 +245,20 @@ def turn_between(places: TwoPlaces, match: Match) -> float:
     return float(np.angle(np.vdot(a - a.mean(), b - b.mean())))
 
 
-def moved_gaps(places: TwoPlaces, match: Match) -> Array:
-    """Return distances of local and older landmarks after a match, shape (m, n) [m].
+def moved(places: TwoPlaces, match: Match, points: Array) -> Array:
+    """Return points (..., 2) of the local map, moved with its matched landmarks [m].
 
-    The matched landmarks of the local map are turned and shifted onto their partners.
+    These are turned and shifted onto their partners.
     """
-    a, b = _matched(places, match)
-    turn = np.exp(1j * turn_between(places, match))
-    moved = b.mean() + turn * (_complex(places.local) - a.mean())
-    return np.asarray(np.abs(moved[:, None] - _complex(places.older)[None]))
+    a, b = places.local[match.local], places.older[match.older]
+    turn = rotation(turn_between(places, match))
+    return np.asarray(b.mean(axis=0) + (points - a.mean(axis=0)) @ turn.T)
+
+
+def moved_gaps(places: TwoPlaces, match: Match) -> Array:
+    """Return distances of local and older landmarks after a match, shape (m, n) [m]."""
+    d = moved(places, match, places.local)[:, None] - places.older
+    return np.asarray(np.hypot(d[..., 0], d[..., 1]))
 
 
 def is_plausible(places: TwoPlaces, match: Match) -> bool:
@@ -303,12 +306,9 @@ def extended(places: TwoPlaces, match: Match) -> Match:
         gain = np.linalg.solve(S[:k, :k], S[:k, k:]).T
     except np.linalg.LinAlgError:  # `misfit` refuses the match
         return match
-    r_left, own = (r[k:] - gain @ r[:k]).reshape(-1, 2, 1), np.arange(len(i))
+    r_left, own = (r[k:] - gain @ r[:k]).reshape(-1, 2), np.arange(len(i))
     S_left = _blocks(S[k:, k:] - gain @ S[:k, k:])[own, own]
-    sound = np.flatnonzero(np.linalg.det(S_left) > 0)
-    r_left, S_left = r_left[sound], S_left[sound]
-    squared = (r_left * np.linalg.solve(S_left, r_left)).sum(axis=(1, 2))
-    good = sound[squared <= PAIR_GATE]
+    good = squared_offsets(r_left, S_left) <= PAIR_GATE
     return Match(np.append(match.local, i[good]), np.append(match.older, p[good]))
 
 

@@ -26,7 +26,7 @@ from ..kernels.assignment_search import (
     largest_change,
     reading_covariance,
 )
-from ..models.bearing_range import reading_slopes_jit, wrap_angle_jit
+from ..models.bearing_range import locate_landmark, reading_slopes_jit, wrap_angle_jit
 from ..models.sensors import only_bearing_range, sensor_in
 from ..support import argument_checks
 
@@ -314,6 +314,19 @@ class Noise(NamedTuple):
             std[:, 0] += self.bearing_std_metres / ranges
         std[:, 1] = self.range_std + self.range_std_per_metre * ranges
         return np.asarray(std**2)
+
+
+def located(pose: Array, readings: Array, noise: Noise) -> tuple[Array, Array, Array]:
+    """Locate the landmarks of readings (m, 2) from a pose (3,).
+
+    Returns
+    -------
+    tuple of ndarray, shapes (m, 2), (m, 2, 3) and (m, 2, 2)
+        Positions, their derivatives by the pose, and covariances due to the noise.
+    """
+    places, to_pose, J = locate_landmark(pose, readings)
+    variances = noise.variances(readings[:, 1])
+    return places, to_pose, J * variances[:, None] @ J.mT
 
 
 class Sensor(NamedTuple):

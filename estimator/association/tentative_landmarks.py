@@ -29,10 +29,10 @@ from numpy.typing import NDArray
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
 from ..interface import MapView
-from ..models.bearing_range import locate_landmark, predict_measurement, wrap_angle
+from ..models.bearing_range import predict_measurement, wrap_angle
 from ..models.rigid_motion import as_covariance, rotation
 from ..support import saved_states
-from .scan_assignments import Noise
+from .scan_assignments import Noise, located
 
 Masks = NDArray[np.uint64]
 
@@ -140,9 +140,7 @@ class TentativeLandmarks(NamedTuple):
         if not len(readings):
             return self
         share = min(max(share, LEAST_SHARE), 0.5)
-        places, _, J = locate_landmark(np.zeros(3), readings)
-        variances = noise.variances(readings[:, 1])
-        spread = J * variances[:, None] @ J.transpose(0, 2, 1)
+        places, _, spread = located(np.zeros(3), readings, noise)
         odds = np.full(len(readings), np.log(share / (1 - share)))
         new = places, spread, np.ones(len(readings), np.uint64), labels, odds
         return TentativeLandmarks(*map(np.concatenate, zip(self, new, strict=True)))

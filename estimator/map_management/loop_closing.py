@@ -26,7 +26,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -39,12 +39,13 @@ from ..association.constellations import (
     agreeing_pairs,
     is_plausible,
     match_constellations,
+    moved,
     turn_between,
 )
-from ..association.scan_assignments import Noise
+from ..association.scan_assignments import Noise, located
 from ..interface import MapView
-from ..models.bearing_range import locate_landmark, wrap_angle
-from ..models.rigid_motion import rotation
+from ..models.bearing_range import wrap_angle
+from ..models.rigid_motion import squared_offsets
 from ..support import argument_checks
 
 #: Landmarks that are the same: (kept, gone).
@@ -211,59 +212,62 @@ def places_of_scan(
     if _find_lost(*view[:2], accurate, np.zeros(n, dtype=np.bool_))[1]:
         return []
     argument_checks.refuse_unusable(readings)
-    both = _with_readings(view, readings, noise)
-    turned = _turned_gaps(view, readings, noise.variances(readings[:, 1])[:, 1])
-    shifted, _ = _offsets(both, np.arange(n, n + m), np.arange(n))
-    feasible = np.minimum(turned, shifted) <= OFFSET_GATE
+    feasible = _gaps(view, readings, noise) <= OFFSET_GATE
     partners, used = feasible.sum(axis=1), np.flatnonzero(feasible.any(axis=0))
     rows = np.argsort(partners, kind="stable")[(partners == 0).sum() :]
     if len(rows) < FEWEST_READINGS:
         return []
-    places = _two_places(both, n + rows, used)
+    both = _with_readings(_part(view, used), readings[rows], noise)
+    known = np.arange(len(used))
+    places = _two_places(both, len(used) + np.arange(len(rows)), known)
     feasible = feasible[np.ix_(rows, used)]
     rules = replace(rules, least=FEWEST_READINGS)
     found = []
     for match in agreeing_pairs(places, feasible, rules, most=MOST_PLACES):
         if len(match.local) and is_plausible(places, match):
-            turn = turn_between(places, match)
-            a, b = places.local[match.local], places.older[match.older]
-            shift = rotation(turn) @ (view.mean[:2] - a.mean(axis=0))
-            heading = wrap_angle(float(view.mean[2]) + turn)
-            pose = np.array([*(b.mean(axis=0) + shift), heading])
+            heading = wrap_angle(float(view.mean[2]) + turn_between(places, match))
+            pose = np.append(moved(places, match, view.mean[:2]), heading)
             found.append((pose, used[match.older]))
     return found
 
 
-def _turned_gaps(view: MapView, readings: Array, variances: Array) -> Array:
-    """Return χ² of readings (m, 2) and landmarks with the scan turned, shape (m, n).
+def _gaps(view: MapView, readings: Array, noise: Noise) -> Array:
+    """Return χ² of readings (m, 2) and landmarks, shape (m, n).
 
-    The scan is turned by φ about the robot until the reading points to the landmark.
-    χ² is that of φ and of what is then left, the difference of both distances; the
-    noise across the line of sight is neglected.
+    It is the lower one of two: of their offset, and of the scan turned by φ about the
+    robot until the reading points to the landmark.  The latter is that of φ and of what
+    is then left, the difference of both distances; the noise across the line of sight
+    is neglected.
     """
     n, P = len(view.ids), view.covariance
     d = view.landmarks - view.mean[:2]
     turn = np.arctan2(d[:, 1], d[:, 0]) - view.mean[2] - readings[:, :1]
     away = np.hypot(*d.T)
-    cross = P[3 : 3 + 2 * n, :2].reshape(n, 2, 2)
-    C = view.landmark_covariances + P[:2, :2] - cross - cross.mT
+    cross = P[3 : 3 + 2 * n, :3].reshape(n, 2, 3) - P[:2, :3]
+    C = view.landmark_covariances - P[:2, :2] - cross[..., :2] - cross[..., :2].mT
     along = np.einsum("ni,nij,nj->n", d, C, d) / (away**2 + TINY)
-    squared = (readings[:, 1:] - away) ** 2 / (along + variances[:, None] + TINY)
-    return np.asarray(squared + wrap_angle(turn) ** 2 / (P[2, 2] + TINY))
+    variances = noise.variances(readings[:, 1])[:, 1:]
+    turned = (readings[:, 1:] - away) ** 2 / (along + variances + TINY)
+    turned += wrap_angle(turn) ** 2 / (P[2, 2] + TINY)
+    # The error of the offset is e_l − e_p − J d e_θ, and the noise of the reading.
+    lever = d[:, ::-1, None] * [[-1.0], [1.0]]
+    half = lever * (P[2, 2] / 2 * lever - cross[..., 2:]).mT
+    places, _, spread = located(view.mean[:3], readings, noise)
+    C = spread[:, None] + (C + half + half.mT)
+    shifted = squared_offsets(places[:, None] - view.landmarks, C)
+    return np.asarray(np.minimum(turned, shifted))
 
 
 def _with_readings(view: MapView, readings: Array, noise: Noise) -> MapView:
-    """Return a map with a new landmark for each reading."""
-    places, to_pose, to_reading = locate_landmark(view.mean[:3], readings)
-    known, m = 3 + 2 * len(view.ids), len(readings)
-    P = view.covariance[:known, :known]
+    """Return a map, without room behind it, with a new landmark for each reading."""
+    places, to_pose, spread = located(view.mean[:3], readings, noise)
+    P, m = view.covariance, len(readings)
     J = to_pose.reshape(2 * m, 3)
     cross = J @ P[:3]
     own = cross[:, :3] @ J.T
-    spread = to_reading * noise.variances(readings[:, 1])[:, None]
-    own.reshape(m, 2, m, 2)[range(m), :, range(m)] += spread @ to_reading.mT
+    own.reshape(m, 2, m, 2)[range(m), :, range(m)] += spread
     P = np.block([[P, cross.T], [cross, own]])
-    mean = np.append(view.mean[:known], places)
+    mean = np.append(view.mean, places)
     return MapView(mean, P, range(len(view.ids) + m))
 
 
@@ -310,13 +314,8 @@ def _offsets(view: MapView, some: IntArray, others: IntArray) -> tuple[Array, Ar
     C = own[:m, None] + own[None, m:] - cross - cross.transpose(0, 1, 3, 2)
     d = view.landmarks[some][:, None] - view.landmarks[others][None]
     xx, xy, yy = C[..., 0, 0], C[..., 0, 1], C[..., 1, 1]
-    x, y = d[..., 0], d[..., 1]
-    determinant = xx * yy - xy * xy
-    squared = np.full((m, n), np.inf)
-    product = yy * x * x - 2 * xy * x * y + xx * y * y
-    np.divide(product, determinant, out=squared, where=determinant > 0)
     largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
-    return squared, np.sqrt(np.maximum(largest, 0.0))
+    return squared_offsets(d, C), np.sqrt(np.maximum(largest, 0.0))
 
 
 def _invariant(view: MapView, slots: IntArray) -> Array:
@@ -331,7 +330,7 @@ def _invariant(view: MapView, slots: IntArray) -> Array:
 
 def _part(view: MapView, slots: IntArray) -> MapView:
     """Return a view of some landmarks only."""
-    columns = np.concatenate([[0, 1, 2], (3 + 2 * slots[:, None] + [0, 1]).ravel()])
-    ids: Sequence[int] = [view.ids[slot] for slot in slots.tolist()]
+    columns = np.append([0, 1, 2], 3 + 2 * slots[:, None] + [0, 1])
+    ids = [view.ids[slot] for slot in slots.tolist()]
     P = view.covariance[np.ix_(columns, columns)]
     return MapView(view.mean[columns], P, ids, view.mapped)
