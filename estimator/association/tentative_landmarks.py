@@ -21,10 +21,9 @@ the share of the readings that match no mapped landmark and proved to be of a ne
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
@@ -33,8 +32,6 @@ from ..models.bearing_range import predict_measurement, wrap_angle
 from ..models.rigid_motion import as_covariance, rotation
 from ..support import saved_states
 from .scan_assignments import Noise, located
-
-Masks = NDArray[np.uint64]
 
 #: Cells over the bearings, and over the ranges up to the longest reading.
 SECTORS, RINGS = 16, 8
@@ -68,7 +65,7 @@ class TentativeLandmarks(NamedTuple):
     #: C, shape (t, 2, 2) [m²].
     covariances: Array = np.empty((0, 2, 2))
     #: One bit per scan, the latest scan lowest: whether the landmark was seen, (t,).
-    seen: Masks = np.empty(0, np.uint64)
+    seen: IntArray = np.empty(0, np.int64)
     #: Unique number of each, shape (t,).
     labels: IntArray = np.empty(0, np.int64)
     #: ln o of each, shape (t,).
@@ -95,8 +92,7 @@ class TentativeLandmarks(NamedTuple):
         """Begin a scan: drop sightings ``scans`` old, then landmarks without any."""
         if not len(self.seen):
             return self
-        window = np.uint64((1 << scans) - 1)
-        seen = (self.seen << np.uint64(1)) & window
+        seen = (self.seen << 1) & ((1 << scans) - 1)
         return self._replace(seen=seen).chosen(seen > 0)
 
     def view(self) -> MapView:
@@ -110,7 +106,7 @@ class TentativeLandmarks(NamedTuple):
 
     def with_misses(self, chance: Array) -> "TentativeLandmarks":
         """Lower the odds of those that this scan misses; chance (t,) is 1 − P_D."""
-        missed = self.seen & np.uint64(1) == 0
+        missed = self.seen & 1 == 0
         return self._replace(odds=self.odds + np.where(missed, np.log(chance), 0.0))
 
     def with_sighting(
@@ -129,7 +125,7 @@ class TentativeLandmarks(NamedTuple):
         after = TentativeLandmarks._make(part.copy() for part in self)
         after.places[which] += gain @ nu
         after.covariances[which] = as_covariance(C - gain @ H @ C)
-        after.seen[which] |= np.uint64(1)
+        after.seen[which] |= 1
         after.odds[which] -= unlikelihood / 2 + np.log(2 * np.pi * density)
         return after
 
@@ -142,7 +138,7 @@ class TentativeLandmarks(NamedTuple):
         share = min(max(share, LEAST_SHARE), 0.5)
         places, _, spread = located(np.zeros(3), readings, noise)
         odds = np.full(len(readings), np.log(share / (1 - share)))
-        new = places, spread, np.ones(len(readings), np.uint64), labels, odds
+        new = places, spread, np.ones(len(readings), np.int64), labels, odds
         return TentativeLandmarks(*map(np.concatenate, zip(self, new, strict=True)))
 
     def chosen(self, which: BoolArray) -> "TentativeLandmarks":
@@ -279,22 +275,11 @@ def _count_readings(
     return farthest, known
 
 
-def _masks(name: str, value: Any, shape: tuple[int, ...]) -> Masks:
-    """Return a copy of masks (t,), or refuse them."""
-    seen = np.array(value)
-    if seen.shape != shape or seen.dtype != np.uint64:
-        raise ValueError(
-            f"state[{name!r}] must be {shape[0]} unsigned integers, got "
-            f"{seen.dtype} with shape {seen.shape}"
-        )
-    return seen
-
-
 #: What a saved state holds about them, in the order of the fields.
 TENTATIVE: saved_states.Table = {
     "places": (saved_states.NUMBERS, "t", 2),
     "covariances": (saved_states.NUMBERS, "t", 2, 2),
-    "seen": (saved_states.Kind(np.uint64, _masks), "t"),
+    "seen": (saved_states.COUNTS._replace(dtype=np.uint64), "t"),
     "labels": (saved_states.WHOLE, "t"),
     "odds": (saved_states.NUMBERS, "t"),
 }
