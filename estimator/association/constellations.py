@@ -230,15 +230,6 @@ class Match(NamedTuple):
     older: IntArray
 
 
-class Misfit(NamedTuple):
-    """χ² of a match, with the heading free."""
-
-    #: Of 2k − 3 degrees of freedom.
-    shape: float
-    #: Of 2 degrees of freedom.
-    displacement: float
-
-
 def turn_between(places: TwoPlaces, match: Match) -> float:
     """Return φ, by which the matched local landmarks have to be turned [rad]."""
     a, b = _matched(places, match)
@@ -267,8 +258,8 @@ def is_plausible(places: TwoPlaces, match: Match) -> bool:
     return bool(np.all(misfit(places, match) <= chdtri(freedom, TAIL)))
 
 
-def misfit(places: TwoPlaces, match: Match) -> Misfit:
-    """Return how far shape and displacement of a match are from what is expected."""
+def misfit(places: TwoPlaces, match: Match) -> tuple[float, float]:
+    """Return χ² of shape and displacement of a match, of 2k − 3 and 2 degrees."""
     r, S = _offsets(places, match, turn_between(places, match))
     b = places.older[match.older]
     turned = ((b - b.mean(axis=0))[:, ::-1] * (-1.0, 1.0)).reshape(-1, 1)  # J b
@@ -276,10 +267,10 @@ def misfit(places: TwoPlaces, match: Match) -> Misfit:
     try:
         L = np.linalg.cholesky(S)
     except np.linalg.LinAlgError:
-        return Misfit(np.inf, np.inf)
+        return np.inf, np.inf
     r, turned, shifted = (np.linalg.solve(L, x) for x in (r, turned, shifted))
     shape = _unexplained(r, np.hstack([turned, shifted]))
-    return Misfit(shape, _unexplained(r, turned) - shape)
+    return shape, _unexplained(r, turned) - shape
 
 
 def extended(places: TwoPlaces, match: Match) -> Match:

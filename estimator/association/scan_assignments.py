@@ -90,9 +90,8 @@ def assign_scan(
     if policy.association == "nearest":
         fit = innovation_distances(view, readings, noise, policy.new_gate)
         explained = np.flatnonzero(np.isfinite(fit.squared).any(axis=0))
-        within = {"match": policy.match_gate, "new": policy.new_gate}
-        slots = nearest_neighbours(fit, **within, ambiguity=policy.ambiguity)
-        return Assignments([Assignment(0.0, slots)], explained)
+        ranked = [Assignment(0.0, nearest_neighbours(fit, policy))]
+        return Assignments(ranked, explained)
     pairs_first, count = policy.association == "compatibility", len(readings)
     missing = np.zeros(count) if pairs_first else missing_costs(density)
     if most is None:
@@ -473,9 +472,7 @@ def _compare(
                 unlikelihood[k, j] = d + np.log(determinant)
 
 
-def nearest_neighbours(
-    fit: Distances, *, match: float, new: float, ambiguity: float = 0.0
-) -> IntArray:
+def nearest_neighbours(fit: Distances, policy: AssociationPolicy) -> IntArray:
     """Give each reading at most one landmark, and each landmark at most one reading.
 
     A reading belongs to the landmark under which it is most likely, among those whose
@@ -485,13 +482,11 @@ def nearest_neighbours(
     ----------
     fit : Distances
         Of m readings and n landmarks.
-    match : float
-        The gate: largest νᵀ S⁻¹ ν of a pair, χ² of 2 degrees of freedom.
-    new : float
-        A reading farther than this from every landmark belongs to none of them.
-    ambiguity : float
-        If −2 ln of the likelihood of the second-best landmark within the gate is larger
-        by no more than this, the reading is left out.
+    policy : AssociationPolicy
+        Its ``match_gate`` is the gate.  A reading farther than ``new_gate`` from every
+        landmark belongs to none of them.  If −2 ln of the likelihood of the second-best
+        landmark within the gate is larger by no more than ``ambiguity``, the reading is
+        left out.
 
     Returns
     -------
@@ -501,22 +496,23 @@ def nearest_neighbours(
     Examples
     --------
     >>> d = np.array([[1.0, np.inf], [4.0, np.inf], [np.inf, 12.0], [np.inf, np.inf]])
-    >>> nearest_neighbours(Distances(d, d), match=9.21, new=25.0).tolist()
+    >>> nearest_neighbours(Distances(d, d), AssociationPolicy(ambiguity=0)).tolist()
     [0, -2, -2, -1]
     """
     rows, landmarks = fit.squared.shape
     chosen = np.full(rows, NEW, dtype=np.int64)
     if not fit.squared.size:
         return chosen
-    scores = np.where(fit.squared <= match, fit.unlikelihood, np.inf)
-    chosen[fit.squared.min(axis=1) <= new] = AMBIGUOUS
+    scores = np.where(fit.squared <= policy.match_gate, fit.unlikelihood, np.inf)
+    chosen[fit.squared.min(axis=1) <= policy.new_gate] = AMBIGUOUS
     best = scores.argmin(axis=1)
     every = np.arange(rows)
     score = scores[every, best]
     is_clear = np.isfinite(score) & (scores.argmin(axis=0)[best] == every)
-    if landmarks > 1 and ambiguity > 0:
+    if landmarks > 1 and policy.ambiguity > 0:
         others = scores.copy()
         others[every, best] = np.inf
-        is_clear &= others.min(axis=1) - np.where(is_clear, score, 0.0) > ambiguity
+        gap = others.min(axis=1) - np.where(is_clear, score, 0.0)
+        is_clear &= gap > policy.ambiguity
     chosen[is_clear] = best[is_clear]
     return chosen

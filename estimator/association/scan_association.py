@@ -58,12 +58,11 @@ class ScanAssociation:
     def __init__(
         self, policy: AssociationPolicy, candidates: Candidates, readings: Array
     ) -> None:
-        self._policy = policy
+        self._policy, self._readings = policy, readings
         self._tentative = candidates.tentative.next_scan(policy.confirm[1])
         self._waiting = dict(candidates.waiting)
         self._next_id, self.scan = candidates.next_id, candidates.scan
-        self._density, self._readings = candidates.density, readings
-        self._detections = candidates.detections
+        self._density, self._detections = candidates.density, candidates.detections
         #: For each row the landmark that the filter associates it with, if any.
         self.row_ids: list[int | None] = [None] * len(readings)
         #: Labels of landmarks that were tentative before this scan.

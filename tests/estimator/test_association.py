@@ -10,6 +10,7 @@ from slamgym.estimator import make_estimator
 from slamgym.estimator.association.scan_assignments import (
     AMBIGUOUS,
     NEW,
+    AssociationPolicy,
     Distances,
     Noise,
     innovation_distances,
@@ -131,7 +132,7 @@ FAR = np.inf
 )
 def test_every_reading_gets_one_landmark_or_none(squared, log_det, ambiguity, expected):
     fit = fit_of(squared, log_det)
-    slots = nearest_neighbours(fit, match=9.21, new=25.0, ambiguity=ambiguity)
+    slots = nearest_neighbours(fit, AssociationPolicy(ambiguity=ambiguity))
     assert slots.tolist() == expected
 
 
