@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array
+from ...arrays import Array, BoolArray
 from ..association.scan_assignments import SAME
 from ..association.scan_association import ScanAssociation
 from ..filters.conditioning import PoseReading
@@ -30,7 +30,6 @@ from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo, attributes, to_the_end, undo_all, undone_on_error
 from .loop_closing import AROUND
 from .managed_slam import ManagedSlam
-from .map_editor import is_near
 from .policy import LandmarkPolicy, as_policy
 
 #: Cost, the hypothesis that it continues, and what completes the association.
@@ -86,33 +85,48 @@ def distinct(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
         return [*hypotheses]
     views = [h.slam.map_view() for h in hypotheses]
     variances = np.maximum([v.covariance.diagonal()[:3] for v in views], 0.0) + NIL
-    poses = np.hstack([[v.mean[:3] for v in views], variances]).tolist()
+    overlap = _overlap(np.array([v.mean[:3] for v in views]), variances)
     labels = [h.slam.candidates.tentative.labels.tobytes() for h in hypotheses]
     chosen: list[int] = []
     for k, view in enumerate(views):
         if len(chosen) == most:
             break
-        overlapping = sum(_overlap(poses[n], poses[k]) for n in chosen)
         alike = (views[n] for n in chosen if labels[n] == labels[k])
-        if overlapping < PER_BASIN and not any(is_near(v, view, SAME) for v in alike):
+        is_free = overlap[k, chosen].sum() < PER_BASIN
+        if is_free and not any(is_near(v, view) for v in alike):
             chosen.append(k)
     return [hypotheses[k] for k in chosen]
 
 
-def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
-    """Return whether two poses overlap, each three means, then three variances.
+def _overlap(means: Array, variances: Array) -> BoolArray:
+    """Return which of n poses overlap, shape (n, n), by their means and variances.
 
     The Bhattacharyya distance of two Gaussians is, in one coordinate, ::
 
         (μ₂ − μ₁)² / 4 (σ₁² + σ₂²) + ½ ln ((σ₁² + σ₂²) / 2 σ₁σ₂)
     """
-    for k in range(3):
-        gap, variance, v = other[k] - one[k], one[k + 3], other[k + 3]
-        apart = (wrap_angle(gap) if k == 2 else gap) ** 2 / (4 * (variance + v))
-        apart += log((variance + v) ** 2 / (4 * variance * v)) / 4
-        if not apart <= OVERLAP:
-            return False
-    return True
+    gaps, sums = means[:, None] - means, variances[:, None] + variances
+    gaps[..., 2] = wrap_angle(gaps[..., 2])
+    apart = gaps**2 / (4 * sums)
+    apart += np.log(sums**2 / (4 * variances[:, None] * variances)) / 4
+    return np.asarray((apart <= OVERLAP).all(axis=-1))
+
+
+def is_near(one: MapView, other: MapView) -> bool:
+    """Return whether two maps of the same landmarks have nearly the same belief.
+
+    In every coordinate with means μ₁, μ₂ and deviations σ₁, σ₂, the second belief must
+    not be far off the first one and not be much less certain::
+
+        (μ₂ − μ₁)² + σ₂² − σ₁² ≤ (SAME σ₁)²
+    """
+    if one.ids != other.ids:
+        return False
+    size = 3 + 2 * len(one.ids)
+    gap = other.mean[:size] - one.mean[:size]
+    gap[2] = wrap_angle(float(gap[2]))
+    variances, others = (m.covariance.diagonal()[:size] for m in (one, other))
+    return bool((gap**2 + others <= (1 + SAME**2) * variances).all())
 
 
 def cost_of(report: UpdateReport) -> float:
@@ -269,9 +283,8 @@ class HypothesisSlam:
                 known = [*known, *self._at_places(readings)]
                 options = self._options(known, readings)
             else:
-                given = argument_checks.identities(landmark_ids, len(readings))
                 options = [
-                    (h.cost, k, partial(h.slam.as_given, readings, given))
+                    (h.cost, k, partial(h.slam.as_given, readings, landmark_ids))
                     for k, h in enumerate(known)
                 ]
             return self._take(readings, options, [h.slam for h in known])

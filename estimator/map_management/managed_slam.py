@@ -50,7 +50,7 @@ from ..support.undo import Undo, attributes, undo_all, undone_on_error
 from .loop_closing import AROUND, places_of_scan
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy
-from .pruning import MapPruner
+from .pruning import LandmarkRecords, MapPruner
 from .recent_scans import FedScans, RecentScans
 
 
@@ -168,7 +168,7 @@ class ManagedSlam:
         with undone_on_error(self.bookmark()):
             self._filter.reset(pose, pose_std)
             self._editor.expire()
-            self._pruner.forget()
+            self._pruner.records = LandmarkRecords()
             self.candidates = Candidates()
             self._recent.forget()
 
@@ -224,8 +224,7 @@ class ManagedSlam:
         def associate() -> ScanAssociation:
             if landmark_ids is None:
                 return self.alternatives(readings)[0][1]()
-            given = argument_checks.identities(landmark_ids, len(readings))
-            return self.as_given(readings, given)
+            return self.as_given(readings, landmark_ids)
 
         return self.take(readings, associate)
 
@@ -253,11 +252,12 @@ class ManagedSlam:
         undo = attributes(self, self._recent)
         return advance(self._filter, step, follow, undo, lambda: undo)
 
-    def as_given(self, readings: Array, ids: Sequence[int]) -> ScanAssociation:
+    def as_given(self, readings: Array, ids: LandmarkIds) -> ScanAssociation:
         """Associate readings (m, 2) by their identities, which must differ."""
+        given = argument_checks.identities(ids, len(readings))
         plan = ScanAssociation(self._policy, self.candidates, readings)
         view = self._pruner.view_around(readings)
-        plan.translate(ids, view.mapped, self._pruner.records.aliases)
+        plan.translate(given, view.mapped, self._pruner.records.aliases)
         return plan
 
     def alternatives(self, readings: Array, ceiling: float = np.inf) -> list[Option]:
@@ -342,20 +342,16 @@ class ManagedSlam:
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise mapped landmarks by hand, shape (n,); all else stays."""
-        ids = argument_checks.mapped_identities(landmark_ids, self._slots)
+        ids = argument_checks.mapped_identities(landmark_ids, {*self.landmark_ids})
         with undone_on_error(self.bookmark()):
             self._recent.note_edits(self._pruner.remove(ids), ())
 
     def merge(self, kept: int, gone: int) -> None:
         """Merge two mapped landmarks by hand; both identities then name the first."""
-        argument_checks.two_landmarks(kept, gone, self._slots)
+        argument_checks.two_landmarks(kept, gone, self.landmark_ids)
         with undone_on_error(self.bookmark()):
             self._pruner.join([(kept, gone)])
             self._recent.note_edits((), [(kept, gone)])
-
-    @property
-    def _slots(self) -> dict[int, int]:
-        return {i: slot for slot, i in enumerate(self.landmark_ids)}
 
     def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
         """Return the present belief, of the whole map or of pose and some landmarks."""

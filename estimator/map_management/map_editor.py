@@ -36,7 +36,6 @@ from ..interface import (
     restore,
     view_map,
 )
-from ..models.bearing_range import wrap_angle
 from ..support.undo import Undo
 
 #: What the saved state of a filter must hold so that its belief can be changed.
@@ -167,20 +166,3 @@ class MapEditor:
             state[key] = without_landmarks(np.asarray(state[key]), slots)
         state["landmark_ids"] = np.delete(np.asarray(state["landmark_ids"]), slots)
         self._slam.load_state_dict(state)
-
-
-def is_near(one: MapView, other: MapView, tolerance: float) -> bool:
-    """Return whether two maps of the same landmarks have nearly the same belief.
-
-    In every coordinate with means μ₁, μ₂ and deviations σ₁, σ₂, the second belief must
-    not be far off the first one and not be much less certain::
-
-        (μ₂ − μ₁)² + σ₂² − σ₁² ≤ (tolerance σ₁)²
-    """
-    if one.ids != other.ids:
-        return False
-    size = 3 + 2 * len(one.ids)
-    gap = other.mean[:size] - one.mean[:size]
-    gap[2] = wrap_angle(float(gap[2]))
-    variances, others = (m.covariance.diagonal()[:size] for m in (one, other))
-    return bool((gap**2 + others <= (1 + tolerance**2) * variances).all())

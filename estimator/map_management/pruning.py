@@ -45,10 +45,6 @@ class MapPruner:
         self._noise = *np.maximum(noise[:3], 1e-12).tolist(), noise.bearing_std_metres
         self.records = LandmarkRecords()
 
-    def forget(self) -> None:
-        """Start a new run."""
-        self.records = LandmarkRecords()
-
     def view_around(self, readings: Array) -> MapView:
         """Return a view of the landmarks that may matter for a scan (m, 2)."""
         is_local = self._editor.is_local
@@ -178,10 +174,8 @@ class MapPruner:
         if _ordered(view.ids[kept], view.ids[gone]) in self.records.apart:
             return False
         between = separation(view.mean, view.covariance, kept, gone)
-        return (
-            between.largest_std <= self._policy.worst_separation_std
-            and between.squared <= self._policy.merge_gate
-        )
+        is_accurate = between.largest_std <= self._policy.worst_separation_std
+        return is_accurate and between.squared <= self._policy.merge_gate
 
     def _close_loops(self, added: Collection[int], readings: Array) -> Pairs:
         """Merge landmarks around the robot with an older part of the map.
@@ -245,15 +239,12 @@ class LandmarkRecords(Restorable):
     [7, 9]
     """
 
-    replaced = (
-        *("ids", "_slots", "misses", "information"),
-        *("apart", "aliases", "doubtful"),
-    )
+    replaced = ("_slots", "misses", "information", "apart", "aliases", "doubtful")
 
     def __init__(self) -> None:
-        self.ids: tuple[int, ...] = ()
         self.misses: IntArray = np.zeros(0, dtype=np.int64)
         self.information: Array = np.zeros((0, 3))
+        #: The landmarks, each with its place, in the order of the map.
         self._slots: dict[int, int] = {}
         #: Landmarks known to differ.
         self.apart: set[tuple[int, int]] = set()
@@ -262,9 +253,14 @@ class LandmarkRecords(Restorable):
         #: Landmarks that may be older, lost ones.
         self.doubtful: set[int] = set()
 
+    @property
+    def ids(self) -> list[int]:
+        """The landmarks, in the order of the map."""
+        return [*self._slots]
+
     def follow(self, ids: Sequence[int]) -> None:
         """Adopt the order of the map: keep records of its landmarks, start new ones."""
-        if self.ids == tuple(ids):
+        if self.ids == [*ids]:
             return
         rows = np.array([self._slots.get(i, -1) for i in ids], dtype=np.int64)
         fresh = rows < 0
@@ -273,9 +269,9 @@ class LandmarkRecords(Restorable):
             after = np.zeros((len(rows), *before.shape[1:]), dtype=before.dtype)
             after[~fresh] = before[rows[~fresh]]
             setattr(self, name, after)
-        self._slots = {i: k for k, i in enumerate(ids)}
-        self.apart = {pair for pair in self.apart if self._slots.keys() >= {*pair}}
-        self.ids = tuple(ids)  # last: an interrupted call begins anew
+        slots = {i: k for k, i in enumerate(ids)}
+        self.apart = {pair for pair in self.apart if slots.keys() >= {*pair}}
+        self._slots = slots  # last: an interrupted call begins anew
 
     def note_sightings(
         self,
@@ -335,15 +331,16 @@ class LandmarkRecords(Restorable):
         """Return copies of all, as arrays."""
         tables = {"apart": sorted(self.apart), "aliases": list(self.aliases.items())}
         found = vars(self) | tables | {"doubtful": sorted(self.doubtful)}
+        found["ids"] = self.ids
         return saved_states.write(found, RECORDS)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned; refuse what does not fit."""
         saved = saved_states.read(state, RECORDS, "landmarks.")
-        self.follow(saved["ids"])
+        self.follow(saved.pop("ids"))
         apart, aliases = (saved[name].tolist() for name in ("apart", "aliases"))
         sets = {"apart": {(i, j) for i, j in apart}, "doubtful": {*saved["doubtful"]}}
-        vars(self).update(saved | sets, ids=self.ids, aliases=dict(aliases))
+        vars(self).update(saved | sets, aliases=dict(aliases))
 
 
 #: What a saved state holds about the landmarks of a map.

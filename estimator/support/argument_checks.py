@@ -7,7 +7,7 @@ that does not fit into memory is refused before it is filled.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from math import inf, isfinite, prod, sqrt
 from pathlib import Path
 from typing import Any
@@ -187,7 +187,7 @@ def asked_identities(ids: LandmarkIds | None, mapped: Mapping[int, int]) -> list
     return mapped_identities(ids, mapped)
 
 
-def mapped_identities(asked: LandmarkIds, mapped: Mapping[int, int]) -> list[int]:
+def mapped_identities(asked: LandmarkIds, mapped: Collection[int]) -> list[int]:
     """Return ids of mapped landmarks, without repetition."""
     try:
         count = np.size(asked)
@@ -329,7 +329,7 @@ def _is_finite(value: float) -> bool:
 _WHOLE = (int, np.integer)
 
 
-def two_landmarks(kept: int, gone: int, mapped: Mapping[int, int]) -> list[int]:
+def two_landmarks(kept: int, gone: int, mapped: Collection[int]) -> list[int]:
     """Return the ids of two different landmarks of a map."""
     if not (isinstance(kept, _WHOLE) and isinstance(gone, _WHOLE)):
         raise ValueError(f"kept and gone must be integers, got {kept!r} and {gone!r}")

@@ -16,9 +16,9 @@ from slamgym.estimator.map_management.hypotheses import (
     Hypothesis,
     HypothesisSlam,
     distinct,
+    is_near,
 )
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
-from slamgym.estimator.map_management.map_editor import is_near
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.evaluation import score_association
 from slamgym.sim_configs import action_sequence, load_scenario
@@ -447,11 +447,11 @@ def test_a_belief_that_is_much_less_certain_is_another_one():
     unsure = view([1.0, 2.0, 3.1], [0.1, 0.3, 0.05])
     turned = view([1.0, 2.0, -3.14], [0.1, 0.1, 0.05])
     shifted = view([1.0, 2.11, 3.1], [0.1, 0.1, 0.05])
-    assert is_near(sure, sure, 1.0)
-    assert is_near(sure, turned, 1.0)  # by .04 rad, across π
-    assert is_near(unsure, sure, 1.0)
-    assert not is_near(sure, unsure, 1.0)
-    assert not is_near(sure, shifted, 1.0)
+    assert is_near(sure, sure)
+    assert is_near(sure, turned)  # by .04 rad, across π
+    assert is_near(unsure, sure)
+    assert not is_near(sure, unsure)
+    assert not is_near(sure, shifted)
 
 
 def test_a_loop_is_not_closed_for_good_by_one_reading_of_clutter():
