@@ -94,11 +94,10 @@ class RecentScans(Restorable):
             return
         self.scans = [*self.scans]
         noted: tuple[list[Any], ...] = self.decisions, self.scans
-        for scans in noted:
-            for last in scans[-1:]:
-                scans[-1] = last._replace(
-                    removed=(*last.removed, *removed), merged=(*last.merged, *merged)
-                )
+        for scans in filter(None, noted):
+            last = scans[-1]
+            edits = {"removed": (*last.removed, *removed)}
+            scans[-1] = last._replace(**edits, merged=(*last.merged, *merged))
 
     def with_scan(self, readings: Array, plan: ScanAssociation) -> FedScans:
         """Return what to feed to the filter: a new scan, and earlier ones to repeat."""
@@ -107,7 +106,8 @@ class RecentScans(Restorable):
         scan = RecentScan(plan.scan, self.motions, readings.copy(), *decided)
         if not self._window:
             return FedScans(plan, [scan], None)
-        if scan.begins:
+        # Where a tentative landmark is seen for the first time:
+        if max(scan.labels, default=NO_LABEL) >= scan.number << LABEL_BITS:
             scan = scan._replace(before=self._slam.state_dict())
         scans = [*self.scans, scan][-self._window - 1 :]
         first = _relabel(scans, plan.confirmed) if plan.confirmed else None
@@ -248,10 +248,8 @@ def _drop_contradicted(
             continue  # of a filter that reports no innovations
         for landmark_id in confirmed.intersection(report.associated_ids):
             earlier = scans[first : first + k]
-            if (
-                any(landmark_id in scan.row_ids for scan in earlier)
-                and report.squared_given_others(landmark_id) > gate
-            ):
+            is_seen = any(landmark_id in scan.row_ids for scan in earlier)
+            if is_seen and report.squared_given_others(landmark_id) > gate:
                 scans[first : first + k] = [s.without(landmark_id) for s in earlier]
                 return True
     return False
@@ -308,11 +306,6 @@ class RecentScan(NamedTuple):
     removed: tuple[int, ...] = ()
     #: Landmarks merged after it: (kept, gone).
     merged: tuple[tuple[int, int], ...] = ()
-
-    @property
-    def begins(self) -> bool:
-        """Whether a tentative landmark is seen here for the first time."""
-        return max(self.labels, default=NO_LABEL) >= self.number << LABEL_BITS
 
     def feed(self, slam: SlamEstimator) -> UpdateReport:
         """Update a filter with the rows that it uses."""
