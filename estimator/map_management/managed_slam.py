@@ -114,11 +114,9 @@ class ManagedSlam:
             **options,
         )
         self._sensor = Sensor.checked(measurement_std, options)
-        self._motion_noise = MotionNoise.checked(
-            motion_std,
-            options.get("noise_at_rest", True),
-            options.get("motion", UNICYCLE),
-        )
+        motion = options.get("motion", UNICYCLE)
+        at_rest = options.get("noise_at_rest", True)
+        self._motion_noise = MotionNoise.checked(motion_std, at_rest, motion)
         merging = self._policy.merge_within is not None
         self._editor = MapEditor(self._filter, merging=merging)
         self._pruner = MapPruner(self._policy, self._editor, self._sensor.noise)

@@ -158,9 +158,8 @@ class RecentScans(Restorable):
 
     def state_dict(self) -> dict[str, Any]:
         """Return all as arrays."""
-        state = saved_states.write(
-            {"motions": self.motions, "count": len(self.scans)}, WINDOW
-        )
+        window = {"motions": self.motions, "count": len(self.scans)}
+        state = saved_states.write(window, WINDOW)
         for k, scan in enumerate(self.scans):
             state |= with_prefix(str(k), scan.state_dict())
         return state
@@ -171,9 +170,8 @@ class RecentScans(Restorable):
         n, most = int(saved["count"]), self._window + 1
         if n > most:
             raise ValueError(f"state['recent.count'] must be at most {most}, got {n}")
-        self.scans = [
-            RecentScan.from_state_dict(without_prefix(state, str(k))) for k in range(n)
-        ]
+        parts = [without_prefix(state, str(k)) for k in range(n)]
+        self.scans = [*map(RecentScan.from_state_dict, parts)]
         self.motions = _as_tuples(saved["motions"].tolist())
         self.decisions = []
 

@@ -15,6 +15,8 @@ from slamgym.estimator.filters.conditioning import observe_relative_pose
 from slamgym.estimator.interface import Belief, MapView
 from slamgym.estimator.map_management.loop_closing import (
     AROUND,
+    _gaps,
+    _offsets,
     _with_readings,
     lost,
     places_of_scan,
@@ -369,6 +371,24 @@ def test_a_reading_extends_the_map_as_a_new_landmark_of_the_filter():
     np.testing.assert_allclose(
         extended.covariance, given.belief().covariance, atol=1e-9
     )
+
+
+def test_a_reading_is_as_far_from_a_landmark_as_it_is_in_a_map_with_both():
+    rng, n = np.random.default_rng(7), len(PLACE)
+    root = rng.normal(size=(3 + 2 * n, 3 + 2 * n)) / 5
+    root[2] /= 5
+    view = MapView(np.append([0.3, 0.2, 0.5], PLACE), root @ root.T, range(n))
+    readings = readings_of(PLACE - (-0.9, 2.1), view.mean[:3])[:5]
+    turn = readings[:, :1] - readings_of(PLACE, view.mean[:3])[:, 0]
+    turned = turn**2 / view.covariance[2, 2]  # and more, of a scan that is turned
+    for noise in (Noise(0.01, 0.03), Noise(0.2, 0.3, 0.05, 0.1)):
+        both = _with_readings(view, readings, noise)
+        expected, _ = _offsets(both, n + np.arange(5), np.arange(n))
+        nearer = expected < turned
+        assert nearer.sum() >= 8
+        gaps = _gaps(view, readings, noise)
+        np.testing.assert_allclose(gaps[nearer], expected[nearer], rtol=1e-9)
+        assert (gaps <= expected * (1 + 1e-9)).all()
 
 
 def test_a_part_of_the_belief_weighs_what_the_prior_holds_of_it():
