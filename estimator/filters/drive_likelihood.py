@@ -289,11 +289,15 @@ def follow_drive(
         size = len(start[0])  # a literal would compile all kernels anew
         for s in range(len(drive.first_motions) - 1):
             for k in range(drive.first_motions[s], drive.first_motions[s + 1]):
-                dx, dy, turn, dt = drive.motions[k]
+                dx, dy, turn = (
+                    drive.motions[k, 0],
+                    drive.motions[k, 1],
+                    drive.motions[k, 2],
+                )
                 moves = noise_at_rest or dx != 0 or dy != 0 or turn != 0
                 for i in range(3):
                     sigma = noises[b, MOTION + i]
-                    variance[i] = sigma * sigma * dt * moves
+                    variance[i] = sigma * sigma * drive.motions[k, 3] * moves
                 predict(
                     belief.mean,
                     belief.covariance,
