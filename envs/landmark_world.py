@@ -15,7 +15,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array, ComplexArray, ImageArray, WordArray
-from ..restorable import Restorable, State
+from ..restorable import Restorable, State, refuse_other_state
 from ..sim_configs import Scenario, load_scenario
 from .bearing_range import BearingRangeSensor, hide_identities
 from .drives import drive_of
@@ -229,6 +229,26 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         """
         self._refuse_before_reset()
         return super().state()
+
+    def restore(self, state: State) -> None:
+        """Return to a state of this world, which stays usable for further calls.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            Before the first episode.
+        ValueError
+            If this is no state of such a world, or that of another scenario.
+        """
+        self._refuse_before_reset()
+        refuse_other_state(self, state, len(self.changing) + len(self.replaced))
+        drawn = state[len(self.changing) + self.replaced.index("_drawn_scenario")]
+        if drawn.name != self.scenario.name:
+            raise ValueError(
+                f"state must be of the world '{self.scenario.name}', "
+                f"got one of '{drawn.name}'"
+            )
+        super().restore(state)
 
     def render(self) -> ImageArray | None:
         """Return a frame in mode "rgb_array", else None."""

@@ -196,6 +196,7 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
 
     def restore(self, state: State) -> None:
         """Return to a state of these worlds, which stays usable for further calls."""
+        self._begun_worlds()
         own = *self._generators(), *self._renderers
         given: Any = state[-1] if isinstance(state, tuple) and state else None
         refuse_other_state(self, given, len(own))

@@ -122,9 +122,28 @@ def test_frames_return_with_their_world():
 
 
 def test_there_is_no_state_before_the_first_episode():
-    for env in (LandmarkWorldEnv(), LandmarkWorldVectorEnv(2), ActiveSlamEnv()):
+    kinds = (LandmarkWorldEnv, LandmarkWorldVectorEnv)
+    for kind in (*kinds, ActiveSlamEnv, ActiveSlamVectorEnv):
         with pytest.raises(gymnasium.error.ResetNeeded):
-            env.state()
+            kind().state()
+        begun = kind()
+        begun.reset(seed=0)
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            kind().restore(begun.state())
+
+
+def test_a_state_of_another_scenario_is_refused_and_changes_nothing():
+    for kind, names in [
+        (LandmarkWorldEnv, ("loop", "corridor")),
+        (ActiveSlamEnv, ("active_easy", "active_medium")),
+    ]:
+        own, other = map(kind, names)
+        own.reset(seed=0)
+        other.reset(seed=0)
+        before = own.state()
+        with pytest.raises(ValueError, match=f"of the world '{names[0]}', got one"):
+            own.restore(other.state())
+        assert same(before, own.state())
 
 
 def test_what_is_no_state_of_these_worlds_is_refused_and_changes_nothing():

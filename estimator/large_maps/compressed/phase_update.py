@@ -26,11 +26,11 @@ e_θ.  Both are linear in q read as a complex number, J = i.  There y is one com
 number for each of the s coordinates, a *virtual landmark* at the origin.  With x_b and
 the rows of S read as complex numbers, the equations above hold unchanged.
 
-Where the heading is badly known, J y e_θ is most of the error e_y of y.  Its product
+Where the heading is poorly known, J y e_θ is most of the error e_y of y.  Its product
 with S̃ is J m_b e_θ, where m_b = S̃ᵀ y is how far the points have moved.  This is often
-far less than the terms of the product, whose rounding would hide the rest of the error.
-The two are therefore kept apart: ỹ = e_y − J y e_θ stands in place of e_y, and m_b is
-one more row of S̃, that of J e_θ.
+far less than the terms of the product, whose rounding errors would then exceed the rest
+of e_y.  The two are therefore kept apart: ỹ = e_y − J y e_θ takes the place of e_y, and
+m_b becomes an additional row of S̃, which belongs to J e_θ.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -79,7 +79,7 @@ class Phase(NamedTuple):
 
     @property
     def loss(self) -> Array:
-        """Ψ, shape (e, e); two rows more in the invariant frame."""
+        """Ψ, shape (e, e), or (e + 2, e + 2) in the invariant frame."""
         heading, loss = np.split(-self.cross(np.arange(2, self.first)), [1])
         if not self.invariant:
             return loss
@@ -122,7 +122,7 @@ class Phase(NamedTuple):
         return np.hstack([solution, coefficients[:, size:]])
 
     def extended(self, strip: Array, moved: Array) -> Array:
-        """Return S or S̃, in the invariant frame with the row m_b."""
+        """Return S or S̃; in the invariant frame, with m_b as an additional row."""
         return np.vstack([strip, moved]) if self.invariant else strip
 
 

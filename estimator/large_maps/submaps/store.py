@@ -148,7 +148,7 @@ class FolderStore:
     def clear(self) -> None:
         """Delete the files of the run."""
         if self.run and self._found_run() == self.run:
-            # Including files newer than a loaded state.
+            # This also deletes files that are newer than a loaded state.
             for path in self.folder.glob("submap_[0-9]*"):
                 if path.suffix in (SUFFIX, PART):
                     path.unlink()
