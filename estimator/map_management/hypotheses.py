@@ -413,7 +413,12 @@ class HypothesisSlam:
     def resume(self, before: tuple[Any, ...]) -> None:
         """Return to a :meth:`snapshot` of a filter with the same settings."""
         kept, self.steps = before
-        self._keep([Hypothesis(cost, self._pool.resumed(own)) for cost, own in kept])
+        slams = self._slams
+        slams += [self._pool.fresh() for _ in kept[len(slams) :]]
+        for (_, own), slam in zip(kept, slams, strict=False):
+            slam.resume(own)
+        costs = [cost for cost, _ in kept]
+        self._keep([*map(Hypothesis, costs, slams)])
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
