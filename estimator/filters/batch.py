@@ -250,6 +250,7 @@ class BatchSlam(Restorable):
         """
         u = argument_checks.as_floats("odometry", odometry)
         steps = u.shape[1] if u.ndim == 3 else 0
+        u = shaped("odometry", u, (self.runs, steps, 2))
         durations = _durations(dt)
         if durations.shape not in ((), (1,), (steps,)):
             raise ValueError(
@@ -258,6 +259,7 @@ class BatchSlam(Restorable):
         durations = np.broadcast_to(durations, (self.runs, steps))
         data = self._checked((self.runs, steps), u, measurements, visible, durations)
         trace = BatchTrace.empty(self.runs, steps)
+        self.failed_at = self.failed_at.copy()  # a caller may hold the former one
         self._drive(data, trace, runs)
         trace.poses[..., 2] = wrap_angle(trace.poses[..., 2])
         return trace

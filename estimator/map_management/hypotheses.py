@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import Array, BoolArray
+from ...arrays import Array
 from ..association.scan_assignments import SAME
 from ..association.scan_association import ScanAssociation
 from ..filters.conditioning import PoseReading
@@ -85,31 +85,33 @@ def distinct(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
         return [*hypotheses]
     views = [h.slam.map_view() for h in hypotheses]
     variances = np.maximum([v.covariance.diagonal()[:3] for v in views], 0.0) + NIL
-    overlap = _overlap(np.array([v.mean[:3] for v in views]), variances)
+    poses = np.hstack([[v.mean[:3] for v in views], variances]).tolist()
     labels = [h.slam.candidates.tentative.labels.tobytes() for h in hypotheses]
     chosen: list[int] = []
     for k, view in enumerate(views):
         if len(chosen) == most:
             break
+        overlapping = sum(_overlap(poses[n], poses[k]) for n in chosen)
         alike = (views[n] for n in chosen if labels[n] == labels[k])
-        is_free = overlap[k, chosen].sum() < PER_BASIN
-        if is_free and not any(is_near(v, view) for v in alike):
+        if overlapping < PER_BASIN and not any(is_near(v, view) for v in alike):
             chosen.append(k)
     return [hypotheses[k] for k in chosen]
 
 
-def _overlap(means: Array, variances: Array) -> BoolArray:
-    """Return which of n poses overlap, shape (n, n), by their means and variances.
+def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
+    """Return whether two poses overlap, each three means, then three variances.
 
     The Bhattacharyya distance of two Gaussians is, in one coordinate, ::
 
         (μ₂ − μ₁)² / 4 (σ₁² + σ₂²) + ½ ln ((σ₁² + σ₂²) / 2 σ₁σ₂)
     """
-    gaps, sums = means[:, None] - means, variances[:, None] + variances
-    gaps[..., 2] = wrap_angle(gaps[..., 2])
-    apart = gaps**2 / (4 * sums)
-    apart += np.log(sums**2 / (4 * variances[:, None] * variances)) / 4
-    return np.asarray((apart <= OVERLAP).all(axis=-1))
+    for k in range(3):
+        gap, variance, v = other[k] - one[k], one[k + 3], other[k + 3]
+        apart = (wrap_angle(gap) if k == 2 else gap) ** 2 / (4 * (variance + v))
+        apart += log((variance + v) ** 2 / (4 * variance * v)) / 4
+        if not apart <= OVERLAP:
+            return False
+    return True
 
 
 def is_near(one: MapView, other: MapView) -> bool:

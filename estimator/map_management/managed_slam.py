@@ -169,6 +169,7 @@ class ManagedSlam:
             self._pruner.records = LandmarkRecords()
             self.candidates = Candidates()
             self._recent.forget()
+            self._report = UpdateReport()
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], dt multiplies its noise variance."""
@@ -388,7 +389,7 @@ class ManagedSlam:
             self._recent.load_state_dict(without_prefix(state, "recent"))
             self._filter.load_state_dict(without_prefix(state, "filter"))
             self._editor.expire()
-            self.candidates = candidates
+            self.candidates, self._report = candidates, UpdateReport()
 
     def forget_scans(self) -> None:
         """Free the memory of the last scans, of a filter that nobody uses."""

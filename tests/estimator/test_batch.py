@@ -148,8 +148,9 @@ def test_arrays_of_a_wrong_shape_are_refused_by_name(data, index, message):
     batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
     arrays = list(data)
     arrays[index] = arrays[index][0]
-    with pytest.raises(ValueError, match=message):
-        batch.run(*arrays)
+    for dt in (1.0, np.ones(40)):
+        with pytest.raises(ValueError, match=message):
+            batch.run(*arrays, dt)
 
 
 def test_a_run_that_has_stopped_stays_so(data):
@@ -157,7 +158,9 @@ def test_a_run_that_has_stopped_stays_so(data):
     odometry[1, 3] = np.nan
     settings = {"runs": RUNS, "landmarks": LANDMARKS, **NOISE}
     whole, pieces = make_batch("ekf", **settings), make_batch("ekf", **settings)
+    held = whole.failed_at
     at_once = whole.run(odometry, measurements, visible)
+    assert (held == -1).all()  # it is not changed in place
     parts = [
         pieces.run(*(array[:, steps] for array in (odometry, measurements, visible)))
         for steps in (slice(0, 10), slice(10, STEPS))

@@ -566,3 +566,19 @@ def test_a_reading_too_far_from_a_landmark_for_a_pair_is_new(method, aside, new_
     for _ in range(20):
         slam.update([(0.0, 5.0)])
     assert slam.update([(aside, 5.0)]).tentative_rows == new_rows
+
+
+def test_a_loaded_state_and_a_new_run_have_no_report():
+    """The filters that load it are reused, and have reports of their own."""
+    scans = drive(slippery_world(), steps=6)
+    slam = make(slippery_world(), association="hypotheses")
+    follow(slam, scans)
+    assert slam.report().row_ids
+    state = slam.state_dict()
+    for change in (
+        lambda: slam.load_state_dict(state),
+        lambda: slam.reset((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    ):
+        slam.update(scans[-1][1])
+        change()
+        assert slam.report() == UpdateReport()
