@@ -281,8 +281,8 @@ def associate(
     is of interest.  Readings closer than the sensor's least range have no usable
     bearing: they are ambiguous.
     """
-    usable, noise = readings[:, 1] >= sensor.min_range, sensor.noise
-    used = readings[usable]
+    usable = [distance >= sensor.min_range for distance in readings[:, 1].tolist()]
+    used, noise = readings if all(usable) else readings[usable], sensor.noise
     density = _unexplained_density(policy, candidates, used, noise)
     found = assign_scan(policy, view, used, noise, density, ceiling=ceiling)
 
@@ -290,9 +290,10 @@ def associate(
         counted = candidates._replace(detections=detections)
         association = ScanAssociation(policy, counted, readings)
         association.explained = {view.ids[slot] for slot in found.explained.tolist()}
-        every = np.full(len(readings), AMBIGUOUS)
-        every[usable] = slots
-        association.assign(every, view, noise)
+        if used is not readings:
+            of_used, slots = slots, np.full(len(readings), AMBIGUOUS)
+            slots[usable] = of_used
+        association.assign(slots, view, noise)
         return association
 
     options = []

@@ -285,8 +285,9 @@ class HypothesisSlam:
                 known = [*known, *self._at_places(readings)]
                 options = self._options(known, readings)
             else:
+                given = argument_checks.identities(landmark_ids, len(readings))
                 options = [
-                    (h.cost, k, partial(h.slam.as_given, readings, landmark_ids))
+                    (h.cost, k, partial(h.slam.as_given, readings, given))
                     for k, h in enumerate(known)
                 ]
             return self._take(readings, options, [h.slam for h in known])

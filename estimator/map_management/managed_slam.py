@@ -223,7 +223,8 @@ class ManagedSlam:
         def associate() -> ScanAssociation:
             if landmark_ids is None:
                 return self.alternatives(readings)[0][1]()
-            return self.as_given(readings, landmark_ids)
+            given = argument_checks.identities(landmark_ids, len(readings))
+            return self.as_given(readings, given)
 
         return self.take(readings, associate)
 
@@ -251,12 +252,11 @@ class ManagedSlam:
         undo = attributes(self, self._recent)
         return advance(self._filter, step, follow, undo, lambda: undo)
 
-    def as_given(self, readings: Array, ids: LandmarkIds) -> ScanAssociation:
+    def as_given(self, readings: Array, ids: Sequence[int]) -> ScanAssociation:
         """Associate readings (m, 2) by their identities, which must differ."""
-        given = argument_checks.identities(ids, len(readings))
         plan = ScanAssociation(self._policy, self.candidates, readings)
         view = self._pruner.view_around(readings)
-        plan.translate(given, view.mapped, self._pruner.records.aliases)
+        plan.translate(ids, view.mapped, self._pruner.records.aliases)
         return plan
 
     def alternatives(self, readings: Array, ceiling: float = np.inf) -> list[Option]:

@@ -239,12 +239,15 @@ class LandmarkRecords(Restorable):
     [7, 9]
     """
 
-    replaced = ("_slots", "misses", "information", "apart", "aliases", "doubtful")
+    replaced = (
+        *("ids", "_slots", "misses", "information"),
+        *("apart", "aliases", "doubtful"),
+    )
 
     def __init__(self) -> None:
+        self.ids: tuple[int, ...] = ()
         self.misses: IntArray = np.zeros(0, dtype=np.int64)
         self.information: Array = np.zeros((0, 3))
-        #: The landmarks, each with its place, in the order of the map.
         self._slots: dict[int, int] = {}
         #: Landmarks known to differ.
         self.apart: set[tuple[int, int]] = set()
@@ -253,14 +256,9 @@ class LandmarkRecords(Restorable):
         #: Landmarks that may be older, lost ones.
         self.doubtful: set[int] = set()
 
-    @property
-    def ids(self) -> list[int]:
-        """The landmarks, in the order of the map."""
-        return [*self._slots]
-
     def follow(self, ids: Sequence[int]) -> None:
         """Adopt the order of the map: keep records of its landmarks, start new ones."""
-        if self.ids == [*ids]:
+        if self.ids == tuple(ids):
             return
         rows = np.array([self._slots.get(i, -1) for i in ids], dtype=np.int64)
         fresh = rows < 0
@@ -269,9 +267,9 @@ class LandmarkRecords(Restorable):
             after = np.zeros((len(rows), *before.shape[1:]), dtype=before.dtype)
             after[~fresh] = before[rows[~fresh]]
             setattr(self, name, after)
-        slots = {i: k for k, i in enumerate(ids)}
-        self.apart = {pair for pair in self.apart if slots.keys() >= {*pair}}
-        self._slots = slots  # last: an interrupted call begins anew
+        self._slots = {i: k for k, i in enumerate(ids)}
+        self.apart = {pair for pair in self.apart if self._slots.keys() >= {*pair}}
+        self.ids = tuple(ids)  # last: an interrupted call begins anew
 
     def note_sightings(
         self,
@@ -331,16 +329,15 @@ class LandmarkRecords(Restorable):
         """Return copies of all, as arrays."""
         tables = {"apart": sorted(self.apart), "aliases": list(self.aliases.items())}
         found = vars(self) | tables | {"doubtful": sorted(self.doubtful)}
-        found["ids"] = self.ids
         return saved_states.write(found, RECORDS)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned; refuse what does not fit."""
         saved = saved_states.read(state, RECORDS, "landmarks.")
-        self.follow(saved.pop("ids"))
+        self.follow(saved["ids"])
         apart, aliases = (saved[name].tolist() for name in ("apart", "aliases"))
         sets = {"apart": {(i, j) for i, j in apart}, "doubtful": {*saved["doubtful"]}}
-        vars(self).update(saved | sets, aliases=dict(aliases))
+        vars(self).update(saved | sets, ids=self.ids, aliases=dict(aliases))
 
 
 #: What a saved state holds about the landmarks of a map.

@@ -96,8 +96,9 @@ class RecentScans(Restorable):
         noted: tuple[list[Any], ...] = self.decisions, self.scans
         for scans in filter(None, noted):
             last = scans[-1]
-            edits = {"removed": (*last.removed, *removed)}
-            scans[-1] = last._replace(**edits, merged=(*last.merged, *merged))
+            scans[-1] = last._replace(
+                removed=(*last.removed, *removed), merged=(*last.merged, *merged)
+            )
 
     def with_scan(self, readings: Array, plan: ScanAssociation) -> FedScans:
         """Return what to feed to the filter: a new scan, and earlier ones to repeat."""
