@@ -22,7 +22,7 @@ from ..envs.vector.landmark_world_vector import final_infos
 from ..estimator.filters.batch import BatchBeliefs, BatchSlam, BatchStorage, can_batch
 from ..estimator.filters.ekf import EkfSlam
 from ..estimator.interface import resume, snapshot
-from ..estimator.registry import find_estimator, make_batch, read_label
+from ..estimator.registry import accepted_models, find_estimator, make_batch, read_label
 from ..estimator.support import argument_checks
 from ..restorable import Restorable, State
 from ..sim_configs import Scenario
@@ -39,7 +39,6 @@ from .estimator_choice import (
     FollowingEstimator,
     checked_belief,
     choose_estimator,
-    noise_options,
 )
 
 Observation = dict[str, Any]
@@ -492,7 +491,7 @@ def choose_filters(
             for _ in range(runs)
         ]
         return SeparateFilters(filters, rows)
-    known = noise_options(find_estimator(read_label(estimator).name), scenario)
+    known = accepted_models(find_estimator(read_label(estimator).name), scenario.models)
     return make_batch(
         estimator,
         runs=runs,

@@ -89,14 +89,14 @@ def choose_estimator(
     factory: Any
     if isinstance(estimator, str):
         factory = partial(registry.make_estimator, estimator)
-        known = noise_options(
-            registry.find_estimator(registry.read_label(estimator).name), scenario
-        )
+        own = registry.find_estimator(registry.read_label(estimator).name)
+        known = registry.accepted_models(own, scenario.models)
         if not scenario.sensor.identities:
             settings["management"] = _bounded(settings.get("management", True), rows)
     elif isinstance(estimator, type) or not _has_a_method(estimator):
         factory = estimator
-        known = registry.with_sensor(factory, noise_options(factory, scenario))
+        known = registry.accepted_models(factory, scenario.models)
+        known = registry.with_sensor(factory, known)
     elif options:
         raise ValueError(
             "estimator_options must be empty with an estimator already made, "
@@ -114,22 +114,6 @@ def _bounded(management: Any, rows: int | None) -> LandmarkPolicy | Literal[Fals
         return False
     policy = as_policy(management)
     return replace(policy, capacity=rows) if policy.capacity is None else policy
-
-
-def noise_options(factory: Callable[..., Any], scenario: Scenario) -> dict[str, Any]:
-    """Return the noise settings of a world that a factory accepts, and its models.
-
-    Raises
-    ------
-    ValueError
-        If the factory does not take the world's sensor or drive.
-    """
-    settings = {
-        "range_std_per_metre": scenario.sensor.range_std_per_metre,
-        "noise_at_rest": scenario.motion.noise_at_rest,
-    }
-    accepted = registry.accepted_options(factory, settings)
-    return {**accepted, **registry.accepted_models(factory, scenario.models)}
 
 
 def checked_estimator(estimator: FollowingEstimator) -> FollowingEstimator:

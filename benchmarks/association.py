@@ -133,7 +133,7 @@ def make(world: Scenario, **options: Any) -> SlamEstimator:
         "invariant",
         motion_std=world.motion.std,
         measurement_std=world.sensor.std,
-        range_std_per_metre=world.sensor.range_std_per_metre,
+        **world.models,
         initial_pose=world.start.pose,
         initial_pose_std=world.start.std,
         **options,

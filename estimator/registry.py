@@ -330,17 +330,17 @@ class FilterLabel(NamedTuple):
 
 
 def accepted_models(
-    factory: EstimatorFactory, models: Mapping[str, str]
-) -> dict[str, str]:
-    """Return the models ``sensor`` and ``motion`` of a world or log for an estimator.
+    factory: EstimatorFactory, models: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return what an estimator accepts of the models of a world or log.
 
     Raises
     ------
     ValueError
-        If the estimator does not take one of them.
+        If the estimator does not take the ``sensor`` or ``motion`` among them.
     """
     accepted = accepted_options(factory, models)
-    for name in models.keys() - accepted.keys():
+    for name in (models.keys() - accepted.keys()) & {"sensor", "motion"}:
         raise ValueError(f"the estimator does not accept {name} = '{models[name]}'")
     return accepted
 

@@ -35,6 +35,7 @@ def start_filter(name: str, env: LandmarkWorldEnv) -> SlamEstimator:
         name,
         motion_std=scenario.motion.std,
         measurement_std=scenario.sensor.std,
+        **scenario.models,
         initial_pose=env.start_estimate,
         initial_pose_std=scenario.start.std,
     )

@@ -72,6 +72,7 @@ def drive(env: LandmarkWorldEnv) -> None:
         "invariant",
         motion_std=scenario.motion.std,
         measurement_std=scenario.sensor.std,
+        **scenario.models,
         initial_pose=scenario.start.pose,
         initial_pose_std=scenario.start.std,
     )

@@ -49,6 +49,7 @@ def follow(env: LandmarkWorldEnv) -> Iterator[list[Belief]]:
             name,
             motion_std=scenario.motion.std,
             measurement_std=scenario.sensor.std,
+            **scenario.models,
             initial_pose=env.start_estimate,
             initial_pose_std=scenario.start.std,
         )

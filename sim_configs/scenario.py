@@ -392,8 +392,8 @@ class Scenario(Part):
         return self.faults or _NO_FAULTS
 
     @property
-    def models(self) -> dict[str, str]:
-        """Its sensor and drive as filters take them, but for the defaults.
+    def models(self) -> dict[str, Any]:
+        """What filters take of sensor, drive and noise beside the std, but defaults.
 
         Examples
         --------
@@ -401,8 +401,12 @@ class Scenario(Part):
         >>> load_scenario("differential").models
         {'motion': 'differential[track_width=0.5]'}
         """
-        models: dict[str, str] = {}
+        models: dict[str, Any] = {}
         robot = self.robot
+        if self.sensor.range_std_per_metre:
+            models["range_std_per_metre"] = self.sensor.range_std_per_metre
+        if not self.motion.noise_at_rest:
+            models["noise_at_rest"] = False
         if self.sensor.kind != "bearing_range":
             models["sensor"] = self.sensor.kind
         if robot.drive == "differential":
@@ -415,11 +419,11 @@ class Scenario(Part):
 
     def refuse_models(self, part: str) -> None:
         """Raise a `ScenarioError` if sensor or drive is not the default."""
-        for name, label in self.models.items():
-            usual = {"sensor": "bearing_range", "motion": "unicycle"}[name]
-            raise ScenarioError(
-                f"{part} accepts only {name} = '{usual}', got '{label}'"
-            )
+        for name, usual in ("sensor", "bearing_range"), ("motion", "unicycle"):
+            if (label := self.models.get(name, usual)) != usual:
+                raise ScenarioError(
+                    f"{part} accepts only {name} = '{usual}', got '{label}'"
+                )
 
     def _broken_rules(self) -> Iterator[str]:
         yield from self._broken_sizes()

@@ -15,7 +15,7 @@ from slamgym.envs.rendering.render_state import drawn_readings
 from slamgym.envs.vector import WorldBatch
 from slamgym.estimator.models.motions import find_motion
 from slamgym.estimator.models.sensors import find_sensor
-from slamgym.sim_configs import ScenarioError, load_scenario
+from slamgym.sim_configs import ScenarioError, list_presets, load_scenario
 
 LOOP = load_scenario("loop").with_changes(
     motion={"noise_in": "motion", "std": (0.02, 0.01, 0.02)}
@@ -188,10 +188,38 @@ def test_the_unicycle_has_no_drive_of_its_own():
     assert LOOP.models == {}
 
 
+def test_models_tell_whether_there_is_noise_at_rest():
+    resting = LOOP.with_changes(motion={"noise_at_rest": False})
+    assert resting.models == {"noise_at_rest": False}
+
+
 def test_scenario_and_drive_have_the_same_label():
     for name in ("differential", "bicycle"):
         label = load_scenario(name).models["motion"]
         assert find_motion(label).name == label
+
+
+@pytest.mark.parametrize("name", list_presets())
+def test_models_complete_the_noise_of_every_preset(name):
+    preset = load_scenario(name)
+    stds = {"motion_std": preset.motion.std, "measurement_std": preset.sensor.std}
+    slam, distances = make_estimator("invariant", **stds, **preset.models), [1, 2, 4]
+    scenario = LOOP.with_changes(
+        motion={"std": (0, 0, 0)},
+        start={"std": (0, 0, 0)},
+        landmarks={"layout": "points", "points": [(r, 1.0) for r in distances]},
+        sensor={
+            key: getattr(preset.sensor, key)
+            for key in ("kind", "std", "range_std_per_metre")
+        },
+    )
+    worlds = WorldBatch(scenario, 2000)
+    worlds.reset([np.random.default_rng(seed) for seed in range(2000)])
+    exact = slam.sensor.predict(worlds.poses[0], worlds.landmarks[0]).measurement
+    errors = slam.sensor.difference(worlds.measurements, exact)
+    stated = slam.sensor.stds(preset.sensor.std, np.hypot(distances, 1.0))
+    size = slam.sensor.size  # a sensor of one number fills the second with 0
+    np.testing.assert_allclose(errors.std(axis=0)[:, :size], stated[:, :size], rtol=0.1)
 
 
 def test_pictures_show_a_ray_of_each_reading():
