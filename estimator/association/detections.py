@@ -274,10 +274,9 @@ class Detections(NamedTuple):
         if left or min(chances, default=1.0) < 1:
             left = {**left, **dict(zip(ids, chances, strict=True))}
             left = {i: chance for i, chance in left.items() if chance < 1}
-        seen = [ids[slot] for slot in scan[0].tolist() if slot >= 0]
-        times = {i: 1 + self.shown.get(i, 0) for i in seen}
-        more = {i: count for i, count in times.items() if count <= PROVEN}
-        shown = {**self.shown, **more} if more else self.shown
+        shown, seen = self.shown, [ids[k] for k in scan[0].tolist() if k >= 0]
+        if rare := [i for i in seen if shown.get(i, 0) < PROVEN]:
+            shown = {**shown, **{i: 1 + shown.get(i, 0) for i in rare}}
         evidence = self.lost.after(fewer, view.mapped)
         return cost, Detections(counts, left, shown, evidence, self.path)
 

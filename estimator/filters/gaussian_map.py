@@ -663,7 +663,8 @@ class ScanReport(UpdateReport):
     @cached_property
     def near_ids(self) -> tuple[int, ...]:
         """Mapped landmarks within 10 σ of the robot."""
-        return tuple([i for i, is_near in self._entries(gain.NEAR) if is_near])
+        ids, ledger = self._entries
+        return tuple(ids[ledger[gain.NEAR] != 0].tolist())
 
     @cached_property
     def innovation(self) -> Array:
@@ -671,20 +672,17 @@ class ScanReport(UpdateReport):
         return self._record.rows[:, gain.INNOVATION].reshape(-1, 2)
 
     def _with_outcome(self, value: int) -> tuple[int, ...]:
-        return tuple(self._by_outcome.get(value, ()))
+        ids, ledger = self._entries
+        outcomes = ledger[gain.OUTCOME].tolist()
+        if value not in outcomes:  # mostly so
+            return ()
+        pairs = zip(ids.tolist(), outcomes, strict=True)
+        return tuple([i for i, outcome in pairs if outcome == value])
 
-    @cached_property
-    def _by_outcome(self) -> dict[int, list[int]]:
-        groups: dict[int, list[int]] = {}
-        for i, outcome in self._entries(gain.OUTCOME):
-            groups.setdefault(outcome, []).append(i)
-        return groups
-
-    def _entries(self, row: int) -> list[tuple[int, int]]:
-        """Return the landmark of each reading, and its entry in a row of the ledger."""
+    @property
+    def _entries(self) -> tuple[IntArray, IntArray]:
+        """The landmark of each reading, and the ledger."""
         if self.is_detached:
-            ids, values = self._record.scan_ids, self._record.ledger[row]
-        else:  # without a copy of the rows, which are large
-            parts, count = self._parts, self._parts.numbers[SCANNED]
-            ids, values = parts.scan_ids[:count], parts.ledger[row, :count]
-        return [*zip(ids.tolist(), values.tolist(), strict=True)]
+            return self._record.scan_ids, self._record.ledger
+        parts, count = self._parts, self._parts.numbers[SCANNED]  # not all the rows
+        return parts.scan_ids[:count], parts.ledger[:, :count]

@@ -31,7 +31,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...arrays import Array, BoolArray, IntArray
+from ...arrays import LARGEST, Array, BoolArray, IntArray
 from ...jit import jit
 from ..association.constellations import (
     Constellations,
@@ -179,7 +179,11 @@ def _named(view: MapView, kept: IntArray, gone: IntArray) -> Pairs:
 
 
 def places_of_scan(
-    view: MapView, readings: Array, noise: Noise, rules: Constellations | None
+    view: MapView,
+    readings: Array,
+    noise: Noise,
+    rules: Constellations | None,
+    min_range: float = 0.0,
 ) -> list[tuple[Array, IntArray]]:
     """Return where the robot may be if it knows no landmark accurately.
 
@@ -193,6 +197,8 @@ def places_of_scan(
         Of the sensor.
     rules : Constellations or None
         None: the answer is empty.
+    min_range : float
+        Readings closer than this are not used [m].
 
     Returns
     -------
@@ -203,14 +209,16 @@ def places_of_scan(
     Raises
     ------
     ValueError
-        If no landmark is known accurately, and a reading is not finite.
+        If no landmark is known accurately, and a bearing is not finite.
     """
-    n, m = len(view.ids), len(readings)
-    if rules is None or min(n, m) < FEWEST_READINGS:
+    n = len(view.ids)
+    if rules is None or min(n, len(readings)) < FEWEST_READINGS:
         return []
     accurate = ACCURATE * rules.lost_std
     if _find_lost(*view[:2], accurate, np.zeros(n, dtype=np.bool_))[1]:
         return []
+    r = readings[:, 1]
+    readings = readings[(r >= min_range) & (r <= LARGEST)]
     argument_checks.refuse_unusable(readings)
     feasible = _gaps(view, readings, noise) <= OFFSET_GATE
     partners, used = feasible.sum(axis=1), np.flatnonzero(feasible.any(axis=0))

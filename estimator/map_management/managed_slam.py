@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...arrays import LARGEST, Array, IntArray
+from ...arrays import Array, IntArray
 from ..association.detections import LOST_SCORE
 from ..association.scan_assignments import Sensor
 from ..association.scan_association import (
@@ -275,9 +275,8 @@ class ManagedSlam:
         landmarks of accurate absolute position count.
         """
         view, rules = self._pruner.view_around(readings), self._policy.constellations
-        r = readings[:, 1]
-        used = readings[(r >= self._sensor.min_range) & (r <= LARGEST)]
-        places = places_of_scan(view, used, self._sensor.noise, rules)
+        noise, min_range = self._sensor
+        places = places_of_scan(view, readings, noise, rules, min_range)
         if not places or self._editor.can_move:
             return places
         if not isinstance(self._filter, SupportsPoses):
@@ -323,11 +322,12 @@ class ManagedSlam:
         self._editor.expire()
         view = self._pruner.view_around(readings)
         self.candidates = plan.candidates_after(view)
-        seen = set(view.ids).intersection(plan.row_ids)
-        seen -= {*report.rejected_ids, *report.skipped_ids}
+        made = self.decisions[-1]
+        seen = set(view.ids).intersection(made.row_ids)
+        if plan.confirmed:  # the filter may refuse the last sighting of a new one
+            seen -= {*report.rejected_ids, *report.skipped_ids}
         removed, merged = self._pruner.prune(readings, plan, seen, missed)
         self._recent.note_edits(removed, merged)
-        made = self.decisions[-1]
         self._report = report.completed(
             removed_ids=tuple(removed),
             merged_ids=tuple(merged),
