@@ -25,7 +25,8 @@ from ..models.rigid_motion import (
     state_of,
 )
 from ..support import argument_checks
-from .gaussian_map import GaussianMap
+from ..support.undo import attributes, undone_on_error
+from .gaussian_map import GaussianMap, PoseReport
 
 FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
 
@@ -52,6 +53,8 @@ class ObservesPoses:
     map: GaussianMap
     #: What distinguishes this filter's updates from another's.
     rules: Rules
+    #: That of the last update, where the map has changed since.
+    _report: UpdateReport | None = None
 
     @property
     def frame(self) -> ErrorFrame:
@@ -101,8 +104,11 @@ class ObservesPoses:
         if not found.nis <= gate_of(self.rules, len(found.innovation)):
             return UpdateReport()
         after = BeliefArrays(found.mean, found.covariance, reference)
-        map_.hold(after, map_.slots, block=map_.blank(map_.room), steps=1)
-        return found.report()
+        block, report = map_.blank(map_.room), found.report()
+        with undone_on_error(attributes(self, map_)):
+            self._report = None
+            map_.hold(after, map_.slots, block=block, steps=1, report=report)
+        return report
 
     def _observe(
         self, given: PoseReading, mean: Array, covariance: Array
@@ -217,9 +223,9 @@ class ObservedMap(NamedTuple):
     #: νᵀ S⁻¹ ν, shape ().
     nis: Array
 
-    def report(self) -> UpdateReport:
+    def report(self) -> PoseReport:
         """Return the report of the reading."""
-        return UpdateReport(
+        return PoseReport(
             nis=float(self.nis),
             degrees_of_freedom=len(self.innovation),
             innovation=self.innovation,

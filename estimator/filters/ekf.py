@@ -214,9 +214,6 @@ class MapFilter(ObservesPoses):
         """Return the report of the last update once more."""
         return self.map.last_report() if self._report is None else self._report
 
-    #: That of the last update, where the map has changed since.
-    _report: UpdateReport | None = None
-
     def memory_for(self, landmarks: int) -> int:
         """Return the least memory of a map with this many landmarks [bytes]."""
         return covariance_bytes(landmarks)

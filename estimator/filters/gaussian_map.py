@@ -84,15 +84,17 @@ class GaussianMap:
     #: Its parts by name.
     parts: Parts
     _slots: dict[int, int]
-    _last: Callable[[], ScanReport | None]
+    _last: Callable[[], ScanReport | PoseReport | None]
 
     def __init__(self, values: Sequence[float]) -> None:
         capacity = self.capacity_for(FIRST_LANDMARKS)
         self._become(new_block(capacity, FIRST_READINGS, np.array(values)))
 
-    def _become(self, block: Array, parts: Parts | None = None) -> None:
-        parts, nobody = parts or parts_of(block), type(None)
-        vars(self).update(block=block, parts=parts, _slots={}, _last=nobody)
+    def _become(
+        self, block: Array, parts: Parts | None = None, report: PoseReport | None = None
+    ) -> None:
+        parts = parts or parts_of(block)
+        vars(self).update(block=block, parts=parts, _slots={}, _last=lambda: report)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the memory; its parts would be copied one by one."""
@@ -205,6 +207,7 @@ class GaussianMap:
         *,
         block: Array | None = None,
         steps: int = 0,
+        report: PoseReport | None = None,
     ) -> None:
         """Continue with another belief.
 
@@ -218,6 +221,8 @@ class GaussianMap:
             The memory to use.
         steps : int
             Number of steps that have led to this belief.
+        report : PoseReport, optional
+            Of the last of these steps.
         """
         self._detach_report()
         if block is None:
@@ -227,7 +232,7 @@ class GaussianMap:
             array[tuple(slice(size) for size in content.shape)] = content
         parts.ids[: len(ids)] = [*ids]
         parts.numbers[LANDMARKS], parts.numbers[STEPS] = len(ids), self.steps + steps
-        self._become(block, parts)
+        self._become(block, parts, report)
 
     def make_room(self, readings: int) -> None:
         """Grow the arrays where a scan of new landmarks could overflow them."""
@@ -260,8 +265,8 @@ class GaussianMap:
         if (last := self._last()) is not None:
             last.detach()
 
-    def last_report(self) -> ScanReport:
-        """Return the report of the last scan once more."""
+    def last_report(self) -> UpdateReport:
+        """Return the report of the last scan or reading of the pose once more."""
         last = self._last()
         return self.report() if last is None or last.is_detached else last
 
@@ -589,6 +594,16 @@ class ScanRecord(NamedTuple):
         pair = (every - every % 2)[:, None] + (0, 1)
         factor[every[:, None], pair] = rows[:, gain.ROOT : gain.ROOT + 2]
         return factor
+
+
+class PoseReport(UpdateReport):
+    """The results of a reading of the pose; no memory holds them."""
+
+    is_detached = False
+
+    def detach(self) -> None:
+        """Note that they are no longer the last ones."""
+        vars(self).update(is_detached=True)
 
 
 class ScanReport(UpdateReport):

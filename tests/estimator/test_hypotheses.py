@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from comparison import digest
 from inner_parts import filters_of
+from interrupts import assert_all_or_nothing
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import EkfSlam, UpdateReport, make_estimator
@@ -389,6 +390,16 @@ def test_an_interrupted_update_loses_no_filter(slippery_drive, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         go_on()
     assert len(slam.hypotheses) + len(pool) == 1 + len(made)
+
+
+def test_an_interrupted_reading_of_the_pose_has_its_cost_in_every_hypothesis(
+    slippery_drive,
+):
+    world, scans = slippery_drive
+    slam, _ = several_hypotheses(scans, world)
+    place = slam.belief().pose[:2] + 0.5
+    gps = place, np.eye(2, 3), 0.01 * np.eye(2)
+    assert_all_or_nothing(slam, lambda s: s.observe_pose(*gps))
 
 
 class WithoutInnovations(EkfSlam):

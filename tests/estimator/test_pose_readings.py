@@ -6,6 +6,7 @@ from comparison import assert_close_beliefs, assert_same_bits, digest
 from dense_family import TWINS, DenseAdaptiveInvariant, DenseInvariant, belief_of
 from dense_family import tell_truth as tell
 from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
+from interrupts import assert_all_or_nothing
 
 from slamgym.estimator import make_batch, make_estimator
 from slamgym.estimator.filters import conditioning
@@ -204,6 +205,29 @@ def test_a_reading_survives_as_rows():
         assert len(rest) == 1 - 2 * first[2]
         for part, again in zip(given, PoseReading.of_rows(rest), strict=True):
             assert np.array_equal(part, again)
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"sensor": "range"}, {"management": True}], ids=str
+)
+def test_an_interrupt_leaves_a_reading_with_its_report_or_none(options):
+    slam, steps = make("invariant", **options), list(steps_of(4, 5))
+    for odometry, readings, seen, *_ in steps:
+        slam.predict(odometry)
+        slam.update(readings[:, 1:] if "sensor" in options else readings, seen.tolist())
+    assert_all_or_nothing(slam, lambda s: s.observe_pose(*steps[-1][-1]))
+
+
+def test_a_filter_returns_the_report_of_a_reading_until_the_next_scan():
+    slam = make("ekf")
+    for odometry, readings, seen, _, given in steps_of(4, 5):
+        slam.predict(odometry)
+        first = slam.update(readings, seen.tolist())
+        before, report = slam.snapshot(), slam.observe_pose(*given)
+        slam.predict(odometry)
+        assert slam.report() is report
+        slam.resume(before)
+        assert slam.report() == first
 
 
 @pytest.mark.parametrize("association", ["nearest", "hypotheses"])

@@ -2,6 +2,10 @@
 
 import sys
 from collections.abc import Callable
+from copy import deepcopy
+from typing import Any
+
+from comparison import digest
 
 
 class _Lines:
@@ -35,6 +39,20 @@ def is_interrupted(call: Callable[[], object], line: int) -> bool:
     except KeyboardInterrupt:
         return True
     return False
+
+
+def assert_all_or_nothing(slam: Any, call: Callable[[Any], object]) -> None:
+    """Interrupt a call before each of its lines; belief and report change together."""
+    after = deepcopy(slam)
+    lines, found = lines_of(lambda: call(after)), set()
+    for line in range(lines):
+        other = deepcopy(slam)
+        assert is_interrupted(lambda: call(other), line)  # noqa: B023
+        expected = after if other.steps != slam.steps else slam
+        assert digest(other) == digest(expected), line
+        assert other.report() == expected.report(), line
+        found.add(expected is after)
+    assert found == {False, True}
 
 
 def _traced(call: Callable[[], object], lines: _Lines) -> None:
