@@ -83,9 +83,8 @@ def _known(truth: Array | None) -> BoolArray:
 
 def truth_limits(trace: RunTrace, walls: Walls = ()) -> Array:
     """Return a box around a run's estimates, its truth and walls, shape (2, 2) [m]."""
-    truths = [trace.true_poses, trace.true_landmarks]
-    points = [trace.poses[:, :2], trace.landmarks]
-    points += [truth[:, :2] for truth in truths if truth is not None]
+    points = [trace.poses[:, :2], trace.landmarks, trace.every_true_landmark]
+    points += [] if trace.true_poses is None else [trace.true_poses[:, :2]]
     points.append(wall_ends(walls))
     return box_around(
         np.concatenate(points), trace.landmarks, trace.landmark_covariances
@@ -108,12 +107,14 @@ def draw_against_truth(axes: Axes, trace: RunTrace) -> list[Artist]:
         _join(axes, trace.poses[steps, :2], truth[steps], width=0.8)
         keys.insert(1, line)
     if landmarks.any() and trace.true_landmarks is not None:
-        truth = trace.true_landmarks[landmarks]
+        truth = trace.every_true_landmark
         size = 9 if len(truth) <= _FEW else 5
         (crosses,) = axes.plot(
             *truth.T, "+", color=style.INK, ms=size, mew=size / 7, label="true landmark"
         )
-        _join(axes, trace.landmarks[landmarks], truth, width=1.6)
+        _join(
+            axes, trace.landmarks[landmarks], trace.true_landmarks[landmarks], width=1.6
+        )
         keys.append(crosses)
     return [*keys, Line2D([], [], color=style.ALARM, lw=1.4, label="error")]
 

@@ -315,7 +315,7 @@ class MapPicture:
         """Return the keys of a legend, to be drawn with `ELLIPSE_HANDLER`."""
         kinds = [PREDICTED, UPDATED, FIRST, LATER]
         keys: list[Artist] = [kind.legend_key() for kind in kinds]
-        truth = [] if self._trace.true_landmarks is None else [self._truth]
+        truth = [self._truth] if len(self._trace.every_true_landmark) else []
         return [*keys, self._artists.path, *truth]
 
     def _show_landmarks(self, step: int) -> None:
@@ -335,8 +335,7 @@ class MapPicture:
         )
 
     def _add_truth(self, scale: float) -> Line2D:
-        truth = self._trace.true_landmarks
-        points = np.empty((0, 2)) if truth is None else truth
+        points = self._trace.every_true_landmark
         (crosses,) = self._axes.plot(*points.T, "+", color=style.INK, zorder=5)
         crosses.set_label("true landmark")
         size, width = (9.0, 1.3) if len(points) <= 60 else (5.0, 0.9)
@@ -391,9 +390,8 @@ def map_limits(trace: RunTrace, walls: Walls = ()) -> Array:
     ndarray, shape (2, 2)
         Lower left and upper right corner [m].
     """
-    truth = trace.true_landmarks
     points = [trace.poses[:, :2], trace.landmarks, wall_ends(walls)]
-    points += [] if truth is None else [truth]
+    points.append(trace.every_true_landmark)
     poses = np.concatenate([trace.poses, trace.predicted_poses])
     covariances = np.concatenate(
         [trace.pose_covariances, trace.predicted_pose_covariances]

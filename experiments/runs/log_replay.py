@@ -342,6 +342,7 @@ class RunRecorder:
             true_landmarks=ground_truth.true_landmarks_of(
                 log, belief.landmark_ids, belief.landmarks, identities
             ),
+            world_landmarks=log.landmarks,
             first_covariance=self._first_covariance,
             final_covariance=belief.covariance,
         )

@@ -86,6 +86,8 @@ class RunTrace:
     time_unit: str = "s"
     #: Coordinates of the estimator's Gaussian error.
     frame: ErrorFrame = "additive"
+    #: Every true landmark, in the map or not, shape (L, 2); by default those in it.
+    world_landmarks: Array | None = None
 
     def __post_init__(self) -> None:
         steps, n = len(self.t), len(self.landmark_ids)
@@ -115,6 +117,12 @@ class RunTrace:
     def last_step(self) -> int:
         """K, the number of motions."""
         return len(self.t) - 1
+
+    @property
+    def every_true_landmark(self) -> Array:
+        """Every true landmark that is known, shape (m, 2), perhaps with rows of nan."""
+        known = (self.world_landmarks, self.true_landmarks, np.empty((0, 2)))
+        return next(truth for truth in known if truth is not None)
 
     @property
     def landmark_covariances(self) -> Array:

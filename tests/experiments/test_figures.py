@@ -242,6 +242,17 @@ def test_a_long_run_may_have_ellipses_without_an_area():
     assert pose_stride(replace(trace, pose_covariances=covariances)) == 5
 
 
+@pytest.mark.parametrize("draw", [map_figure, truth_figure])
+def test_true_landmarks_outside_the_map_are_drawn_too(draw):
+    known = make_trace().true_landmarks
+    everywhere = np.concatenate([known, [[40.0, -30.0]]])
+    (axes, *_) = draw(make_trace(world_landmarks=everywhere)).axes
+    crosses = line_of(axes, "true landmark").get_xydata()
+    np.testing.assert_array_equal(crosses, everywhere)
+    low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+    assert ((low < everywhere) & (everywhere < high)).all()
+
+
 def test_view_is_the_same_at_every_step_and_holds_the_whole_run():
     trace = make_trace()
     first, last = map_figure(trace, 0).axes[0], typical(map_figure).axes[0]

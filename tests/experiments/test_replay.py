@@ -97,6 +97,7 @@ def test_the_summary_scores_readings_without_identity(method):
     truth = dict(zip(log.landmark_ids.tolist(), log.landmarks.tolist(), strict=True))
     expected = [truth[ids[i]] for i in done.belief.landmark_ids]
     assert done.trace.true_landmarks.tolist() == expected
+    assert done.trace.every_true_landmark is log.landmarks
     assert done.trace.estimator == "EkfSlam"
 
 
