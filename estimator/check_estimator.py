@@ -109,6 +109,8 @@ def check_estimator(factory: Factory | str) -> tuple[Finding, ...]:
     EstimatorContractError
         If the estimator cannot run or computes wrong beliefs. The message lists all
         findings; the attribute ``findings`` holds them.
+    TypeError
+        If the factory is not callable, such as an estimator already made.
     ValueError
         If there is no estimator of that name.
 
@@ -121,6 +123,10 @@ def check_estimator(factory: Factory | str) -> tuple[Finding, ...]:
     if isinstance(factory, str):
         name, options = read_label(factory)
         factory = partial(find_estimator(name), **options)
+    if not callable(factory):
+        raise TypeError(
+            f"factory must be callable, such as an estimator's class, got {factory!r}"
+        )
     findings = find_breaches(factory)
     if any(finding.level != "recommended" for finding in findings):
         raise EstimatorContractError(listed(factory, findings), findings)

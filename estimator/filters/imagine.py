@@ -41,6 +41,9 @@ class SensorLimits(Protocol):
         """Probability of losing a reading."""
 
 
+_LIMITS = ("min_range", "max_range", "field_of_view", "occlusion", "dropout")
+
+
 def imagine(
     filters: EkfSlam | BatchSlam,
     plans: ArrayLike,
@@ -88,7 +91,7 @@ def imagine(
     Raises
     ------
     TypeError
-        If the filter has another type.
+        If the filter has another type, or the sensor lacks an attribute.
     ValueError
         If an array has a wrong shape or is not finite, there is no plan or no step, or
         a horizon is not a step of the plans or not after the one before.
@@ -106,6 +109,11 @@ def imagine(
     >>> bool((after.worst_variances[0, 0] < slam.belief().covariance[3, 3]).all())
     True
     """
+    if missing := [name for name in _LIMITS if not hasattr(sensor, name)]:
+        raise TypeError(
+            f"sensor must have {', '.join(_LIMITS)}, as scenario.sensor has, but "
+            f"{type(sensor).__name__} has no {missing[0]}"
+        )
     means, covariances, references, slots = _beliefs(filters)
     only_unicycle(filters.motion, "imagine")
     count, landmarks = slots.shape

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 
+from slamgym import make_estimator
 from slamgym.agents import ActiveSlamEnv, ActiveSlamVectorEnv
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.envs.vector import LandmarkWorldVectorEnv
@@ -130,6 +131,22 @@ def test_there_is_no_state_before_the_first_episode():
         begun.reset(seed=0)
         with pytest.raises(gymnasium.error.ResetNeeded):
             kind().restore(begun.state())
+
+
+class WithoutState:
+    """A filter of four methods, which cannot return to a state."""
+
+    def __init__(self, **settings):
+        slam = make_estimator("ekf", **settings)
+        self.reset, self.predict = slam.reset, slam.predict
+        self.update, self.belief = slam.update, slam.belief
+
+
+def test_a_filter_that_cannot_return_to_a_state_is_named():
+    env = ActiveSlamEnv("active_easy", estimator=WithoutState)
+    env.reset(seed=0)
+    with pytest.raises(TypeError, match=r"WithoutState has no method state_dict\(\)"):
+        env.state()
 
 
 def test_a_state_of_another_scenario_is_refused_and_changes_nothing():

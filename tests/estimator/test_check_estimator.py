@@ -257,12 +257,16 @@ class NeverGrowsCertain(EkfSlam):
         (IsSkewed, "must be symmetric, got elements that differ by 0.001"),
         (IsNegative, "must be positive semidefinite, got the eigenvalue -0.0"),
         (lambda: None, r"<lambda>\(motion_std=.* raised TypeError: .* unexpected"),
-        (3, r"raised TypeError: 'int' object is not callable"),
     ],
 )
 def test_a_breach_of_the_contract_is_named(estimator, complaint):
     with pytest.raises(EstimatorContractError, match=complaint):
         check_estimator(estimator)
+
+
+def test_an_estimator_in_place_of_its_class_is_refused():
+    with pytest.raises(TypeError, match=r"must be callable, .* got EkfSlam"):
+        check_estimator(EkfSlam(**NOISE))
 
 
 @pytest.mark.parametrize(

@@ -263,6 +263,8 @@ def test_other_filters_and_keywords_are_refused():
         imagine(RobocentricEkfSlam(**NOISE), PLANS, sensor())
     with pytest.raises(TypeError, match="unexpected keyword argument 'horizon'"):
         imagine(driven("ekf"), PLANS, sensor(), horizon=3)
+    with pytest.raises(TypeError, match=r"sensor must have .* has no min_range"):
+        imagine(driven("ekf"), PLANS, None)
 
 
 # beliefs loaded into a batch

@@ -565,8 +565,10 @@ def test_utias_robot_can_be_chosen_and_the_lowest_is_the_default(utias):
 @pytest.mark.parametrize("name", sorted(set(UTIAS) - {"Robot3_Groundtruth.dat"}))
 def test_missing_utias_file_is_named(utias, name):
     (utias / name).unlink()
-    expected = name.replace("Robot3", "Robot(3|<k>)")
-    with pytest.raises(LogError, match=f"expected {expected}, got no such file"):
+    expected = rf"expected {name}, got no such file"
+    if name == "Robot3_Odometry.dat":
+        expected = r"with Robot<k>_Odometry\.dat .* got another folder"
+    with pytest.raises(LogError, match=expected):
         read_log(utias)
 
 
@@ -636,8 +638,12 @@ def test_what_is_no_log_is_refused_with_the_known_formats(file, text):
         read_log(file(text))
 
 
-def test_a_folder_without_utias_files_and_a_missing_file_are_refused(tmp_path):
-    with pytest.raises(LogError, match=r"expected Robot<k>_Odometry\.dat"):
+def test_another_folder_and_a_missing_file_are_refused(tmp_path):
+    expected = r"expected a log, or a folder with Robot<k>_.* got another folder"
+    with pytest.raises(LogError, match=f"{expected}$"):
+        read_log(tmp_path)
+    (tmp_path / "log.csv").touch()  # the folder of a run
+    with pytest.raises(LogError, match=rf"{expected}; did you mean .*log\.csv\?$"):
         read_log(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"nowhere\.csv"):
         read_log(tmp_path / "nowhere.csv")

@@ -95,8 +95,11 @@ def _choose_robot(folder: Path, robot: int | None) -> int:
     matches = (ODOMETRY_NAME.fullmatch(file.name) for file in folder.iterdir())
     robots = sorted(int(match[1]) for match in matches if match)
     if not robots:
+        log = folder / "log.csv"
+        hint = f"; did you mean {log}?" if log.is_file() else ""
         raise slamlog.LogError(
-            f"{folder}: expected Robot<k>_Odometry.dat, got no such file"
+            f"{folder}: expected a log, or a folder with Robot<k>_Odometry.dat (UTIAS "
+            f"MR.CLAM) or aa3_dr.mat (Victoria Park), got another folder{hint}"
         )
     if robot is None:
         return robots[0]
