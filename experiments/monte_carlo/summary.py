@@ -49,6 +49,7 @@ from .verdict import (
     report_of,
     run_warnings,
     scores_of,
+    seeds_sentence,
     start_heading_std,
     verdict_sentence,
 )
@@ -145,7 +146,8 @@ def summarise_estimator(
         heading [rad]; ``ate`` and ``landmark_rmse``, ``{raw, aligned}`` [m];
         ``landmark_mahalanobis``, root mean square; ``area`` of the 3σ ellipses at the
         end [m²]; ``efficiency``, see :func:`.summary.efficiency_summary`;
-        ``diagnosis``, see :func:`.verdict.diagnosis_summary`;
+        ``diagnosis``, see :func:`.verdict.diagnosis_summary`; ``seeds_sentence``, of
+        runs to look at;
         ``association``, see :func:`.association.association_summary`;
         ``unused_readings``, the share of readings of known identity that corrected
         nothing and added no landmark, None where identities are hidden or readings of
@@ -173,6 +175,7 @@ def summarise_estimator(
         **found,
         "efficiency": efficiency_summary(scores),
         "diagnosis": diagnosis_summary(scores, frame, verdict),
+        "seeds_sentence": seeds_sentence(scores, frame, _excess(scores)),
         "association": association_summary(scores),
         "unused_readings": _unused_readings(scores),
     }
@@ -605,7 +608,7 @@ def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
     if KNOWN_IDS_ATE not in scores.results:
         return None
     hidden, known = scores.per_run("ate"), scores.per_run(KNOWN_IDS_ATE)
-    is_bad = hidden > known + MARGIN
+    is_bad = _excess(scores) > 0
     bad = int((~scores.good).sum() + is_bad.sum())
     parts = {
         which: {
@@ -623,6 +626,14 @@ def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
         "alarm": _alarm(scores.per_run(ALARM), is_bad),
         "median_ate": {"hidden": _median(hidden), "known": _median(known)},
     }
+
+
+def _excess(scores: EstimatorScores) -> Array:
+    """Return the path error of each bad run that succeeded, 0 of others, (M,) [m]."""
+    ate = scores.per_run("ate")
+    if KNOWN_IDS_ATE not in scores.results:
+        return np.zeros_like(ate)
+    return np.where(ate > scores.per_run(KNOWN_IDS_ATE) + MARGIN, ate, 0.0)
 
 
 def _alarm(raised: Array, is_bad: BoolArray) -> dict[str, Any] | None:

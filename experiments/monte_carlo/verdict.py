@@ -32,6 +32,7 @@ from ...evaluation.diagnosis import (
     Diagnosis,
     SmallNoise,
     diagnose,
+    lost_runs,
     p_text,
 )
 from ...evaluation.hypothesis_tests import EQUIVALENCE_MARGIN
@@ -243,6 +244,7 @@ def _number(ratio: float) -> str:
 LARGE_MAP = 1.2
 
 _MOST_GROUPS = 3
+_MOST_SEEDS = 5
 _LETTERS = 160  # of a message
 
 
@@ -385,7 +387,7 @@ def diagnosis_summary(
 
 
 def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
-    """Write the cause in an entry of the summary as a line, if there is one.
+    """Write the cause in an entry of the summary, and seeds to look at, as lines.
 
     Examples
     --------
@@ -393,10 +395,41 @@ def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
     >>> diagnosis_lines("ekf", {"diagnosis": found})
     ('ekf: cause: clutter: it is used.',)
     """
-    found = entry.get("diagnosis")
-    if found is None or found["cause"] == HONEST:
-        return ()
-    return (f"{label}: cause: {found['sentence']}",)
+    found, lines = entry.get("diagnosis"), []
+    if found is not None and found["cause"] != HONEST:
+        lines.append(f"cause: {found['sentence']}")
+    if seeds := entry.get("seeds_sentence"):
+        lines.append(seeds)
+    return tuple(f"{label}: {line}" for line in lines)
+
+
+def seeds_sentence(scores: EstimatorScores, frame: ErrorFrame, excess: Array) -> str:
+    """Name up to five runs by their seeds: failed, bad, or lost; empty for none.
+
+    Parameters
+    ----------
+    scores : EstimatorScores
+        Results of the estimator.
+    frame : {"invariant", "additive"}
+        Error coordinates of the NEES.
+    excess : ndarray, shape (M,)
+        Path error of each bad run [m], 0 of the others.
+    """
+    nees = scores.over_time(f"pose_nees_{frame}")[:, scores.first - 1 :]
+    lost = np.where(lost_runs(nees) & (not scores.is_fitted), nees.mean(axis=1), 0.0)
+    rows = [*np.flatnonzero(~scores.good)]
+    for badness in (excess, lost):
+        worst = np.argsort(-badness, kind="stable")[: np.count_nonzero(badness)]
+        rows += [*np.flatnonzero(scores.good)[worst]]
+    runs = scores.results["run"].values[list(dict.fromkeys(rows))]
+    if not len(runs):
+        return ""
+    seeds = (runs[:_MOST_SEEDS] + int(scores.results.attrs["seed"])).tolist()
+    more = f", the worst of {len(runs)}" if len(runs) > _MOST_SEEDS else ""
+    return (
+        "failed, bad or lost runs (slamgym run --seed shows one): seed "
+        f"{', '.join(map(str, seeds))}{more}."
+    )
 
 
 def diagnosis_of(

@@ -27,9 +27,11 @@ from slamgym.experiments.monte_carlo.report import (
 from slamgym.experiments.monte_carlo.summary import summarise_monte_carlo
 from slamgym.experiments.monte_carlo.verdict import (
     KINDS,
+    diagnosis_lines,
     judge,
     run_warnings,
     scores_of,
+    seeds_sentence,
 )
 from slamgym.sim_configs import load_scenario
 
@@ -263,6 +265,25 @@ def test_notes_group_failures_and_warn_of_few_runs():
         "ekf: only 7 runs succeeded; at least 20 are needed.",
     ]
     assert summarise_monte_carlo(typical())["notes"] == []
+
+
+def test_seeds_of_failed_bad_and_lost_runs_are_told_the_worst_first():
+    dataset = with_failures(typical(), [("invariant", 3, 1, "boom")])
+    dataset = dataset.copy(deep=True).assign_attrs(seed=100)
+    nees = dataset["pose_nees_invariant"]
+    nees.loc[{"run": 8}], nees.loc[{"run": 9}] = 1000.0, 2000.0
+    summary = summarise_monte_carlo(dataset)
+    entry = summary["estimators"]["invariant"]
+    assert entry["seeds_sentence"].endswith(": seed 103, 109, 108.")
+    assert entry["seeds_sentence"] in diagnosis_lines("invariant", entry)[-1]
+    assert ": seed 103, 109, 108.</p>" in html_report(dataset, summary)
+    nees.loc[{"run": range(20, 30)}] = 500.0
+    scores, excess = scores_of(dataset, "invariant", "invariant"), np.zeros(39)
+    excess[6] = 5.0  # of run 7, since run 3 is missing
+    told = seeds_sentence(scores, "invariant", excess)
+    assert told.endswith(": seed 103, 107, 109, 108, 120, the worst of 14.")
+    honest = summarise_monte_carlo(typical())["estimators"]["invariant"]
+    assert honest["seeds_sentence"] == ""
 
 
 def test_few_runs_are_noted_once_for_all_estimators_and_warned_of_in_each():
