@@ -15,7 +15,7 @@ from ..logs.recording import steps_of
 from ..logs.slamlog import SlamLog, write_slamlog
 from ..runs.filter_settings import FilterSettings
 from ..runs.log_replay import replay
-from ..runs.summary import association_failed, summarise
+from ..runs.summary import association_failure, summarise
 from ..runs.trace import RunTrace
 from ..viewers import RunFrames, ViewedRun, write_rerun, write_run_page
 from ..viewers.rerun_recording import import_rerun
@@ -185,10 +185,11 @@ def show_run(
     if summary["warnings"]:
         warnings = (Text(f"Warning: {text}", "yellow") for text in summary["warnings"])
         reporter.show(*warnings, "")
-    if association_failed(summary):
+    if reason := association_failure(summary):
         log = str(place / "log.csv")
         repair = ["slamgym", "smooth", log, "--associate", *given.noise_arguments()]
-        reporter.show_verbatim(f"Repair the association: {shlex.join(repair)}\n")
+        reporter.show(f"The association failed: {reason}. Repair it with")
+        reporter.show_verbatim(f"{shlex.join(repair)}\n")
     reporter.show(tables.written(str(place), summary["files"]))
     reporter.finish({**summary, "out": str(place)})
 

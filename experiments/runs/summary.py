@@ -315,8 +315,8 @@ LOST = (
 )
 
 
-def association_failed(summary: Mapping[str, Any]) -> bool:
-    """Return whether the association of a run failed, by the alarm or the truth.
+def association_failure(summary: Mapping[str, Any]) -> str:
+    """Write why the association of a run failed, by the alarm or the truth; or "".
 
     By the truth, it failed if a filter that knew pose and map would assign at least
     `MOST_REJECTED` more of the readings rightly.
@@ -328,8 +328,12 @@ def association_failed(summary: Mapping[str, Any]) -> bool:
     """
     scores = summary["association"] or {}
     precision, wrong = scores.get("precision"), scores.get("oracle_errors") or 0.0
-    is_wrong = precision is not None and 1 - precision > wrong + MOST_REJECTED
-    return bool(summary["probably_lost"] or is_wrong)
+    if precision is not None and 1 - precision > wrong + MOST_REJECTED:
+        return (
+            f"{1 - precision:.1%} of the readings that it assigned are wrong, and "
+            f"{wrong:.1%} would be, if it knew pose and map"
+        )
+    return "the filter is probably lost" if summary["probably_lost"] else ""
 
 
 def run_warnings(replay: Replay) -> list[str]:
