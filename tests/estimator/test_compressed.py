@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from inner_parts import map_of, spied
 from interrupts import is_interrupted, lines_of
+from matplotlib import pyplot as plt
 from town_drives import TOWN_MOTION_STD, map_all, run, wander
 
 from slamgym.estimator import EkfSlam, InvariantEkfSlam, check_estimator
@@ -34,7 +35,9 @@ from slamgym.estimator.map_management.map_editor import MapEditor
 from slamgym.estimator.models.bearing_range import predict_measurement
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+import growing_maps
 from growing_maps_peers import FullWithDsyrk
+from growing_maps_timing import Costs
 
 NOISE = (TOWN_MOTION_STD, MEASUREMENT_STD)
 WHOLE = 250
@@ -666,3 +669,13 @@ def test_a_filter_that_was_continued_from_a_saved_state_begins_phases_alike():
             assert not array[size:].any()
         assert not map_of(each).filter.map.covariance[:, size:].any()
     assert_same_bits(slam.belief(), other.belief())
+
+
+def test_the_legend_of_the_benchmark_names_what_was_measured(tmp_path):
+    costs = {"ekf": Costs([1e-4]), "compressed": Costs([1e-5], 1000)}
+    growing_maps.draw({300: costs, 1000: costs}, tmp_path / "curves.png")
+    lines, names = plt.gcf().axes[0].get_legend_handles_labels()
+    plt.close()
+    assert "ekf" in names
+    assert "GTSAM iSAM2, mean" not in names
+    assert all(len(line.get_xdata()) == 2 for line in lines)
