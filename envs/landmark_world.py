@@ -243,11 +243,7 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         self._refuse_before_reset()
         refuse_other_state(self, state, len(self.changing) + len(self.replaced))
         drawn = state[len(self.changing) + self.replaced.index("_drawn_scenario")]
-        if drawn.name != self.scenario.name:
-            raise ValueError(
-                f"state must be of the world '{self.scenario.name}', "
-                f"got one of '{drawn.name}'"
-            )
+        refuse_other_world(self.scenario, drawn.name)
         super().restore(state)
 
     def render(self) -> ImageArray | None:
@@ -328,3 +324,11 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
             clutter = None if ids is None else ids[mask] < 0
             self._renderer.add(body.pose, measurements[mask], collision, clutter)
         return {"landmarks": measurements, "mask": mask, "odometry": odometry}, info
+
+
+def refuse_other_world(scenario: Scenario, name: str) -> None:
+    """Refuse the state of a world of another scenario."""
+    if name != scenario.name:
+        raise ValueError(
+            f"state must be of the world '{scenario.name}', got one of '{name}'"
+        )

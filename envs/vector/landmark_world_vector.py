@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from ...arrays import AnyArray, Array, BoolArray, ImageArray
 from ...restorable import Restorable, State, copied, put_back, refuse_other_state
 from ...sim_configs import Scenario, load_scenario
-from ..landmark_world import LandmarkWorldEnv
+from ..landmark_world import LandmarkWorldEnv, refuse_other_world
 from ..rendering.episode_renderer import EpisodeRenderer
 from ..rendering.render_state import BeliefLike
 from ..spaces import action_space, observation_space
@@ -192,14 +192,17 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
         True
         """
         self._begun_worlds()
-        return (*super().state(), copied((*self._generators(), *self._renderers)))
+        own = self.scenario.name, *self._generators(), *self._renderers
+        return (*super().state(), copied(own))
 
     def restore(self, state: State) -> None:
-        """Return to a state of these worlds, which stays usable for further calls."""
+        """Return to a state of these worlds; see `LandmarkWorldEnv.restore`."""
         self._begun_worlds()
         own = *self._generators(), *self._renderers
-        given: Any = state[-1] if isinstance(state, tuple) and state else None
-        refuse_other_state(self, given, len(own))
+        last: Any = state[-1] if isinstance(state, tuple) and state else None
+        refuse_other_state(self, last, 1 + len(own))
+        name, *given = last
+        refuse_other_world(self.scenario, name)
         super().restore(state[:-1])
         for part, value in zip(own, given, strict=True):
             put_back(part, value)

@@ -1,5 +1,7 @@
 """Worlds return to earlier states, to the bit, whatever they have done since."""
 
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
@@ -153,6 +155,8 @@ def test_a_state_of_another_scenario_is_refused_and_changes_nothing():
     for kind, names in [
         (LandmarkWorldEnv, ("loop", "corridor")),
         (ActiveSlamEnv, ("active_easy", "active_medium")),
+        (partial(LandmarkWorldVectorEnv, 2), ("loop", "coarse_loop")),
+        (partial(ActiveSlamVectorEnv, 2), ("active_easy", "active_medium")),
     ]:
         own, other = map(kind, names)
         own.reset(seed=0)
