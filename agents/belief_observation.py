@@ -38,6 +38,7 @@ from .estimator_choice import (
     EstimatorChoice,
     FollowingEstimator,
     checked_belief,
+    checked_estimator,
     choose_estimator,
 )
 
@@ -374,7 +375,8 @@ class SeparateFilters(Restorable):
 
     def state(self) -> State:
         """Return the states of the filters, for `restore`."""
-        states = [snapshot(slam) for slam in self.filters]
+        needed = "state_dict", "load_state_dict"
+        states = [snapshot(checked_estimator(slam, needed)) for slam in self.filters]
         return states, self._steps[:], self._beliefs[:], self._stored[:]
 
     def restore(self, state: State) -> None:

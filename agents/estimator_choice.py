@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, Protocol, cast
@@ -116,12 +116,14 @@ def _bounded(management: Any, rows: int | None) -> LandmarkPolicy | Literal[Fals
     return replace(policy, capacity=rows) if policy.capacity is None else policy
 
 
-def checked_estimator(estimator: FollowingEstimator) -> FollowingEstimator:
+def checked_estimator(
+    estimator: FollowingEstimator, methods: Sequence[str] = _METHODS
+) -> FollowingEstimator:
     """Return the estimator, or raise a `TypeError` if it lacks a method."""
-    for method in _METHODS:
+    for method in methods:
         if not callable(getattr(estimator, method, None)):
             raise TypeError(
-                f"estimator must have the methods {', '.join(_METHODS)}, but "
+                f"estimator must have the methods {', '.join(methods)}, but "
                 f"{type(estimator).__name__} has no method {method}()"
             )
     return estimator

@@ -446,15 +446,7 @@ def restore(estimator: Any, state: Mapping[str, Any]) -> None:
 
 def snapshot(estimator: Any) -> Any:
     """Return a copy of the present state for :func:`resume`."""
-    take = getattr(estimator, "snapshot", None) or getattr(
-        estimator, "state_dict", None
-    )
-    if take is None:
-        raise TypeError(
-            "estimator must have the methods state_dict and load_state_dict to return "
-            f"to a state, but {type(estimator).__name__} has no method state_dict()"
-        )
-    return take()
+    return getattr(estimator, "snapshot", estimator.state_dict)()
 
 
 def resume(estimator: Any, before: Any) -> None:

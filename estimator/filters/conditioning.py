@@ -26,7 +26,7 @@ from ..models.rigid_motion import (
 )
 from ..support import argument_checks
 from ..support.undo import attributes, undone_on_error
-from .gaussian_map import GaussianMap, PoseReport
+from .gaussian_map import GaussianMap
 
 FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
 
@@ -115,6 +115,16 @@ class ObservesPoses:
     ) -> ObservedMap:
         once = self.rules.iterations == 1
         return given.correct(mean, covariance, frame=self.frame, once=once)
+
+
+class PoseReport(UpdateReport):
+    """The results of a reading of the pose; no memory holds them."""
+
+    is_detached = False
+
+    def detach(self) -> None:
+        """Note that they are no longer the last ones."""
+        vars(self).update(is_detached=True)
 
 
 class PoseReading(NamedTuple):

@@ -84,17 +84,17 @@ class GaussianMap:
     #: Its parts by name.
     parts: Parts
     _slots: dict[int, int]
-    _last: Callable[[], ScanReport | PoseReport | None]
+    _last: Callable[[], Any]  # the last report: a `ScanReport`, or one like it
 
     def __init__(self, values: Sequence[float]) -> None:
         capacity = self.capacity_for(FIRST_LANDMARKS)
         self._become(new_block(capacity, FIRST_READINGS, np.array(values)))
 
     def _become(
-        self, block: Array, parts: Parts | None = None, report: PoseReport | None = None
+        self, block: Array, parts: Parts | None = None, last: Any = None
     ) -> None:
         parts = parts or parts_of(block)
-        vars(self).update(block=block, parts=parts, _slots={}, _last=lambda: report)
+        vars(self).update(block=block, parts=parts, _slots={}, _last=lambda: last)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the memory; its parts would be copied one by one."""
@@ -207,7 +207,7 @@ class GaussianMap:
         *,
         block: Array | None = None,
         steps: int = 0,
-        report: PoseReport | None = None,
+        report: UpdateReport | None = None,
     ) -> None:
         """Continue with another belief.
 
@@ -221,8 +221,8 @@ class GaussianMap:
             The memory to use.
         steps : int
             Number of steps that have led to this belief.
-        report : PoseReport, optional
-            Of the last of these steps.
+        report : UpdateReport, optional
+            Of the last of these steps, with ``detach`` as a `ScanReport`.
         """
         self._detach_report()
         if block is None:
@@ -594,16 +594,6 @@ class ScanRecord(NamedTuple):
         pair = (every - every % 2)[:, None] + (0, 1)
         factor[every[:, None], pair] = rows[:, gain.ROOT : gain.ROOT + 2]
         return factor
-
-
-class PoseReport(UpdateReport):
-    """The results of a reading of the pose; no memory holds them."""
-
-    is_detached = False
-
-    def detach(self) -> None:
-        """Note that they are no longer the last ones."""
-        vars(self).update(is_detached=True)
 
 
 class ScanReport(UpdateReport):
