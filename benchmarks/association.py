@@ -7,10 +7,10 @@
         --methods "1 hypothesis" hypotheses
 
 For each world and method, the table lists the median error of the path with known and
-with hidden identities, the lost runs (more than 1 m worse than with known identities),
+with hidden identities, the bad runs (more than 1 m worse than with known identities),
 the readings assigned to a wrong landmark, the landmarks mapped twice, the size of the
 map, precision and recall, and the time of a step as a multiple of that of the first
-method.  The lines below the table compare the share of lost runs of each method with
+method.  The lines below the table compare the share of bad runs of each method with
 that of the first one over the same drives: they state the difference with its 95 %
 interval (Agresti and Min, Statistics in Medicine 24, 2005).  With ``--resolution R``,
 true landmarks that are connected by gaps smaller than R [m] count as one.
@@ -179,7 +179,7 @@ def crowded_scan() -> float:
 
 
 def difference(lost: NDArray[np.bool_], of_first: NDArray[np.bool_]) -> str:
-    """Return how many more runs are lost than with the first method, in percent.
+    """Return how many more runs are bad than with the first method, in percent.
 
     The 95 % interval of this difference follows in brackets.
     """
@@ -227,7 +227,7 @@ def main() -> None:
         follow(make(world, management=policy_of(method, world)), drive(world, 0)[:30])
     print(f"12 readings against 60 landmarks, joint: {crowded_scan():.2f} ms\n")
     print(
-        "| world | method | known ids [m] | error [m] | lost | wrong | duplicate "
+        "| world | method | known ids [m] | error [m] | bad | wrong | duplicate "
         "| map | precision | recall | ms a step | of the first |"
     )
     print("|---" * 12 + "|")
@@ -248,7 +248,7 @@ def main() -> None:
             print(f"| {row} |", flush=True)
         first, *others = options.methods
         compared += [
-            f"{name}: lost runs of {other} less those of {first} [%]: "
+            f"{name}: bad runs of {other} less those of {first} [%]: "
             f"{difference(lost[other], lost[first])}"
             for other in others
         ]

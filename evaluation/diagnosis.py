@@ -307,15 +307,15 @@ POSE = 3
 LEAST_RATIO = 1.1
 #: Share of the smallest possible variance below which a reported one is false.
 KNOWABLE = 0.9
-#: Quantile of χ²(3) beyond which a run is lost, and its rate that is accepted.
-LOST_LEVEL, LOST_RATE = 1e-4, 1e-3
+#: Quantile of χ²(3) beyond which a run has diverged, and its rate that is accepted.
+DIVERGED_LEVEL, DIVERGED_RATE = 1e-4, 1e-3
 #: Shares of the excess: with less noise, that of the linearisation falls below the
 #: first, and that of a wrong model exceeds the second.
 SHRINKS, GROWS = 0.5, 3.0
 SMALLEST_NOISE = 0.01
 _CLEARLY, _MOST = 2.0, 0.75
 _FEWEST_OF_A_KIND = 5
-_FEWEST_LOST = 2
+_FEWEST_DIVERGED = 2
 
 
 class Errors(NamedTuple):
@@ -324,18 +324,18 @@ class Errors(NamedTuple):
     p_value: float
     #: NEES per degree over runs and steps, of pose or heading: farthest from 1.
     ratio: float
-    #: Number of lost runs.
-    lost: int
+    #: Number of diverged runs.
+    diverged: int
     #: "pose" or "heading".
     of: str
 
     @property
     def text(self) -> str:
         """The finding, for a sentence."""
-        lost = f", and {self.lost} runs are lost" if self.lost > 1 else ""
+        diverged = f", and {self.diverged} runs diverged" if self.diverged > 1 else ""
         return (
             f"the squared errors of the {self.of} are {self.ratio:.3g} times what the "
-            f"covariances state{lost}"
+            f"covariances state{diverged}"
         )
 
 
@@ -358,7 +358,7 @@ def errors_of(pose: Array, heading: Array) -> Errors:
     test uses the variance between runs instead of χ²: in a nonlinear world, the errors
     of a consistent filter vary more than Gaussian ones.  If a few runs have very large
     errors, this variance is so large that the test cannot reject.  A second test
-    therefore counts the lost runs.
+    therefore counts the diverged runs.
 
     Parameters
     ----------
@@ -369,30 +369,30 @@ def errors_of(pose: Array, heading: Array) -> Errors:
     """
     scores = [pose / POSE] + [heading] * bool(heading.size)
     averages = [score.mean(axis=1) for score in scores]
-    lost = int(lost_runs(pose).sum())
+    diverged = int(diverged_runs(pose).sum())
     p_values = [_beyond_margin(average) for average in averages]
-    p_values.append(float(bdtrc(lost - 1, len(pose), LOST_RATE)))
+    p_values.append(float(bdtrc(diverged - 1, len(pose), DIVERGED_RATE)))
     ratios = [float(average.mean()) for average in averages]
     ratio = max(ratios, key=lambda x: abs(np.log(x)))
     of = ("pose", "heading")[ratios.index(ratio)]
-    return Errors(min(1.0, len(p_values) * min(p_values)), ratio, lost, of)
+    return Errors(min(1.0, len(p_values) * min(p_values)), ratio, diverged, of)
 
 
-def lost_runs(pose: Array) -> BoolArray:
+def diverged_runs(pose: Array) -> BoolArray:
     """Return which runs have an average NEES that no consistent filter has, (M,).
 
     The average of a run varies most if its NEES does not change over time; it then has
     the distribution of one NEES.  Beyond its quantile 1 − 10⁻⁴, ten times as many runs
     are accepted as Gaussian errors would give.
     """
-    return np.asarray(pose.mean(axis=1) > chdtri(POSE, LOST_LEVEL))
+    return np.asarray(pose.mean(axis=1) > chdtri(POSE, DIVERGED_LEVEL))
 
 
 def runs_to_repeat(pose: Array, heading: Array) -> int:
     """Return how many of the first runs show what is left of the excess.
 
     They are a tenth of the runs, at least 10, where most runs err clearly; otherwise as
-    many as show half of the excess in 90 % of cases, or five lost runs.
+    many as show half of the excess in 90 % of cases, or five diverged runs.
 
     Parameters
     ----------
@@ -400,11 +400,11 @@ def runs_to_repeat(pose: Array, heading: Array) -> int:
         As for `errors_of`.
     """
     score, few = _averages(pose, heading), max(10, len(pose) // 10)
-    lost = np.flatnonzero(lost_runs(pose))
+    diverged = np.flatnonzero(diverged_runs(pose))
     if np.median(score) > _CLEARLY:
         needed = few
-    elif len(lost) > 1:
-        needed = int(lost[:5][-1]) + 1
+    elif len(diverged) > 1:
+        needed = int(diverged[:5][-1]) + 1
     else:
         excess = max(abs(float(score.mean()) - 1), LEAST_RATIO - 1)
         needed = math.ceil((3.5 * float(score.std()) / excess) ** 2)
@@ -418,7 +418,7 @@ def excess_of(
 
     With the average NEES per degree a of a run and b with less noise, the excess b − 1
     is tested against the shares `SHRINKS` and `GROWS` of a − 1 (t-test over runs).  If
-    most runs err clearly, or if some are lost, the answer is what most of these runs
+    most runs err clearly, or if some diverged, the answer is what most of these runs
     show, because a few of them make the average.
 
     Parameters
@@ -437,7 +437,7 @@ def excess_of(
         `LINEARISATION`, `WRONG_COVARIANCE`, `WRONG_MODEL` or `CANNOT_TELL`.
     sentence : str
     """
-    errors, lost = errors_of(pose, heading), lost_runs(pose)
+    errors, diverged = errors_of(pose, heading), diverged_runs(pose)
     both = {
         "pose": np.asarray(small.nees, float) / POSE,
         "heading": np.asarray(small.heading_nees, float),
@@ -446,7 +446,7 @@ def excess_of(
     if is_known.sum() < _FEWEST_OF_A_KIND:
         return CANNOT_TELL, "Too few runs succeed with less noise."
     many, few = _averages(pose, heading)[is_known], both[errors.of][is_known]
-    change = _change(many, few, lost[is_known], 1.0 if errors.ratio > 1 else -1.0)
+    change = _change(many, few, diverged[is_known], 1.0 if errors.ratio > 1 else -1.0)
     ratio = float(few.mean())
     rests = [
         float(rest.mean())
@@ -477,18 +477,18 @@ def excess_of(
             f"{found}, but the innovations are too large for linearisation: is an "
             "angle not wrapped?"
         )
-    if ratio > max(errors.ratio, 1.0):  # a few runs are lost with less noise, too
+    if ratio > max(errors.ratio, 1.0):  # a few runs diverge with less noise, too
         typical = f"those of the median run are {np.median(few):.3g} times"
         found = f"With {share} of the noise, {typical}"
     return LINEARISATION, f"{found}, so the excess vanishes with the noise."
 
 
-def _change(many: Array, few: Array, lost: BoolArray, sign: float) -> str:
+def _change(many: Array, few: Array, diverged: BoolArray, sign: float) -> str:
     """Return whether the excess "grows", "shrinks" or "stays", else ""."""
     before, after = sign * (many - 1), sign * (few - 1)
     chosen = np.ones(len(few), np.bool_)
-    if np.median(many) <= _CLEARLY and lost.sum() >= _FEWEST_LOST:
-        chosen = lost
+    if np.median(many) <= _CLEARLY and diverged.sum() >= _FEWEST_DIVERGED:
+        chosen = diverged
     if np.median(many[chosen]) > _CLEARLY:
         share = after[chosen] / before[chosen]
         shows = {
@@ -529,8 +529,8 @@ def blame_association(pose: Array, mistakes: Array, known: Array | None) -> Blam
 
     With known identities for comparison, two tests on the same runs: is the NEES larger
     than with known identities (Wilcoxon's signed-rank test), by a tenth or more on
-    average, and are more runs lost than with known identities?  Otherwise: do the
-    runs with more mistakes than the median have larger errors, and do the lost runs
+    average, and do more runs diverge than with known identities?  Otherwise: do the
+    runs with more mistakes than the median have larger errors, and do the diverged runs
     have more mistakes than others?
 
     Parameters
@@ -542,11 +542,11 @@ def blame_association(pose: Array, mistakes: Array, known: Array | None) -> Blam
     known : ndarray, shape (M, K), optional
         NEES of the same filter with known identities.
     """
-    share, lost = float(np.mean(mistakes > 0)), lost_runs(pose)
+    share, diverged = float(np.mean(mistakes > 0)), diverged_runs(pose)
     if known is None:
         many = mistakes > np.median(mistakes)
         larger = _larger(pose.mean(axis=1), many, _FEWEST_OF_A_KIND)
-        more = _larger(mistakes, lost, _FEWEST_LOST)
+        more = _larger(mistakes, diverged, _FEWEST_DIVERGED)
         text = "those with more mistakes err more"
         return Blame(min(1.0, 2 * min(larger, more)), share, text, is_paired=False)
     excess = (pose - known).mean(axis=1) / POSE
@@ -556,8 +556,8 @@ def blame_association(pose: Array, mistakes: Array, known: Array | None) -> Blam
         from scipy.stats import wilcoxon  # noqa: PLC0415 (slow to import)
 
         larger = float(wilcoxon(excess, alternative="greater").pvalue)
-    more_lost = int(lost.sum()) - int(lost_runs(known).sum())
-    more = float(bdtrc(more_lost - 1, len(pose), LOST_RATE))
+    more_diverged = int(diverged.sum()) - int(diverged_runs(known).sum())
+    more = float(bdtrc(more_diverged - 1, len(pose), DIVERGED_RATE))
     text = f"its NEES would be {ratio:.3g} per degree with known identities"
     return Blame(min(1.0, 2 * min(larger, more)), share, text, is_paired=True)
 

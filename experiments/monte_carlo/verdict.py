@@ -32,7 +32,7 @@ from ...evaluation.diagnosis import (
     Diagnosis,
     SmallNoise,
     diagnose,
-    lost_runs,
+    diverged_runs,
     p_text,
 )
 from ...evaluation.hypothesis_tests import EQUIVALENCE_MARGIN
@@ -404,7 +404,7 @@ def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def seeds_sentence(scores: EstimatorScores, frame: ErrorFrame, excess: Array) -> str:
-    """Name up to five runs by their seeds: failed, bad, or lost; empty for none.
+    """Name up to five runs by their seeds: failed, bad or diverged; "" for none.
 
     Parameters
     ----------
@@ -416,9 +416,11 @@ def seeds_sentence(scores: EstimatorScores, frame: ErrorFrame, excess: Array) ->
         Path error of each bad run [m], 0 of the others.
     """
     nees = scores.over_time(f"pose_nees_{frame}")[:, scores.first - 1 :]
-    lost = np.where(lost_runs(nees) & (not scores.is_fitted), nees.mean(axis=1), 0.0)
+    diverged = np.where(
+        diverged_runs(nees) & (not scores.is_fitted), nees.mean(axis=1), 0.0
+    )
     rows = [*np.flatnonzero(~scores.good)]
-    for badness in (excess, lost):
+    for badness in (excess, diverged):
         worst = np.argsort(-badness, kind="stable")[: np.count_nonzero(badness)]
         rows += [*np.flatnonzero(scores.good)[worst]]
     runs = scores.results["run"].values[list(dict.fromkeys(rows))]
@@ -427,7 +429,7 @@ def seeds_sentence(scores: EstimatorScores, frame: ErrorFrame, excess: Array) ->
     seeds = (runs[:_MOST_SEEDS] + int(scores.results.attrs["seed"])).tolist()
     more = f", the worst of {len(runs)}" if len(runs) > _MOST_SEEDS else ""
     return (
-        "failed, bad or lost runs (slamgym run --seed shows one): seed "
+        "failed, bad or diverged runs (slamgym run --seed shows one): seed "
         f"{', '.join(map(str, seeds))}{more}."
     )
 

@@ -235,7 +235,7 @@ def test_what_is_left_of_an_excess_with_less_noise_names_the_cause(
     assert found.repeat == 0
 
 
-def test_a_run_that_is_lost_with_less_noise_too_is_not_the_average_of_all():
+def test_a_run_that_diverges_with_less_noise_too_is_not_the_average_of_all():
     scores = wrong(11, 3.0)
     small = less_noise(scores, 0.001, factor=0.01)
     small.nees[0] = 3e7
@@ -382,13 +382,13 @@ def test_errors_that_known_identities_share_are_not_of_the_association():
         diagnose(**both | {"known_nees": known[:, 1:]})
 
 
-def test_a_few_lost_runs_are_not_called_honest():
+def test_a_few_diverged_runs_are_not_called_honest():
     scores, mistakes = honest(16), np.ones(RUNS)
     nees = scores["nees"].copy()
     nees[[3, 30, 50]] = nees[[3, 30, 50]] * [[60.0], [400.0], [15.0]]
     mistakes[[3, 30, 50]] = 5
     lost = scores | {"nees": nees}
-    assert "and 3 runs are lost" in diagnose(**lost).sentence
+    assert "and 3 runs diverged" in diagnose(**lost).sentence
     count = diagnose(**lost).repeat
     assert count == 51  # with all three
     for left, cause in ((0.0, "linearisation"), (1.0, "wrong covariance")):

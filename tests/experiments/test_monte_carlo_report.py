@@ -267,7 +267,7 @@ def test_notes_group_failures_and_warn_of_few_runs():
     assert summarise_monte_carlo(typical())["notes"] == []
 
 
-def test_seeds_of_failed_bad_and_lost_runs_are_told_the_worst_first():
+def test_seeds_of_failed_bad_and_diverged_runs_are_told_the_worst_first():
     dataset = with_failures(typical(), [("invariant", 3, 1, "boom")])
     dataset = dataset.copy(deep=True).assign_attrs(seed=100)
     nees = dataset["pose_nees_invariant"]
