@@ -20,28 +20,19 @@ from .ekf import EkfSlam
 class SensorLimits(Protocol):
     """What a sensor sees; ``Scenario.sensor`` has these attributes."""
 
-    @property
-    def min_range(self) -> float:
-        """Nearest visible landmark [m]."""
-
-    @property
-    def max_range(self) -> float:
-        """Farthest visible landmark [m]."""
-
-    @property
-    def field_of_view(self) -> float:
-        """Full angle of view, centred on the heading [rad]."""
-
-    @property
-    def occlusion(self) -> bool:
-        """Whether walls hide landmarks."""
-
-    @property
-    def dropout(self) -> float:
-        """Probability of losing a reading."""
+    #: Nearest visible landmark [m].
+    min_range: float
+    #: Farthest visible landmark [m].
+    max_range: float
+    #: Full angle of view, centred on the heading [rad].
+    field_of_view: float
+    #: Whether walls hide landmarks.
+    occlusion: bool
+    #: Probability of losing a reading.
+    dropout: float
 
 
-_LIMITS = ("min_range", "max_range", "field_of_view", "occlusion", "dropout")
+_LIMITS = tuple(SensorLimits.__annotations__)
 
 
 def imagine(

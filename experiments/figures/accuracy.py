@@ -107,14 +107,12 @@ def draw_against_truth(axes: Axes, trace: RunTrace) -> list[Artist]:
         _join(axes, trace.poses[steps, :2], truth[steps], width=0.8)
         keys.insert(1, line)
     if landmarks.any() and trace.true_landmarks is not None:
-        truth = trace.every_true_landmark
+        truth, mapped = trace.every_true_landmark, trace.true_landmarks[landmarks]
         size = 9 if len(truth) <= _FEW else 5
         (crosses,) = axes.plot(
             *truth.T, "+", color=style.INK, ms=size, mew=size / 7, label="true landmark"
         )
-        _join(
-            axes, trace.landmarks[landmarks], trace.true_landmarks[landmarks], width=1.6
-        )
+        _join(axes, trace.landmarks[landmarks], mapped, width=1.6)
         keys.append(crosses)
     return [*keys, Line2D([], [], color=style.ALARM, lw=1.4, label="error")]
 
