@@ -440,7 +440,7 @@ class HypothesisSlam:
         in the prior of z with R added, relative to N(0; 0, R).
         """
         parts = []
-        for h in self.hypotheses[:PER_BASIN]:
+        for h in self.hypotheses:
             for place in h.slam.places_of_scan(readings):
                 slam = self._pool.resumed(h.slam.snapshot())
                 reports = slam.move_to(*place)

@@ -55,6 +55,8 @@ Pairs = list[tuple[int, int]]
 LOCAL_REACH = 3.0
 #: Largest χ² of the offset of two landmarks that may be the same; 2 degrees.
 OFFSET_GATE = 25.0
+#: The same of a landmark and a reading after a turn of 1 rad and more, not linear.
+PLACE_GATE = 50.0
 #: Largest χ² of the offset of two landmarks that are the same; 2 degrees, 99 %.
 SAME_GATE = 9.21
 #: Landmarks around the robot are those more certain than this times lost ones.
@@ -178,6 +180,15 @@ def _named(view: MapView, kept: IntArray, gone: IntArray) -> Pairs:
     return [(view.ids[i], view.ids[j]) for i, j in pairs]
 
 
+def is_astray(view: MapView, rules: Constellations) -> bool:
+    """Return whether a robot with a map knows no landmark accurately."""
+    n = len(view.ids)
+    if n < FEWEST_READINGS:
+        return False
+    accurate = ACCURATE * rules.lost_std
+    return not _find_lost(*view[:2], accurate, np.zeros(n, dtype=np.bool_))[1]
+
+
 def places_of_scan(
     view: MapView,
     readings: Array,
@@ -211,16 +222,12 @@ def places_of_scan(
     ValueError
         If no landmark is known accurately, and a bearing is not finite.
     """
-    n = len(view.ids)
-    if rules is None or min(n, len(readings)) < FEWEST_READINGS:
-        return []
-    accurate = ACCURATE * rules.lost_std
-    if _find_lost(*view[:2], accurate, np.zeros(n, dtype=np.bool_))[1]:
+    if rules is None or len(readings) < FEWEST_READINGS or not is_astray(view, rules):
         return []
     r = readings[:, 1]
     readings = readings[(r >= min_range) & (r <= LARGEST)]
     argument_checks.refuse_unusable(readings)
-    feasible = _gaps(view, readings, noise) <= OFFSET_GATE
+    feasible = _gaps(view, readings, noise) <= PLACE_GATE
     partners, used = feasible.sum(axis=1), np.flatnonzero(feasible.any(axis=0))
     rows = np.argsort(partners, kind="stable")[(partners == 0).sum() :]
     if len(rows) < FEWEST_READINGS:

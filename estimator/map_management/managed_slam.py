@@ -47,7 +47,7 @@ from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
-from .loop_closing import AROUND, places_of_scan
+from .loop_closing import AROUND, is_astray, places_of_scan
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy
 from .pruning import LandmarkRecords, MapPruner
@@ -263,10 +263,20 @@ class ManagedSlam:
         """Associate readings (m, 2) without identity, in every way to consider.
 
         Of those that cost more than ``ceiling`` only the most likely is of interest.
+        Where the robot is astray, the last one defers the decision: it leaves all
+        readings out at the cost of the best, so that later scans decide.
         """
         argument_checks.refuse_unusable(readings)
         known, view = self.candidates, self._pruner.view_for(readings)
-        return associate(self._policy, known, readings, view, self._sensor, ceiling)
+        policy, sensor = self._policy, self._sensor
+        options = associate(policy, known, readings, view, sensor, ceiling)
+        around, rules = self._pruner.view_around(readings), policy.constellations
+        if rules is not None and len(readings) and is_astray(around, rules):
+            deferred = ScanAssociation(policy, known, readings)
+            deferred.explained.update(around.ids)
+            deferred.ambiguous_rows.extend(range(len(readings)))
+            options.append((options[0][0], lambda: deferred))
+        return options
 
     def places_of_scan(self, readings: Array) -> list[tuple[Array, IntArray]]:
         """Return places that a scan (m, 2) shows, see :func:`places_of_scan`.
