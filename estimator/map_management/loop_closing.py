@@ -34,6 +34,7 @@ import numpy as np
 from ...arrays import LARGEST, Array, BoolArray, IntArray
 from ...jit import jit
 from ..association.constellations import (
+    LARGEST_GRAPH,
     Constellations,
     TwoPlaces,
     agreeing_pairs,
@@ -55,8 +56,6 @@ Pairs = list[tuple[int, int]]
 LOCAL_REACH = 3.0
 #: Largest χ² of the offset of two landmarks that may be the same; 2 degrees.
 OFFSET_GATE = 25.0
-#: The same of a landmark and a reading after a turn of 1 rad and more, not linear.
-PLACE_GATE = 50.0
 #: Largest χ² of the offset of two landmarks that are the same; 2 degrees, 99 %.
 SAME_GATE = 9.21
 #: Landmarks around the robot are those more certain than this times lost ones.
@@ -72,6 +71,8 @@ SLACK = 0.2
 AROUND = np.diag([0.25, 0.25, 0.0225])
 #: Added to variances that may be zero [m², rad²].
 TINY = 1e-12
+#: Gauss-Newton steps for the turn of the robot, each from two beginnings.
+TURNS = 4
 #: Least number of readings that recognise a place, and most places of a scan.
 FEWEST_READINGS, MOST_PLACES = 3, 4
 
@@ -227,7 +228,9 @@ def places_of_scan(
     r = readings[:, 1]
     readings = readings[(r >= min_range) & (r <= LARGEST)]
     argument_checks.refuse_unusable(readings)
-    feasible = _gaps(view, readings, noise) <= PLACE_GATE
+    gaps = _gaps(view, readings, noise)
+    compared = np.sort(gaps, axis=None)[:LARGEST_GRAPH]
+    feasible = gaps <= min(OFFSET_GATE, compared.max(initial=0.0))
     partners, used = feasible.sum(axis=1), np.flatnonzero(feasible.any(axis=0))
     rows = np.argsort(partners, kind="stable")[(partners == 0).sum() :]
     if len(rows) < FEWEST_READINGS:
@@ -249,28 +252,39 @@ def places_of_scan(
 def _gaps(view: MapView, readings: Array, noise: Noise) -> Array:
     """Return χ² of readings (m, 2) and landmarks, shape (m, n).
 
-    It is the lower one of two: of their offset, and of the scan turned by φ about the
-    robot until the reading points to the landmark.  The latter is that of φ and of what
-    is then left, the difference of both distances; the noise across the line of sight
-    is neglected.
+    If the robot is turned by φ, the offset of a landmark is Gaussian with the mean
+    d + φ c / σ², where c is its covariance with the heading, and the reading shows the
+    offset z(φ)::
+
+        χ² = min over φ of φ² / σ² + ‖z(φ) − d − φ c / σ²‖²
+
+    Gauss-Newton steps begin at 0, and where the reading points to the landmark.
     """
     n, P = len(view.ids), view.covariance
+    variance, r = P[2, 2] + TINY, readings[:, 1, None, None]
+    across_std, along_std = np.sqrt(noise.variances(readings[:, 1])).T[..., None, None]
     d = view.landmarks - view.mean[:2]
-    turn = np.arctan2(d[:, 1], d[:, 0]) - view.mean[2] - readings[:, :1]
-    away = np.hypot(*d.T)
     cross = P[3 : 3 + 2 * n, :3].reshape(n, 2, 3) - P[:2, :3]
+    lever = cross[..., 2] / variance
     C = view.landmark_covariances - P[:2, :2] - cross[..., :2] - cross[..., :2].mT
-    along = np.einsum("ni,nij,nj->n", d, C, d) / (away**2 + TINY)
-    variances = noise.variances(readings[:, 1])[:, 1:]
-    turned = (readings[:, 1:] - away) ** 2 / (along + variances + TINY)
-    turned += wrap_angle(turn) ** 2 / (P[2, 2] + TINY)
-    # The error of the offset is e_l − e_p − J d e_θ, and the noise of the reading.
-    lever = d[:, ::-1, None] * [[-1.0], [1.0]]
-    half = lever * (P[2, 2] / 2 * lever - cross[..., 2:]).mT
-    places, _, spread = located(view.mean[:3], readings, noise)
-    C = spread[:, None] + (C + half + half.mT)
-    shifted = squared_offsets(places[:, None] - view.landmarks, C)
-    return np.asarray(np.minimum(turned, shifted))
+    C = C - variance * lever[:, :, None] * lever[:, None]
+    ahead, found = view.mean[2] + readings[:, :1], np.inf
+    pointing = wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - ahead)
+    for begin in (np.zeros_like(pointing), pointing):
+        turn = begin
+        for _ in range(TURNS):
+            along = np.stack([np.cos(ahead + turn), np.sin(ahead + turn)], axis=-1)
+            across = along[..., ::-1] * (-1.0, 1.0)
+            stds = along_std * along, r * across_std * across
+            S = C + sum(x[..., :, None] * x[..., None, :] for x in stds)
+            slope = r * across - lever
+            gap = r * along - d - turn[..., None] * lever
+            found = np.minimum(found, turn**2 / variance + squared_offsets(gap, S))
+            start = gap - turn[..., None] * slope
+            own, rest = squared_offsets(slope, S), squared_offsets(start, S)
+            both = squared_offsets(slope + start, S) - own - rest
+            turn = np.clip(-both / 2 / (own + 1 / variance), -np.pi, np.pi)
+    return np.asarray(found)
 
 
 def _with_readings(view: MapView, readings: Array, noise: Noise) -> MapView:

@@ -47,7 +47,7 @@ from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
-from .loop_closing import AROUND, is_astray, places_of_scan
+from .loop_closing import AROUND, FEWEST_READINGS, is_astray, places_of_scan
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy
 from .pruning import LandmarkRecords, MapPruner
@@ -263,8 +263,9 @@ class ManagedSlam:
         """Associate readings (m, 2) without identity, in every way to consider.
 
         Of those that cost more than ``ceiling`` only the most likely is of interest.
-        Where the robot is astray, the last one defers the decision: it leaves all
-        readings out at the cost of the best, so that later scans decide.
+        Where the robot is astray, and the best one knows too few landmarks to recognise
+        a place, the last one defers the decision to later scans: it leaves all readings
+        out, at the cost of the best.
         """
         argument_checks.refuse_unusable(readings)
         known, view = self.candidates, self._pruner.view_for(readings)
@@ -272,10 +273,12 @@ class ManagedSlam:
         options = associate(policy, known, readings, view, sensor, ceiling)
         around, rules = self._pruner.view_around(readings), policy.constellations
         if rules is not None and len(readings) and is_astray(around, rules):
+            cost, best = options[0]
             deferred = ScanAssociation(policy, known, readings)
             deferred.explained.update(around.ids)
             deferred.ambiguous_rows.extend(range(len(readings)))
-            options.append((options[0][0], lambda: deferred))
+            if sum(i is not None for i in best().row_ids) < FEWEST_READINGS:
+                options.append((cost, lambda: deferred))
         return options
 
     def places_of_scan(self, readings: Array) -> list[tuple[Array, IntArray]]:
