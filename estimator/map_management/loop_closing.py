@@ -267,7 +267,7 @@ def _gaps(view: MapView, readings: Array, noise: Noise) -> Array:
     cross = P[3 : 3 + 2 * n, :3].reshape(n, 2, 3) - P[:2, :3]
     lever = cross[..., 2] / variance
     C = view.landmark_covariances - P[:2, :2] - cross[..., :2] - cross[..., :2].mT
-    C = C - variance * lever[:, :, None] * lever[:, None]
+    C = C - variance * lever[:, :, None] * lever[:, None] + TINY * np.eye(2)
     ahead, found = view.mean[2] + readings[:, :1], np.inf
     pointing = wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - ahead)
     for begin in (np.zeros_like(pointing), pointing):
