@@ -16,7 +16,8 @@ accurate and passes the gate.
 A robot that knows the relative position of no landmark accurately, as after a gap in
 the readings, is too far from its estimate for linearised innovations: they exclude the
 right landmarks.  The readings of one scan then form the constellation, and the places
-where it fits best become parts of the belief, as in a Gaussian sum filter [1]_.
+where it fits best become parts of the belief, as in a Gaussian sum filter [1]_.  Where
+a scan shows too few of its landmarks, one hypothesis leaves it out.
 
 References
 ----------
@@ -258,7 +259,8 @@ def _gaps(view: MapView, readings: Array, noise: Noise) -> Array:
 
         χ² = min over φ of φ² / σ² + ‖z(φ) − d − φ c / σ²‖²
 
-    Gauss-Newton steps begin at 0, and where the reading points to the landmark.
+    Gauss-Newton steps begin at 0, and where the reading points to the landmark.  They
+    neglect that the noise of the reading turns with it.
     """
     n, P = len(view.ids), view.covariance
     variance, r = P[2, 2] + TINY, readings[:, 1, None, None]
