@@ -269,7 +269,10 @@ def _gaps(view: MapView, readings: Array, noise: Noise) -> Array:
     cross = P[3 : 3 + 2 * n, :3].reshape(n, 2, 3) - P[:2, :3]
     lever = cross[..., 2] / variance
     C = view.landmark_covariances - P[:2, :2] - cross[..., :2] - cross[..., :2].mT
-    C = C - variance * lever[:, :, None] * lever[:, None] + TINY * np.eye(2)
+    C = C - variance * lever[:, :, None] * lever[:, None]
+    size = np.trace(view.landmark_covariances + P[:2, :2], axis1=1, axis2=2)
+    size = size[:, None, None] + (along_std**2 + (r * across_std) ** 2)[..., None]
+    C = C + TINY * (1 + size) * np.eye(2)  # rounded, it might be singular
     ahead, found = view.mean[2] + readings[:, :1], np.inf
     pointing = wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - ahead)
     for begin in (np.zeros_like(pointing), pointing):

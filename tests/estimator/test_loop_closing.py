@@ -392,6 +392,18 @@ def test_a_reading_is_as_far_from_a_landmark_as_it_is_in_a_map_with_both():
         assert (gaps[~may_be] > OFFSET_GATE).all()
 
 
+@pytest.mark.parametrize("std", [1.0, 1e3])
+def test_readings_fit_along_the_only_line_on_which_the_robot_may_be(std):
+    for direction in np.linspace(0.1, 3.0, 8):
+        line, P = np.array([np.cos(direction), np.sin(direction)]), np.zeros((17, 17))
+        P[:2, :2] = std**2 * np.outer(line, line)
+        view = MapView(np.append([0.3, 0.2, 0.5], PLACE), P, range(7))
+        where = view.mean[:3] + np.append(2 * std * line, 0.0)
+        gaps = _gaps(view, readings_of(PLACE, where), Noise(0.0, 0.0))
+        np.testing.assert_allclose(gaps.diagonal(), 4.0, rtol=1e-3)
+        assert (gaps[~np.eye(7, dtype=bool)] > OFFSET_GATE).all()
+
+
 TURNS = np.linspace(-np.pi, np.pi, 4001)
 
 
