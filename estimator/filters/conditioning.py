@@ -123,8 +123,7 @@ class PoseReport(UpdateReport):
     is_detached = False
 
     def detach(self) -> None:
-        """Note that they are no longer the last ones."""
-        vars(self).update(is_detached=True)
+        """Change nothing: the results are copies."""
 
 
 class PoseReading(NamedTuple):

@@ -94,7 +94,11 @@ class GaussianMap:
         self, block: Array, parts: Parts | None = None, last: Any = None
     ) -> None:
         parts = parts or parts_of(block)
-        vars(self).update(block=block, parts=parts, _slots={}, _last=lambda: last)
+
+        def newest() -> Any:  # until a scan is taken in
+            return None if parts.numbers[SCANNED] else last
+
+        vars(self).update(block=block, parts=parts, _slots={}, _last=newest)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the memory; its parts would be copied one by one."""
@@ -109,7 +113,7 @@ class GaussianMap:
         self._detach_report()
         starts = slice(STARTS, NUMBERS)
         if memory[starts].tobytes() == self.block[starts].tobytes():
-            self._slots, self.block[:] = {}, memory
+            self._slots, self._last, self.block[:] = {}, type(None), memory
         else:
             self._become(aligned_copy(memory))
 

@@ -6,7 +6,7 @@ from comparison import assert_close_beliefs, assert_same_bits, digest
 from dense_family import TWINS, DenseAdaptiveInvariant, DenseInvariant, belief_of
 from dense_family import tell_truth as tell
 from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
-from interrupts import assert_all_or_nothing
+from interrupts import assert_all_or_nothing, is_interrupted, lines_of
 
 from slamgym.estimator import make_batch, make_estimator
 from slamgym.estimator.filters import conditioning
@@ -228,6 +228,20 @@ def test_a_filter_returns_the_report_of_a_reading_until_the_next_scan():
         assert slam.report() is report
         slam.resume(before)
         assert slam.report() == first
+
+
+def test_a_reading_keeps_its_report_where_a_later_step_changes_nothing():
+    slam, ((odometry, readings, seen, _, given), *_) = make("ekf"), steps_of(4, 5)
+    slam.predict(odometry)
+    slam.update(readings, seen.tolist())
+    report = slam.observe_pose(*given)
+    with pytest.raises(ValueError, match="landmark_ids"):
+        slam.update([(0.5, 4.0)] * 2, [0, 0])
+    assert slam.report() is report
+    for line in range(lines_of(lambda: slam.observe_pose(*given))):
+        report, steps = slam.observe_pose(*given), slam.steps
+        assert is_interrupted(lambda: slam.observe_pose(*given), line)
+        assert (slam.report() is report) == (slam.steps == steps)
 
 
 @pytest.mark.parametrize("association", ["nearest", "hypotheses"])
