@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from math import log
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -439,9 +441,10 @@ class HypothesisSlam:
         the metric of R, where z is the pose relative to them.  Its weight is that of c
         in the prior of z with R added, relative to N(0; 0, R).
         """
-        parts = []
-        for h in self.hypotheses:
-            for place in h.slam.places_of_scan(readings):
+        parts: list[Hypothesis] = []
+        found = ((h, h.slam.places_of_scan(readings)) for h in self.hypotheses)
+        for h, places in islice(filter(itemgetter(1), found), PER_BASIN):
+            for place in places:
                 slam = self._pool.resumed(h.slam.snapshot())
                 reports = slam.move_to(*place)
                 if all(report.degrees_of_freedom for report in reports):

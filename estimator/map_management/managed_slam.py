@@ -272,7 +272,9 @@ class ManagedSlam:
         policy, sensor = self._policy, self._sensor
         options = associate(policy, known, readings, view, sensor, ceiling)
         around, rules = self._pruner.view_around(readings), policy.constellations
-        if rules is not None and len(readings) and is_astray(around, rules):
+        if rules is None or policy.association != "hypotheses" or not len(readings):
+            return options
+        if is_astray(around, rules):
             cost, best = options[0]
             deferred = ScanAssociation(policy, known, readings)
             deferred.explained.update(around.ids)
