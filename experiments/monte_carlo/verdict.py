@@ -159,9 +159,8 @@ def _verdict_on_successes(report: ConsistencyReport) -> Verdict:
     interval = f"the 90 % interval of the ratio, [{low:.3f}, {high:.3f}]"
     refusal = _refusal(report)
     if refusal and _is_near_everywhere(report):
-        return Verdict(
-            NEARLY, f"{refusal}, which is certain but small: {interval}, {_INSIDE}"
-        )
+        small = f"which is certain but small: {interval}, {_INSIDE}"
+        return Verdict(NEARLY, f"{refusal}, {small}")
     if refusal:
         return Verdict(NOT_CONSISTENT, refusal + _outliers(report))
     if verdict.accepted:
@@ -415,16 +414,11 @@ def seeds_sentence(scores: EstimatorScores, frame: ErrorFrame, excess: Array) ->
     excess : ndarray, shape (M,)
         Path error of each bad run [m], 0 of the others.
     """
-    nees = scores.over_time(f"pose_nees_{frame}")[:, scores.first - 1 :]
-    diverged = np.where(
-        diverged_runs(nees) & (not scores.is_fitted), nees.mean(axis=1), 0.0
-    )
-    rows = [*np.flatnonzero(~scores.good)]
-    for badness in (excess, diverged):
-        worst = np.argsort(-badness, kind="stable")[: np.count_nonzero(badness)]
-        rows += [*np.flatnonzero(scores.good)[worst]]
-    runs = scores.results["run"].values[list(dict.fromkeys(rows))]
-    if not len(runs):
+    nees = POSE_FREEDOM * scores.ratios(frame)
+    diverged = nees.mean(axis=1) * (diverged_runs(nees) & (not scores.is_fitted))
+    worst = np.lexsort((-diverged, -excess))[: np.count_nonzero(excess + diverged)]
+    rows = [*np.flatnonzero(~scores.good), *np.flatnonzero(scores.good)[worst]]
+    if not (runs := scores.results["run"].values[rows]).size:
         return ""
     seeds = (runs[:_MOST_SEEDS] + int(scores.results.attrs["seed"])).tolist()
     more = f", the worst of {len(runs)}" if len(runs) > _MOST_SEEDS else ""
