@@ -161,20 +161,18 @@ def diagnose(
         return _of_the_noise(guilty, errors)
     before = "" if sums is None else "the noise is as assumed, but "
     blame = _blamed(pose, nees, mistakes, known_nees)
-    knowledge = (
-        None if heading_knowledge is None else np.asarray(heading_knowledge, float)
+    knowledge = np.asarray(
+        [] if heading_knowledge is None else heading_knowledge, float
     )
-    spurious = None if knowledge is None else spurious_knowledge(knowledge)
+    spurious = spurious_knowledge(knowledge) if knowledge.size else None
     p_value = smallest_adjusted(errors, spurious, blame)
     if p_value >= FILTER_RATE and not rejected:
         return _of_consistent_errors(before, p_value, nis_ratio or 0.0, blame)
     if _is_of_the_association(blame, errors):
         return _of_the_association(before, blame, errors)
     if p_value >= FILTER_RATE and 1 / LEAST_RATIO < errors.ratio < LEAST_RATIO:
-        text = (
-            f"cannot tell: {before}a test rejects the filter, although {errors.text}."
-        )
-        return Diagnosis(CANNOT_TELL, p_value, text)
+        text = f"{before}a test rejects the filter, although {errors.text}."
+        return Diagnosis(CANNOT_TELL, p_value, f"cannot tell: {text}")
     what = f"{before}{errors.text} ({p_text(p_value)})"
     what += _also(knowledge, spurious, nis_ratio)
     if small_noise is None:
@@ -200,12 +198,10 @@ def _blamed(
     return blame_association(pose, np.asarray(mistakes, float), paired)
 
 
-def _also(
-    knowledge: Array | None, spurious: float | None, nis_ratio: float | None
-) -> str:
+def _also(knowledge: Array, spurious: float | None, nis_ratio: float | None) -> str:
     """Write what else is wrong with an overconfident filter."""
     text = ""
-    if knowledge is not None and spurious is not None and spurious < _ERROR_RATE:
+    if spurious is not None and spurious < _ERROR_RATE:
         text += (
             f"; the filter reports {100 * knowledge.mean():.2g} % of the smallest "
             "heading variance that any filter can reach"
@@ -241,9 +237,8 @@ def _of_the_noise(guilty: list[noise_findings.Finding], errors: Errors) -> Diagn
     first = guilty[0]
     others = dict.fromkeys(f.cause for f in guilty[1:] if f.cause != first.cause)
     also = f"; also {', '.join(others)}" if others else ""
-    sentence = (
-        f"{first.cause}: {first.text} ({p_text(first.p_value)}){also}; {errors.text}."
-    )
+    found = f"{first.cause}: {first.text} ({p_text(first.p_value)})"
+    sentence = f"{found}{also}; {errors.text}."
     return Diagnosis(first.cause, first.p_value, sentence, tuple(others))
 
 
@@ -585,9 +580,6 @@ def smallest_adjusted(
     errors: Errors, spurious: float | None, blame: Blame | None
 ) -> float:
     """Return the smallest p-value of the tests of a filter, times their number."""
-    tests = [errors.p_value]
-    if spurious is not None:
-        tests.append(spurious)
-    if blame is not None and blame.is_paired:
-        tests.append(blame.p_value)
+    blamed = blame.p_value if blame is not None and blame.is_paired else None
+    tests = [p for p in (errors.p_value, spurious, blamed) if p is not None]
     return min(1.0, len(tests) * min(tests))
