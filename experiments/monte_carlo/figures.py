@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from ...arrays import AnyArray, Array
-from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation.hypothesis_tests import (
     autocorrelation,
     average_band,
@@ -55,12 +54,6 @@ class Study(NamedTuple):
         if not (shown := _shown(results, summary)):
             raise ValueError("results must hold an estimator with a successful run")
         return cls(shown, summary, width_mm / _MM, _title(summary))
-
-    @property
-    def frame(self) -> ErrorFrame:
-        """Error frame of the NEES."""
-        frame: ErrorFrame = self.summary["frame"]
-        return frame
 
 
 _MM = 25.4  # in an inch
@@ -147,7 +140,7 @@ def nees_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
         If no estimator has a successful run.
     """
     study = Study.of(results, width_mm)
-    shown, frame, summary = study.shown, study.frame, study.summary
+    shown, summary, frame = study.shown, study.summary, study.summary["frame"]
     figure = new_figure(study.width, 2.9)
     axes = figure.subplots()
     runs = max(int(scores.good.sum()) for scores, _ in shown)
@@ -177,7 +170,7 @@ def runs_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
     Parameters, result and errors are those of :func:`nees_figure`.
     """
     study = Study.of(results, width_mm)
-    shown, frame = study.shown, study.frame
+    shown, frame = study.shown, study.summary["frame"]
     figure = new_figure(study.width, 0.8 + 1.0 * len(shown))
     axes = figure.subplots()
     size = 3.4 if len(shown[0][0].good) <= _FEW_DOTS else 2.6
@@ -476,12 +469,11 @@ def pooled_nis(scores: EstimatorScores) -> tuple[Array, Array, Array]:
     """
     freedom = scores.over_time("nis_dof")
     nis = np.where(freedom > 0, scores.over_time("nis"), 0.0)
-    blocks = np.array_split(
-        np.arange(len(scores.steps)), min(_MOST_BLOCKS, len(scores.steps))
-    )
+    steps = scores.steps
+    blocks = np.array_split(np.arange(len(steps)), min(_MOST_BLOCKS, len(steps)))
     totals = np.array([nis[:, block].sum() for block in blocks])
     counts = np.array([freedom[:, block].sum() for block in blocks], dtype=np.float64)
-    middles = np.array([scores.steps[block].mean() for block in blocks])
+    middles = np.array([steps[block].mean() for block in blocks])
     used = counts > 0
     return middles[used], totals[used] / counts[used], counts[used]
 

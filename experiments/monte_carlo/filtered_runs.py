@@ -145,9 +145,8 @@ def _run(batch: BatchSlam, runs: SimulatedRuns) -> BatchTrace:
         begin = end
     if len(traces) == 1:
         return traces[0]
-    return BatchTrace(
-        *(np.concatenate(parts, axis=1) for parts in zip(*traces, strict=True))
-    )
+    parts = zip(*traces, strict=True)
+    return BatchTrace(*(np.concatenate(part, axis=1) for part in parts))
 
 
 def _renamed(belief: interface.Belief, runs: SimulatedRuns) -> interface.Belief:
