@@ -136,11 +136,9 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
             write_html_report(results, summary, partial)
         with replace_own(place / SUMMARY) as partial:
             partial.write_text(as_json_text(summary), encoding="utf-8")
-    more = []
-    if share := results.attrs.get(SMALL_NOISE_SHARE):
-        text = f"Runs with less noise, which show causes, took {share:.0%} of the time."
-        more.append(text)
-    return show_study(reporter, summary, place, *more)
+    share = results.attrs.get(SMALL_NOISE_SHARE, 0.0)
+    more = f"Runs with less noise, which show causes, took {share:.0%} of the time."
+    return show_study(reporter, summary, place, *[more] * bool(share))
 
 
 def show_study(
@@ -184,10 +182,7 @@ _HERE = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
 _INTERVAL = 1.0  # between looks at the workers of a local cluster [s]
 
 
-@contextlib.contextmanager
-def connected(
-    backend: str | None, scheduler: str | None, jobs: int | None
-) -> Iterator[None]:
+def connected(backend: str | None, scheduler: str | None, jobs: int | None) -> Any:
     """Connect to a cluster, or start one on this machine, for the block.
 
     Parameters
@@ -205,12 +200,10 @@ def connected(
         If the backend is not installed, or none that has a scheduler.
     """
     if backend == "dask":
-        with _dask_client(scheduler, jobs):
-            yield
-        return
+        return _dask_client(scheduler, jobs)
     if scheduler is not None:
         _join_ray(backend, scheduler)
-    yield
+    return contextlib.nullcontext()
 
 
 def _dask_client(scheduler: str | None, jobs: int | None) -> Any:
