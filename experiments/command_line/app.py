@@ -6,6 +6,7 @@ it imports what is heavy when it runs, so that help answers at once.
 # ruff: noqa: I001 (the order of the imports is the order of the commands in the help)
 
 import inspect
+from collections.abc import Sequence
 from typing import Any
 
 from . import run, replay, fit_noise, monte_carlo, generate  # noqa: F401
@@ -33,16 +34,8 @@ def scenarios(*, given: Options) -> None:
     from ...sim_configs import list_presets, load_scenario
 
     each = [(name, load_scenario(name)) for name in list_presets()]
-    rows = [
-        {
-            "name": name,
-            "landmarks": scenario.landmarks.count,
-            "steps": scenario.steps,
-            "description": scenario.description,
-        }
-        for name, scenario in each
-    ]
-    _show("scenarios", rows, given.reporter())
+    rows = [(name, x.landmarks.count, x.steps, x.description) for name, x in each]
+    _show("scenarios", "name landmarks steps description", rows, given.reporter())
 
 
 @command
@@ -61,22 +54,20 @@ def estimators(*, given: Options) -> None:
     from ...estimator.peers.catalogue import list_peers
     from ...estimator.registry import find_estimator, list_estimators
 
-    keys = "name", "library", "installed", "description"
     each = [
         (name, "slamgym", True, inspect.getdoc(find_estimator(name)) or "")
         for name in list_estimators()
     ]
     each += [(p.name, p.library, p.installed, p.description) for p in list_peers()]
-    rows = [
-        dict(zip(keys, (*facts, text.partition("\n")[0]), strict=True))
-        for *facts, text in each
-    ]
-    _show("estimators", rows, given.reporter())
+    rows = [(*facts, text.partition("\n")[0]) for *facts, text in each]
+    _show("estimators", "name library installed description", rows, given.reporter())
 
 
-def _show(what: str, rows: list[dict[str, Any]], reporter: Reporter) -> None:
+def _show(what: str, keys: str, facts: Sequence[Any], reporter: Reporter) -> None:
+    """Print rows of facts below their keys, or both as JSON."""
     from rich.table import Table
 
+    rows = [dict(zip(keys.split(), each, strict=True)) for each in facts]
     table = Table(box=None, pad_edge=False)
     for key in rows[0]:
         numeric = type(rows[0][key]) is int
