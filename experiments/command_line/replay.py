@@ -117,12 +117,8 @@ def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
     from .tables import heading, smoothing_figures, smoothing_table, written
 
     name, own = read_label(given.estimator)
-    chosen = given.named_options()
-    if given.robust is not None:
-        chosen["robust"] = given.robust
-    chosen |= (
-        options.assignments("--option", given.option_texts) | own | {"follow": name}
-    )
+    robust = {} if given.robust is None else {"robust": given.robust}
+    chosen = robust | given.filter_options() | own | {"follow": name}
     reporter = given.reporter()
     drive = given.read(log, reporter)
     stated = given.stds()
