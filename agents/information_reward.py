@@ -25,8 +25,10 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
+from ..envs.vector.wrappers import layers
 from ..estimator.filters.batch import BatchBeliefs
 from ..sim_configs import Scenario
+from ..sim_configs.field_types import unknown_choice
 from .belief_features import world_bounds
 from .belief_observation import BeliefObservation
 
@@ -73,9 +75,7 @@ CRITERIA = {"D": d_optimality, "A": a_optimality, "E": e_optimality}
 def check_criterion(criterion: str) -> None:
     """Raise a `ValueError` if there is no such criterion."""
     if criterion not in CRITERIA:
-        raise ValueError(
-            f"criterion must be one of {', '.join(CRITERIA)}, got {criterion!r}"
-        )
+        raise ValueError(unknown_choice("criterion", criterion, CRITERIA))
 
 
 def map_covariances(beliefs: BatchBeliefs, prior_std: ArrayLike) -> Array:
@@ -212,7 +212,7 @@ class InformationReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
         )
         super().__init__(env)
         check_criterion(criterion)
-        if not _observes_beliefs(env):
+        if not any(isinstance(layer, BeliefObservation) for layer in layers(env)):
             raise ValueError(
                 "env must have a BeliefObservation among its wrappers, got "
                 f"{type(env).__name__}"
@@ -254,11 +254,3 @@ class InformationReward(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructor
     def _measure(self) -> float:
         beliefs = self.env.get_wrapper_attr("beliefs")
         return float(uncertainty(beliefs, self._criterion, self._prior_std)[0])
-
-
-def _observes_beliefs(env: gymnasium.Env[Any, Any]) -> bool:
-    while isinstance(env, gymnasium.Wrapper):
-        if isinstance(env, BeliefObservation):
-            return True
-        env = env.env
-    return False

@@ -11,7 +11,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
+from gymnasium import Wrapper, spaces
 from gymnasium.spaces.utils import flatten_space
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
@@ -162,7 +162,7 @@ class _Adapter:
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """Return whether a wrapper of this class is around the vector environment."""
-        wrapped = any(isinstance(env, wrapper_class) for env in _layers(self.worlds))
+        wrapped = any(isinstance(env, wrapper_class) for env in layers(self.worlds))
         return [wrapped for _ in self._get_indices(indices)]
 
     def _per_world(self, value: Any, indices: Any) -> list[Any]:
@@ -170,8 +170,9 @@ class _Adapter:
         return [value[i] if own else value for i in self._get_indices(indices)]
 
 
-def _layers(env: Any) -> Iterable[Any]:
-    while isinstance(env, VectorWrapper):
+def layers(env: Any) -> Iterable[Any]:
+    """Yield an environment, or a vector of them, and what it wraps, layer by layer."""
+    while isinstance(env, Wrapper | VectorWrapper):
         yield env
         env = env.env
     yield env

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ...sim_configs.field_types import unknown_choice
 from .monte_carlo import show_study
 from .options import FilesOfEstimates, Options, declared, takes
 from .program import BadInputError, command
@@ -69,9 +70,7 @@ def judge(files: FilesOfEstimates, *, given: JudgeOptions) -> int:
     from .output_folder import default_folder, output_folder, write_summary
 
     if given.frame not in ERROR_FRAMES:
-        raise BadInputError(
-            f"--frame must be one of {', '.join(ERROR_FRAMES)}, got {given.frame!r}"
-        )
+        raise BadInputError(unknown_choice("--frame", given.frame, ERROR_FRAMES))
     error: Any = given.frame
     reporter = given.reporter()
     with reporter.warnings():
