@@ -38,9 +38,8 @@ def landmark_table(summary: dict[str, Any]) -> Table:
         count = _FEWER if summary.get("others") else _WORST
         shown = sorted(rows, key=_distance, reverse=True)[:count]
         which = ("first", "largest errors")[known]
-        caption = Text(
-            f"the {len(shown)} {which} of {len(rows)}; all: summary.json", "dim"
-        )
+        told = f"the {len(shown)} {which} of {len(rows)}; all: summary.json"
+        caption = Text(told, "dim")
     title = "Landmarks, with their distances from the truth" * known or "Landmarks"
     headings = ["id", "x [m]", "y [m]"]
     headings += ["Euclidean [m]", "Mahalanobis [σ]"] if known else []
@@ -102,7 +101,8 @@ def key_figures(summary: dict[str, Any]) -> Table:
     are_compared = bool(summary.get("others"))  # a table of its own has these
     for name, key in (("path error", "ate"), ("map error", "landmark_rmse")):
         if summary[key] is not None and not are_compared:
-            rows.append((name, _rmse(summary[key])))
+            raw, aligned = (significant(summary[key][k]) for k in ("raw", "aligned"))
+            rows.append((name, f"{raw} m RMS; {aligned} m after alignment"))
     if never := summary["never_placed"]:
         more = ", …" * (len(never) > _MOST_ROWS)
         names = ", ".join(map(str, never[:_MOST_ROWS]))
@@ -135,11 +135,6 @@ def _pose(
         std = math.sqrt(max(variance, 0.0)) if variance is not None else None
         parts.append(f"{name} {_number(pose[k], 3)} ± {_number(std, 3)} {unit}")
     return ", ".join(parts)
-
-
-def _rmse(errors: dict[str, float | None]) -> str:
-    raw, aligned = (significant(errors[key]) for key in ("raw", "aligned"))
-    return f"{raw} m RMS; {aligned} m after alignment"
 
 
 def _ratio(numbers: dict[str, Any], hint: Sequence[str]) -> str:
@@ -204,12 +199,11 @@ def smoothing_table(summary: dict[str, Any]) -> Table:
     """Lay out filter and smoother of a log side by side."""
     names = {"filter": summary["follows"], "smoother": "smoother"}
     keys = ("ate", "landmark_rmse", "nees")
-    return comparison_table(
-        {
-            heading: {key: summary[key][side] for key in keys}
-            for side, heading in names.items()
-        }
-    )
+    columns = {
+        heading: {key: summary[key][side] for key in keys}
+        for side, heading in names.items()
+    }
+    return comparison_table(columns)
 
 
 def smoothing_figures(summary: dict[str, Any]) -> Table:
