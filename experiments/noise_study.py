@@ -285,17 +285,14 @@ def _changes(
             raise ValueError(unknown_choice("changed", place, CHANGED))
         for variation in CHANGES:
             scaled = scaled_scenario(world, *variation)
-            yield (
-                place,
-                variation,
-                world if place == "filter" else scaled,
-                world if place == "world" else scaled,
-            )
+            actual = world if place == "filter" else scaled
+            yield place, variation, actual, world if place == "world" else scaled
 
 
 def _effect(place: str, variation: Variation, scores: EstimatorScores) -> NoiseEffect:
     per_run = scores.ratios("invariant").mean(axis=1)
     found = {
+        "nees_per_degree_median": float(np.median(per_run)) if len(per_run) else None,
         "nees_per_degree": mean(per_run),
         "nees_per_degree_error": standard_error(per_run),
         "nis_per_degree": scores.nis_per_degree,
@@ -305,16 +302,10 @@ def _effect(place: str, variation: Variation, scores: EstimatorScores) -> NoiseE
     }
     for name in ("ate_aligned", "landmark_rmse_aligned"):
         found[name] = root_mean_square(scores.per_run(name))
-    return NoiseEffect(
-        place,
-        variation.sigma,
-        variation.factor,
-        scores.label,
-        runs=len(per_run),
-        failed=len(scores.failures),
-        nees_per_degree_median=float(np.median(per_run)) if len(per_run) else np.nan,
-        **{name: np.nan if value is None else value for name, value in found.items()},
-    )
+    (sigma, factor), label = variation, scores.label
+    runs, failed = len(per_run), len(scores.failures)
+    figures = {name: np.nan if x is None else x for name, x in found.items()}
+    return NoiseEffect(place, sigma, factor, label, runs, failed, **figures)
 
 
 FACTORS = (10.0, 0.1)
