@@ -139,10 +139,8 @@ def swapped_drives(
                 swaps.append((names[k], names[bad[np.nanargmin(ratios)]]))
     if not swaps:
         return ""
-    fits = [
-        f"the estimate of drive {a} fits the truth of drive {b}" for a, b in swaps[:2]
-    ]
-    said = " and ".join(fits)
+    fits = "the estimate of drive {} fits the truth of drive {}"
+    said = " and ".join(fits.format(*pair) for pair in swaps[:2])
     return f"estimates or truths of {len(swaps)} drives are swapped: {said}."
 
 
@@ -184,24 +182,17 @@ def _honest(
     truth: Array, readings: Sequence[Reading], before: _Fit
 ) -> tuple[Reading, _Fit] | None:
     """Return the honest reading of the largest likelihood; the first of equal ones."""
-    fits = [(reading, _fit(truth, reading)) for reading in readings]
-    honest = [
-        (reading, fit)
-        for reading, fit in fits
-        if fit.is_honest and not fit.likelihood < before.likelihood + _GAIN
-    ]
-    if not honest:
-        return None
-    return max(honest, key=lambda pair: round(pair[1].likelihood, 6))
+    fits = ((reading, _fit(truth, reading)) for reading in readings)
+    least = before.likelihood + _GAIN
+    found = [it for it in fits if it[1].is_honest and not it[1].likelihood < least]
+    return max(found, key=lambda it: round(it[1].likelihood, 6), default=None)
 
 
 def _gain(truth: Array, reading: Reading, before: _Fit) -> float:
     """Return by how much the errors of poses fall [nats]; 0 if it is not far."""
-    sizes = [
-        np.log(np.maximum(fit.errors, 1e-9)).sum()
-        for fit in (before, _fit(truth, reading))
-    ]
-    gain = float(sizes[0] - sizes[1])
+    fits = before, _fit(truth, reading)
+    was, now = (np.log(np.maximum(fit.errors, 1e-9)).sum() for fit in fits)
+    gain = float(was - now)
     return gain if gain > np.log(_SMALLER) else 0.0
 
 
@@ -228,9 +219,8 @@ def _fit(truth: Array, reading: Reading) -> _Fit:
         float(np.sqrt(np.nanmedian((plain[..., :2] ** 2).sum(axis=-1)))),
         float(np.sqrt(np.nanmedian(plain[..., 2] ** 2))),
     )
-    white, log_det = _whitened(
-        errors[..., order], covariances[..., order, :][..., order]
-    )
+    ordered = covariances[..., order, :][..., order]
+    white, log_det = _whitened(errors[..., order], ordered)
     squares = (white**2).mean(axis=1)  # (B, 3): one number per run, and component
     mean = squares.mean(axis=0)
     if not np.isfinite(mean).all() or not mean.all():

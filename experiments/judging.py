@@ -144,9 +144,8 @@ def judge(
         "alignment": "fitted" if align == "fit" else "given" if align else "",
         **provenance(command or f"judge({estimates!r}, {drives!r}, truth={truth!r})"),
     }
-    return _dataset(
-        {k: [part.block for part in each] for k, each in parts.items()}, task, about
-    )
+    blocks = {k: [part.block for part in each] for k, each in parts.items()}
+    return _dataset(blocks, task, about)
 
 
 class _Chunk(NamedTuple):
