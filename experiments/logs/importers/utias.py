@@ -232,11 +232,18 @@ def _timed_lines(path: Path, form: str) -> list[log_lines.LogLine]:
 
 def _lines(path: Path, form: str) -> list[log_lines.LogLine]:
     """Read the lines without comments; each has as many fields as the form."""
-    if not path.is_file():
-        raise slamlog.LogError(f"{path.parent}: expected {path.name}, got no such file")
-    lines = [x for x in log_lines.read_lines(path) if not x.text.startswith("#")]
+    read = log_lines.read_lines(there(path))
+    lines = [line for line in read if not line.text.startswith("#")]
     for line in lines:
         line.check_count(line.text.split(), (len(form.split()),), form)
     if not lines:
         raise slamlog.LogError(f"{path}: expected rows {form}, got comments only")
     return lines
+
+
+def there(path: Path, what: str = "") -> Path:
+    """Return the path of a file that is there; raise a `LogError` for another."""
+    if not path.is_file():
+        name = f"{path.name}{what}"
+        raise slamlog.LogError(f"{path.parent}: expected {name}, got no such file")
+    return path

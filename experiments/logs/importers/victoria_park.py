@@ -21,7 +21,7 @@ import numpy as np
 from ....arrays import Array
 from ....estimator.models.motions import bicycle
 from .. import slamlog
-from .utias import TIME_DIGITS, odometry_between
+from .utias import TIME_DIGITS, odometry_between, there
 
 DRIVE, GPS, TREES = "aa3_dr.mat", "aa3_gpsx.mat", "victoria_park.csv"
 EPOCH = 20.967  # [s] on the car's clock: the time 0 of the trees, the first GPS fix
@@ -57,11 +57,7 @@ def read_victoria_park(path: str | PathLike[str]) -> slamlog.SlamLog:
     folder = Path(path)
     stamps, speed, steering = _columns(folder / DRIVE, "time", "speed", "steering")
     times, x, y = _columns(folder / GPS, "timeGps", "Lo_m", "La_m")
-    if not (folder / TREES).is_file():
-        raise slamlog.LogError(
-            f"{folder}: expected {TREES} with the trees, got no such file"
-        )
-    trees = slamlog.read_slamlog(folder / TREES)
+    trees = slamlog.read_slamlog(there(folder / TREES, " with the trees"))
     if (np.abs(steering) >= np.pi / 4).any():
         raise slamlog.LogError(
             f"{folder / DRIVE}: expected steering within ±π/4, "
@@ -99,10 +95,9 @@ def _columns(path: Path, time: str, *names: str) -> list[Array]:
     """Read columns of a MATLAB file; the first one is a time [ms], returned in s."""
     from scipy.io import loadmat  # noqa: PLC0415 (slow to import)
 
-    if not path.is_file():
-        raise slamlog.LogError(f"{path.parent}: expected {path.name}, got no such file")
+    file = str(there(path))
     try:
-        found: dict[str, Any] = loadmat(str(path), variable_names=(time, *names))
+        found: dict[str, Any] = loadmat(file, variable_names=(time, *names))
     except Exception as error:  # of many kinds
         raise slamlog.LogError(f"{path}: expected a MATLAB file, {error}") from None
     columns = []
