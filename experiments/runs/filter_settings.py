@@ -169,7 +169,7 @@ def settings_for(
     name, own = registry.read_label(estimator)
     estimator = OFFLINE.get(name, name)
     factory = registry.find_estimator(estimator)
-    header = _noise_header(log)
+    header = {"start_sigma": "0,0,0"} | _noise_header(log)
     if measurement_std is not None:
         header.pop("bearing_std_metres", None)
     identified = _flag(log.name, "identities", header.get("identities", "true"))
@@ -178,9 +178,7 @@ def settings_for(
         estimator=estimator,
         motion_std=_std(log.name, header, "motion_std", motion_std),
         measurement_std=_std(log.name, header, "measurement_std", measurement_std),
-        initial_pose_std=_std(
-            log.name, {"start_sigma": "0,0,0"} | header, "start_sigma", initial_pose_std
-        ),
+        initial_pose_std=_std(log.name, header, "start_sigma", initial_pose_std),
         options={
             **_header_options(log.name, header, factory),
             **registry.accepted_models(factory, _models(log)),
