@@ -393,7 +393,7 @@ class Scenario(Part):
 
     @property
     def models(self) -> dict[str, Any]:
-        """What filters take of sensor, drive and noise beside the std, but defaults.
+        """Options that filters need beside the two std, where they are not defaults.
 
         Examples
         --------

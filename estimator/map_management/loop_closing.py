@@ -16,8 +16,8 @@ accurate and passes the gate.
 A robot that knows the relative position of no landmark accurately, as after a gap in
 the readings, is too far from its estimate for linearised innovations: they exclude the
 right landmarks.  The readings of one scan then form the constellation, and the places
-where it fits best become parts of the belief, as in a Gaussian sum filter [1]_.  Where
-a scan shows too few of its landmarks, one hypothesis leaves it out.
+where it fits best become parts of the belief, as in a Gaussian sum filter [1]_.  If
+a scan shows too few landmarks, one hypothesis leaves the scan out.
 
 References
 ----------
@@ -72,7 +72,7 @@ SLACK = 0.2
 AROUND = np.diag([0.25, 0.25, 0.0225])
 #: Added to variances that may be zero [m², rad²].
 TINY = 1e-12
-#: Gauss-Newton steps for the turn of the robot, each from two beginnings.
+#: Number of Gauss-Newton steps for the turn of the robot, from each of two starts.
 TURNS = 4
 #: Least number of readings that recognise a place, and most places of a scan.
 FEWEST_READINGS, MOST_PLACES = 3, 4
@@ -183,7 +183,7 @@ def _named(view: MapView, kept: IntArray, gone: IntArray) -> Pairs:
 
 
 def is_astray(view: MapView, rules: Constellations) -> bool:
-    """Return whether a robot with a map knows no landmark accurately."""
+    """Return whether the robot has a map, but knows no landmark of it accurately."""
     n = len(view.ids)
     if n < FEWEST_READINGS:
         return False
@@ -259,8 +259,8 @@ def _gaps(view: MapView, readings: Array, noise: Noise) -> Array:
 
         χ² = min over φ of φ² / σ² + ‖z(φ) − d − φ c / σ²‖²
 
-    Gauss-Newton steps begin at 0, and where the reading points to the landmark.  They
-    neglect that the noise of the reading turns with it.
+    Gauss-Newton steps start at φ = 0, and at the φ for which the reading points to the
+    landmark.  They neglect that the noise of the reading turns with the robot.
     """
     n, P = len(view.ids), view.covariance
     variance, r = P[2, 2] + TINY, readings[:, 1, None, None]

@@ -263,9 +263,9 @@ class ManagedSlam:
         """Associate readings (m, 2) without identity, in every way to consider.
 
         Of those that cost more than ``ceiling`` only the most likely is of interest.
-        Where the robot is astray, and the best one knows too few landmarks to recognise
-        a place, the last one defers the decision to later scans: it leaves all readings
-        out, at the cost of the best.
+        If the robot is astray, and the best one uses too few landmarks to recognise a
+        place, the last one defers the decision to later scans: it leaves out all
+        readings, and costs as much as the best.
         """
         argument_checks.refuse_unusable(readings)
         known, view = self.candidates, self._pruner.view_for(readings)

@@ -421,11 +421,9 @@ def seeds_sentence(scores: EstimatorScores, frame: ErrorFrame, excess: Array) ->
     if not (runs := scores.results["run"].values[rows]).size:
         return ""
     seeds = (runs[:_MOST_SEEDS] + int(scores.results.attrs["seed"])).tolist()
-    more = f", the worst of {len(runs)}" if len(runs) > _MOST_SEEDS else ""
-    return (
-        "failed, bad or diverged runs (slamgym run --seed shows one): seed "
-        f"{', '.join(map(str, seeds))}{more}."
-    )
+    more = f" of {len(runs)} runs" if len(runs) > _MOST_SEEDS else ""
+    named = ", ".join(map(str, seeds))
+    return f"failed, bad or diverged runs, the worst first: seeds {named}{more}."
 
 
 def diagnosis_of(

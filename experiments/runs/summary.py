@@ -330,8 +330,8 @@ def association_failure(summary: Mapping[str, Any]) -> str:
     precision, wrong = scores.get("precision"), scores.get("oracle_errors") or 0.0
     if precision is not None and 1 - precision > wrong + MOST_REJECTED:
         return (
-            f"{1 - precision:.1%} of the readings that it assigned are wrong, and "
-            f"{wrong:.1%} would be, if it knew pose and map"
+            f"{1 - precision:.1%} of the assigned readings have a wrong landmark; "
+            f"with known pose and map, {wrong:.1%} would"
         )
     return "the filter is probably lost" if summary["probably_lost"] else ""
 

@@ -920,7 +920,7 @@ def test_a_run_whose_association_failed_names_the_command_that_repairs_it(
     assert "slamgym smooth 'a b/log.csv' --associate\n" in shown
     words = " ".join(shown.split())
     assert "a filter that knew pose and map would assign 0.3% wrongly" in words
-    assert re.search(r"failed: .* readings that it assigned are wrong, and 0.3%", words)
+    assert re.search(r"failed: .* readings have a wrong landmark; .* map, 0.3%", words)
     assert slamgym("smooth", "a b/log.csv", "--associate").exit_code == 0
     noise = "--measurement-std=0.0349,0.1", "--option=range_std_per_metre=0.001"
     shown = slamgym("replay", "a b/log.csv", *wrong[:2], *noise, "--out", "c").stdout

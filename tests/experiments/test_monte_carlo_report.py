@@ -274,14 +274,14 @@ def test_seeds_of_failed_bad_and_diverged_runs_are_told_the_worst_first():
     nees.loc[{"run": 8}], nees.loc[{"run": 9}] = 1000.0, 2000.0
     summary = summarise_monte_carlo(dataset)
     entry = summary["estimators"]["invariant"]
-    assert entry["seeds_sentence"].endswith(": seed 103, 109, 108.")
+    assert entry["seeds_sentence"].endswith(": seeds 103, 109, 108.")
     assert entry["seeds_sentence"] in diagnosis_lines("invariant", entry)[-1]
-    assert ": seed 103, 109, 108.</p>" in html_report(dataset, summary)
+    assert ": seeds 103, 109, 108.</p>" in html_report(dataset, summary)
     nees.loc[{"run": range(20, 30)}] = 500.0
     scores, excess = scores_of(dataset, "invariant", "invariant"), np.zeros(39)
     excess[6] = 5.0  # of run 7, since run 3 is missing
     told = seeds_sentence(scores, "invariant", excess)
-    assert told.endswith(": seed 103, 107, 109, 108, 120, the worst of 14.")
+    assert told.endswith(": seeds 103, 107, 109, 108, 120 of 14 runs.")
     honest = summarise_monte_carlo(typical())["estimators"]["invariant"]
     assert honest["seeds_sentence"] == ""
 
