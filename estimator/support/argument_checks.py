@@ -145,7 +145,10 @@ def identity_array(ids: LandmarkIds | None, count: int, estimator: object) -> In
     if ids is None and estimator is not None:
         if count:
             name = type(estimator).__name__
-            raise ValueError(f"landmark_ids must be given: {name} does not associate")
+            raise ValueError(
+                f"landmark_ids must be given: {name} does not associate readings; "
+                "one made with management=True does"
+            )
         return np.empty(0, dtype=np.int64)
     if type(array) is not np.ndarray:
         try:
