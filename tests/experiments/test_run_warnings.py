@@ -92,7 +92,7 @@ def test_landmarks_out_of_view_are_not_missed():
     [
         (True, None, None, "is probably lost"),
         (False, None, None, ""),
-        (None, 0.87, 0.002, "13.0% of the readings .* wrong, and 0.2% would be"),
+        (None, 0.87, 0.002, "13.0% of the assigned readings .* map, 0.2% would"),
         (False, 0.87, 0.1, ""),  # no filter is much better
         (False, 0.97, None, ""),
     ],
