@@ -404,7 +404,7 @@ def test_readings_fit_along_the_only_line_on_which_the_robot_may_be(std):
         assert (gaps[~np.eye(7, dtype=bool)] > OFFSET_GATE).all()
 
 
-TURNS = np.linspace(-np.pi, np.pi, 4001)
+TURNS = np.linspace(-1.0, 1.0, 1601)
 
 
 def _of_a_turned_map(view, phi, readings, noise):
