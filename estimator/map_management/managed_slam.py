@@ -274,14 +274,15 @@ class ManagedSlam:
         around, rules = self._pruner.view_around(readings), policy.constellations
         if rules is None or policy.association != "hypotheses" or not len(readings):
             return options
-        if is_astray(around, rules):
-            cost, best = options[0]
-            deferred = ScanAssociation(policy, known, readings)
-            deferred.explained.update(around.ids)
-            deferred.ambiguous_rows.extend(range(len(readings)))
-            if sum(i is not None for i in best().row_ids) < FEWEST_READINGS:
-                options.append((cost, lambda: deferred))
-        return options
+        cost, best = options[0]
+        if not is_astray(around, rules):
+            return options
+        if sum(i is not None for i in best().row_ids) >= FEWEST_READINGS:
+            return options
+        deferred = ScanAssociation(policy, known, readings)
+        deferred.explained.update(around.ids)
+        deferred.ambiguous_rows.extend(range(len(readings)))
+        return [*options, (cost, lambda: deferred)]
 
     def places_of_scan(self, readings: Array) -> list[tuple[Array, IntArray]]:
         """Return places that a scan (m, 2) shows, see :func:`places_of_scan`.

@@ -369,7 +369,9 @@ def python_call(summary: dict[str, Any]) -> str:
         for option in ("block_size", "resolution", "first_run")
         if summary[option]
     ]
-    note = f"# first save {' and '.join(map(repr, files))}, see below\n" * bool(files)
+    note = (
+        f"# first save {' and '.join(map(repr, files))}, see below\n" if files else ""
+    )
     listed = "".join(f"    {argument},\n" for argument in arguments)
     return (
         "from slamgym.experiments.monte_carlo import monte_carlo\n\n"

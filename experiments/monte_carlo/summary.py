@@ -175,7 +175,7 @@ def summarise_estimator(
         **found,
         "efficiency": efficiency_summary(scores),
         "diagnosis": diagnosis_summary(scores, frame, verdict),
-        "seeds_sentence": seeds_sentence(scores, frame, _excess(scores)),
+        "seeds_sentence": seeds_sentence(scores, frame, _errors_of_bad_runs(scores)),
         "association": association_summary(scores),
         "unused_readings": _unused_readings(scores),
     }
@@ -608,7 +608,7 @@ def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
     if KNOWN_IDS_ATE not in scores.results:
         return None
     hidden, known = scores.per_run("ate"), scores.per_run(KNOWN_IDS_ATE)
-    is_bad = _excess(scores) > 0
+    is_bad = _errors_of_bad_runs(scores) > 0
     bad = int((~scores.good).sum() + is_bad.sum())
     parts = {
         which: {
@@ -628,7 +628,7 @@ def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
     }
 
 
-def _excess(scores: EstimatorScores) -> Array:
+def _errors_of_bad_runs(scores: EstimatorScores) -> Array:
     """Return the path error of each bad run that succeeded, 0 of others, (M,) [m]."""
     ate = scores.per_run("ate")
     if KNOWN_IDS_ATE not in scores.results:

@@ -402,7 +402,7 @@ def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(f"{label}: {line}" for line in lines)
 
 
-def seeds_sentence(scores: EstimatorScores, frame: ErrorFrame, excess: Array) -> str:
+def seeds_sentence(scores: EstimatorScores, frame: ErrorFrame, errors: Array) -> str:
     """Name up to five runs by their seeds: failed, bad or diverged; "" for none.
 
     Parameters
@@ -411,12 +411,12 @@ def seeds_sentence(scores: EstimatorScores, frame: ErrorFrame, excess: Array) ->
         Results of the estimator.
     frame : {"invariant", "additive"}
         Error coordinates of the NEES.
-    excess : ndarray, shape (M,)
+    errors : ndarray, shape (M,)
         Path error of each bad run [m], 0 of the others.
     """
     nees = POSE_FREEDOM * scores.ratios(frame)
     diverged = nees.mean(axis=1) * (diverged_runs(nees) & (not scores.is_fitted))
-    worst = np.lexsort((-diverged, -excess))[: np.count_nonzero(excess + diverged)]
+    worst = np.lexsort((-diverged, -errors))[: np.count_nonzero(errors + diverged)]
     rows = [*np.flatnonzero(~scores.good), *np.flatnonzero(scores.good)[worst]]
     if not (runs := scores.results["run"].values[rows]).size:
         return ""

@@ -120,7 +120,7 @@ class RunTrace:
 
     @property
     def every_true_landmark(self) -> Array:
-        """Every true landmark that is known, shape (m, 2), perhaps with rows of nan."""
+        """Every true landmark that is known, shape (m, 2); some rows may be nan."""
         known = (self.world_landmarks, self.true_landmarks, np.empty((0, 2)))
         return next(truth for truth in known if truth is not None)
 
