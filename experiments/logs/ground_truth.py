@@ -10,6 +10,7 @@ the left, which the header gives in metres as ``groundtruth_offset: a,b``::
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,17 +42,35 @@ def true_poses_of(log: SlamLog, times: Array) -> Array | None:
     return poses if np.isfinite(poses[:, :2]).any() else None
 
 
+class TrueLandmarks(NamedTuple):
+    """The true landmarks of a world."""
+
+    #: Shape (n,).
+    ids: IntArray
+    #: Shape (n, 2) [m].
+    positions: Array
+
+    def of(self, ids: Sequence[int]) -> Array | None:
+        """Return the positions by ids, (k, 2), nan where unknown; None if all are."""
+        known = dict(zip(self.ids.tolist(), self.positions, strict=True))
+        if known.keys().isdisjoint(ids):
+            return None
+        return np.array([known.get(i, np.full(2, np.nan)) for i in ids])
+
+
 def true_landmarks_of(
     log: SlamLog,
     ids: Sequence[int],
     landmarks: Array,
+    path: tuple[Array, Array],
     identities: Mapping[int, int] | None = None,
 ) -> Array | None:
     """Look up the true positions of some landmarks, in their order.
 
     If the log does not identify its readings, the ids are the filter's own. Without
     their identities a landmark is then paired with the nearest true one, if each is the
-    nearest of the other.
+    nearest of the other. The map is compared both as it is and after the motion that
+    aligns the path with the truth; the pairs are those of the better fit.
 
     Parameters
     ----------
@@ -61,6 +80,8 @@ def true_landmarks_of(
         Ids of the landmarks.
     landmarks : ndarray, shape (n, 2)
         Their estimated positions [m].
+    path : (ndarray, ndarray)
+        Times and estimated poses of the same run, as `path_accuracy` takes them.
     identities : mapping of int to int, optional
         The true landmark of each id, if the filter has chosen the ids itself.
 
@@ -69,30 +90,21 @@ def true_landmarks_of(
     ndarray, shape (n, 2), or None
         Positions [m], nan where unknown; None if all are unknown.
     """
+    truth = TrueLandmarks(log.landmark_ids, log.landmarks)
     if identities is not None:
-        ids = [identities.get(i, NO_LANDMARK) for i in ids]
-    elif len(landmarks) and len(log.landmarks) and hides_identities(log):
-        places = mutual_nearest(log.landmarks, landmarks)
-        return np.where(places[:, None] >= 0, log.landmarks[places], np.nan)
-    known = dict(zip(log.landmark_ids.tolist(), log.landmarks, strict=True))
-    if known.keys().isdisjoint(ids):
-        return None
-    return np.array([known.get(i, np.full(2, np.nan)) for i in ids])
-
-
-def mutual_nearest(truth: Array, landmarks: Array) -> IntArray:
-    """Return the row of each mapped landmark's true one, shape (n,), or -1.
-
-    Two landmarks are paired if each is the nearest of the other.
-    """
-    if not len(landmarks) or not len(truth):
-        return np.full(len(landmarks), -1)
+        return truth.of([identities.get(i, NO_LANDMARK) for i in ids])
+    if not (len(landmarks) and len(log.landmarks) and hides_identities(log)):
+        return truth.of(ids)
     from scipy.spatial.distance import cdist  # noqa: PLC0415 (slow to import)
 
-    gaps = cdist(landmarks, truth)
+    places, accuracy = [landmarks], path_accuracy(log, *path)
+    if accuracy is not None:
+        places.append(accuracy.alignment.apply(landmarks))
+    both = [cdist(moved, log.landmarks) for moved in places]
+    gaps = min(both, key=lambda found: found.min(axis=1).sum())
     nearest = gaps.argmin(axis=1)
     is_mutual = gaps.argmin(axis=0)[nearest] == np.arange(len(landmarks))
-    return np.where(is_mutual, nearest, -1)
+    return np.where(is_mutual[:, None], log.landmarks[nearest], np.nan)
 
 
 def path_accuracy(log: SlamLog, times: Array, poses: Array) -> PositionAccuracy | None:

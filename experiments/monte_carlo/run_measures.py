@@ -27,9 +27,11 @@ from ...evaluation.error_bound import PosteriorBound, invariant_squares
 from ...evaluation.noise_findings import CHANNELS, MOMENTS
 from ...evaluation.trajectory_error import ellipse_areas, position_accuracy
 from ...sim_configs import Scenario
+from ..logs.ground_truth import TrueLandmarks
+from ..logs.slamlog import NO_LANDMARK
 from ..runs.filter_settings import FilterSettings
 from ..runs.simulated_runs import SimulatedRuns
-from ..runs.trace import TrueLandmarks, compare_association
+from ..runs.trace import compare_association
 from .filtered_runs import Failure, FilteredRuns, filter_runs, sensor_with_noise
 
 Block = dict[str, NDArray[np.generic]]
@@ -368,8 +370,10 @@ def measure_association(
     if made is None or belief is None:
         return {}
     truth = TrueLandmarks(np.arange(runs.landmarks.shape[1]), runs.landmarks[run])
+    names = made.identities()
+    paired = truth.of([names.get(i, NO_LANDMARK) for i in belief.landmark_ids])
     found = compare_association(
-        made, truth, belief.landmark_ids, belief.landmarks, resolution=resolution
+        made, truth, belief.landmarks, paired, resolution=resolution
     )
     scores = {} if found.scores is None else found.scores.as_dict()
     alarm = {} if made.probably_lost is None else {ALARM: float(made.probably_lost)}

@@ -340,7 +340,11 @@ class RunRecorder:
             first_landmark_covariances=covariances,
             landmark_history=self._history,
             true_landmarks=ground_truth.true_landmarks_of(
-                log, belief.landmark_ids, belief.landmarks, identities
+                log,
+                belief.landmark_ids,
+                belief.landmarks,
+                (times, self._poses[_UPDATED]),
+                identities,
             ),
             world_landmarks=log.landmarks,
             first_covariance=self._first_covariance,

@@ -27,7 +27,7 @@ from ..logs.slamlog import SlamLog
 from . import summary
 from .filter_settings import FilterSettings, one_blas_thread
 from .log_replay import Progress, Replay, replay
-from .trace import finite
+from .trace import accuracy_of, finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +159,8 @@ def summarise_smoothing(
         of ``filter`` and ``smoother``, None if the truth is unknown.
     """
     log, trace, drive = smoothed.log, smoothed.filtered.trace, smoothed.drive
-    true_landmarks = true_landmarks_of(log, drive.landmark_ids, drive.landmarks)
+    path = trace.t, smoothed.poses
+    truth = true_landmarks_of(log, drive.landmark_ids, drive.landmarks, path)
     return {
         "slamgym": __version__,
         "log": log.name,
@@ -179,13 +180,11 @@ def summarise_smoothing(
         "repair": _repair_table(smoothed),
         "ate": {
             "filter": summary.rmse_table(path_accuracy(log, trace.t, trace.poses)),
-            "smoother": summary.rmse_table(path_accuracy(log, trace.t, smoothed.poses)),
+            "smoother": summary.rmse_table(path_accuracy(log, *path)),
         },
         "landmark_rmse": {
             "filter": summary.rmse_table(summary.map_accuracy(trace)),
-            "smoother": summary.rmse_table(
-                summary.accuracy_of(drive.landmarks, true_landmarks)
-            ),
+            "smoother": summary.rmse_table(accuracy_of(drive.landmarks, truth)),
         },
         "nees": {"filter": summary.nees_summary(trace), "smoother": _nees(smoothed)},
     }

@@ -17,12 +17,12 @@ from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation import nees
 from ...evaluation.association_scores import oracle_errors, places_of
 from ...evaluation.hypothesis_tests import chi_square_quantile
-from ...evaluation.trajectory_error import PositionAccuracy, position_accuracy
+from ...evaluation.trajectory_error import PositionAccuracy
 from ..logs import ground_truth
 from ..logs.slamlog import SlamLog
 from .filter_settings import FilterSettings
 from .log_replay import Replay
-from .trace import RunTrace, TrueLandmarks, compare_association, finite
+from .trace import RunTrace, accuracy_of, compare_association, finite
 
 _SHARE = 0.95  # probability of the interval of the NIS
 
@@ -105,10 +105,12 @@ def association_summary(
     log, trace = replay.log, replay.trace
     if not ground_truth.hides_identities(log) or not len(log.landmarks):
         return None
-    truth = TrueLandmarks(log.landmark_ids, log.landmarks)
-    ids = trace.landmark_ids.tolist()
     found = compare_association(
-        replay.decisions, truth, ids, trace.landmarks, resolution=resolution
+        replay.decisions,
+        ground_truth.TrueLandmarks(log.landmark_ids, log.landmarks),
+        trace.landmarks,
+        trace.true_landmarks,
+        resolution=resolution,
     ).as_dict()
     return found | {"oracle_errors": _oracle_errors(log, resolution, settings)}
 
@@ -255,14 +257,6 @@ def pose_nees(trace: RunTrace) -> Array:
 def map_accuracy(trace: RunTrace) -> PositionAccuracy | None:
     """Compare the final map with the truth; None if it is unknown."""
     return accuracy_of(trace.landmarks, trace.true_landmarks)
-
-
-def accuracy_of(landmarks: Array, truth: Array | None) -> PositionAccuracy | None:
-    """Compare landmarks (n, 2) with the truth, nan where unknown; None without it."""
-    if truth is None:
-        return None
-    known = np.isfinite(truth).all(axis=1)
-    return position_accuracy(landmarks[known], truth[known])
 
 
 def settings_table(settings: FilterSettings) -> dict[str, Any]:

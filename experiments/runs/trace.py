@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -18,8 +18,7 @@ from ...estimator import interface
 from ...estimator.map_management.policy import policy_of
 from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation import association_scores, trajectory_error
-from ..logs.ground_truth import mutual_nearest
-from ..logs.slamlog import NO_LANDMARK
+from ..logs.ground_truth import TrueLandmarks
 
 Integers = NDArray[np.integer]
 
@@ -145,15 +144,6 @@ class RunTrace:
 NAMES = (*association_scores.AssociationScores._fields, "precision", "recall")
 
 
-class TrueLandmarks(NamedTuple):
-    """The true landmarks of a world."""
-
-    #: Shape (n,).
-    ids: IntArray
-    #: Shape (n, 2) [m].
-    positions: Array
-
-
 class RunDecisions(NamedTuple):
     """What a filter decided about the readings of a run, and what they are of."""
 
@@ -247,8 +237,8 @@ def alarm_of(slam: object) -> bool | None:
 def compare_association(
     run: RunDecisions | None,
     truth: TrueLandmarks,
-    landmark_ids: Sequence[int],
     landmarks: Array,
+    paired: Array | None,
     *,
     resolution: float = 0.0,
 ) -> RunAssociation:
@@ -260,10 +250,10 @@ def compare_association(
         The decisions, if known.
     truth : TrueLandmarks
         The true landmarks.
-    landmark_ids : sequence of int
-        The landmarks of the final map.
     landmarks : ndarray, shape (k, 2)
-        Their positions [m].
+        The landmarks of the final map [m].
+    paired : ndarray, shape (k, 2), or None
+        The true ones to align them with [m], nan where unknown; None if all are.
     resolution : float
         True landmarks nearer to each other count as one place [m].
     """
@@ -278,35 +268,25 @@ def compare_association(
         is_known = np.isin(
             place, list(association_scores.known_places(seen, run.confirm))
         )
-        identities = run.identities()
-    else:
-        rows = mutual_nearest(truth.positions, landmarks)
-        nearest = np.append(truth.ids, NO_LANDMARK)[rows].tolist()
-        identities = dict(zip(landmark_ids, nearest, strict=True))
     there, of = truth.positions[is_known], place[is_known]
-    moved = alignment(identities, truth, landmark_ids, landmarks)
+    accuracy = accuracy_of(landmarks, paired)
+    moved = landmarks if accuracy is None else accuracy.alignment.apply(landmarks)
     return RunAssociation(
         scores,
         association_scores.gospa(landmarks, there, places=of),
-        association_scores.gospa(moved.apply(landmarks), there, places=of),
+        association_scores.gospa(moved, there, places=of),
         resolution,
     )
 
 
-def alignment(
-    identities: Mapping[int, int],
-    truth: TrueLandmarks,
-    landmark_ids: Sequence[int],
-    landmarks: Array,
-) -> trajectory_error.Alignment:
-    """Return the motion that brings landmarks closest to those they are of."""
-    positions = dict(zip(truth.ids.tolist(), truth.positions, strict=True))
-    owners = [positions.get(identities.get(i, -1)) for i in landmark_ids]
-    pairs = [(m, o) for m, o in zip(landmarks, owners, strict=True) if o is not None]
-    if not pairs:
-        return trajectory_error.Alignment(0.0, np.zeros(2))
-    mapped, true = (np.array(side) for side in zip(*pairs, strict=True))
-    return trajectory_error.align_positions(mapped, true)
+def accuracy_of(
+    landmarks: Array, truth: Array | None
+) -> trajectory_error.PositionAccuracy | None:
+    """Compare landmarks (n, 2) with the truth, nan where unknown; None without it."""
+    if truth is None:
+        return None
+    known = np.isfinite(truth).all(axis=1)
+    return trajectory_error.position_accuracy(landmarks[known], truth[known])
 
 
 # --------------------------------------------------------------------------------------

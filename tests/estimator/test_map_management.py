@@ -1,6 +1,7 @@
 """The policy: who enters the map, who leaves it, who is one."""
 
 import re
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -684,10 +685,17 @@ def test_own_identities_are_scored_by_the_nearest_truth():
     errors = [row["euclidean"] for row in summarise(run)["landmarks"]]
     assert max(errors) < 0.5
     false_one = np.vstack([run.belief.landmarks, (3.4, 6.2)])
-    truth = true_landmarks_of(run.log, range(7), false_one)
+    path = run.trace.t, run.trace.poses
+    truth = true_landmarks_of(run.log, range(7), false_one, path)
     assert np.isfinite(truth[:6]).all()
     assert np.isnan(truth[6]).all()
     np.testing.assert_array_equal(np.sort(truth[:6], axis=0), np.sort(SIX, axis=0))
+    # a path almost at rest determines no angle: the map is paired as it is
+    rest = np.array([[0.0, 0, 0, 0], [1, 1e-3, 0, 0]])
+    at_rest = replace(run.log, ground_truth=rest)
+    path = rest[:, 0], -rest[:, 1:]
+    again = true_landmarks_of(at_rest, range(7), false_one, path)
+    np.testing.assert_array_equal(again, truth)
 
 
 def test_the_replay_sees_the_same_with_and_without_a_door_to_parts():

@@ -10,10 +10,12 @@ from commands import slamgym
 from drives import MEASUREMENT_STD, MOTION_STD, drive
 
 from slamgym.estimator.smoother import Drive, SmoothedDrive, smooth
+from slamgym.evaluation.trajectory_error import Alignment
 from slamgym.experiments.figures.maps import smoothed_figure
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog, write_slamlog
 from slamgym.experiments.runs.filter_settings import SMOOTHER, settings_for
 from slamgym.experiments.runs.log_smoothing import smooth_log, summarise_smoothing
+from slamgym.experiments.runs.summary import summarise
 
 SIX = np.array([[3, 6], [3, 12], [7, 8], [7, 14], [11, 6], [11, 12.0]])
 NOISE = {
@@ -140,6 +142,29 @@ def test_readings_without_identity_are_smoothed_as_management_associates_them():
     summary = summarise_smoothing(found)
     assert summary["landmarks"] == 6
     assert summary["ate"]["smoother"]["aligned"] < 0.1
+
+
+def test_a_map_in_another_frame_is_paired_with_the_truth_after_alignment():
+    """Where the truth is turned, the nearest true landmark is another one."""
+    log = a_log(with_ids=False)
+    turned = Alignment(2.0, np.array([5.0, -3.0]))
+    path = log.ground_truth
+    places, headings = turned.apply(path[:, 1:3]), path[:, 3:] + turned.angle
+    elsewhere = replace(
+        log,
+        ground_truth=np.hstack([path[:, :1], places, headings]),
+        landmarks=turned.apply(SIX),
+    )
+    options = {"management": {"confirm": (2, 3)}}
+    here, there = (smoothed(one, **options) for one in (log, elsewhere))
+    expected, found = map(summarise_smoothing, (here, there))
+    for which in ("filter", "smoother"):
+        error = expected["landmark_rmse"][which]["aligned"]
+        assert error < 0.2
+        assert found["landmark_rmse"][which]["aligned"] == pytest.approx(error)
+        assert found["landmark_rmse"][which]["raw"] > 1
+    gospa = summarise(there.filtered)["association"]["gospa"]
+    assert gospa["aligned"]["missed"] == 0 < gospa["raw"]["missed"]
 
 
 def test_a_log_without_scans_is_refused():
