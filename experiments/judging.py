@@ -100,9 +100,10 @@ def judge(
     Returns
     -------
     xarray.Dataset
-        As of ``monte_carlo``, without NIS and the NEES of whole states. Run i is the
-        drive with the i-th smallest seed or name. A drive without usable estimates is a
-        failed run. The attribute ``mistakes`` names conventions that files break.
+        As of ``monte_carlo``, without NIS and the NEES of whole states. Runs are in the
+        order of their seeds or names; where these are no seeds, ``run`` holds the names
+        of the files. A drive without usable estimates is a failed run. The attribute
+        ``mistakes`` names conventions that files break.
 
     Raises
     ------
@@ -291,7 +292,7 @@ def _paths(truth: Place | Sequence[Place], sources: dict[str, list[Path]]) -> _T
             label: {name: next(iter(each.values()))} if len(each) == 1 else each
             for label, each in found.items()
         }
-    names = sorted(true)
+    names = sorted(true, key=lambda name: (isinstance(name, str), name))
     inside = {
         (label, name): _within(each[name], true[name])
         for label, each in found.items()
@@ -499,7 +500,6 @@ def _dataset(
     import xarray as xr  # noqa: PLC0415
 
     of_world = {"noise_sums", *_BOUNDS} if not task.scenario else set()
-    named = all(isinstance(name, int) for name in task.names)
     arrays = {
         name: (
             ("estimator", *variable.dims),
@@ -511,10 +511,11 @@ def _dataset(
         for name, variable in VARIABLES.items()
         if name not in of_world
     }
-    runs = [n - task.seed for n in task.names] if named else range(len(task.names))
+    numbered = all(isinstance(name, int) for name in task.names)
+    runs = [n - task.seed if numbered else str(n) for n in task.names]
     coordinates = {
         "estimator": np.array(list(blocks)),
-        "run": np.array(list(runs)),
+        "run": np.array(runs, dtype=None if numbered else object),
         "noise": np.array(CHANNELS),
         "moment": np.array(MOMENTS),
     }

@@ -78,7 +78,7 @@ def summarise_monte_carlo(
     dict
         ``scenario`` (its name), ``scenario_toml``, ``assumed_toml`` (the scenario whose
         noise the estimators assume, None where the same), ``seed``, ``runs``,
-        ``first_run`` (number of the first of them), ``steps``, ``block_size`` (None
+        ``first_run`` (number or name of the first), ``steps``, ``block_size`` (None
         where unknown), ``resolution`` (of places in scores of association) [m],
         ``versions``, ``command``; ``frame``; ``knowable_heading_std`` [rad], the
         deviation of the heading at the start, below which it cannot fall;
@@ -101,7 +101,7 @@ def summarise_monte_carlo(
         "assumed_toml": None if assumed == attrs["scenario"] else str(assumed),
         "seed": int(attrs["seed"]),
         "runs": dataset.sizes["run"],
-        "first_run": int(dataset["run"].values[0]),
+        "first_run": dataset["run"].values.tolist()[0],
         "steps": dataset.sizes["step"] - 1,
         "block_size": None if block_size is None else int(block_size),
         "resolution": float(attrs.get("resolution", 0.0)),

@@ -403,7 +403,7 @@ def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def seeds_sentence(scores: EstimatorScores, frame: ErrorFrame, errors: Array) -> str:
-    """Name up to five runs by their seeds: failed, bad or diverged; "" for none.
+    """Name up to five failed, bad or diverged runs by seeds or files; "" for none.
 
     Parameters
     ----------
@@ -418,12 +418,14 @@ def seeds_sentence(scores: EstimatorScores, frame: ErrorFrame, errors: Array) ->
     diverged = nees.mean(axis=1) * (diverged_runs(nees) & (not scores.is_fitted))
     worst = np.lexsort((-diverged, -errors))[: np.count_nonzero(errors + diverged)]
     rows = [*np.flatnonzero(~scores.good), *np.flatnonzero(scores.good)[worst]]
-    if not (runs := scores.results["run"].values[rows]).size:
+    if not rows:
         return ""
-    seeds = (runs[:_MOST_SEEDS] + int(scores.results.attrs["seed"])).tolist()
-    more = f" of {len(runs)} runs" if len(runs) > _MOST_SEEDS else ""
-    named = ", ".join(map(str, seeds))
-    return f"failed, bad or diverged runs, the worst first: seeds {named}{more}."
+    kind, names = "drives", scores.results["run"].values
+    if names.dtype.kind == "i":
+        kind, names = "seeds", names + int(scores.results.attrs["seed"])
+    more = f" of {len(rows)} runs" if len(rows) > _MOST_SEEDS else ""
+    named = ", ".join(map(str, names[rows[:_MOST_SEEDS]]))
+    return f"failed, bad or diverged runs, the worst first: {kind} {named}{more}."
 
 
 def diagnosis_of(
@@ -543,7 +545,7 @@ _NO_MESSAGE = "its NEES or NIS is not finite, or above 1e100"
 class FailedRun(NamedTuple):
     """A run that is left out of all figures, and the reason."""
 
-    run: int
+    run: int | str
     #: -1 where unknown.
     step: int
     message: str
@@ -614,9 +616,9 @@ def scores_of(dataset: xr.Dataset, label: str, frame: ErrorFrame) -> EstimatorSc
     flagged = results["failed"].values.astype(bool)
     good = ~(flagged | gaps.any(axis=1))
     at = np.where(flagged, results["failed_at"].values, gaps.argmax(axis=1))
-    runs, messages = dataset["run"].values, results["message"].values
+    runs, messages = dataset["run"].values.tolist(), results["message"].values
     failures = [
-        FailedRun(int(runs[row]), int(at[row]), str(messages[row]) or _NO_MESSAGE)
+        FailedRun(runs[row], int(at[row]), str(messages[row]) or _NO_MESSAGE)
         for row in np.flatnonzero(~good)
     ]
     return EstimatorScores(label, first, good, tuple(failures), results)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from commands import slamgym
 
 from slamgym import judge, load_scenario, load_trajectories, make_estimator, monte_carlo
@@ -25,6 +26,7 @@ from slamgym.experiments.conventions import (
     mistake_in,
     stray_poses,
 )
+from slamgym.experiments.judging import NO_FILE
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan
 
 ROOT = Path(__file__).parents[2]
@@ -560,6 +562,25 @@ def test_one_estimate_and_one_truth_need_no_common_name(elsewhere, tmp_path):
     assert entry_of(results)["verdict"] == "not shown"
     with pytest.raises(ValueError, match="must share their names"):
         judge(path, truth=truth)
+
+
+def test_drives_from_elsewhere_are_called_by_the_names_of_their_files(elsewhere):
+    mine, truth = elsewhere
+    first, last = f"drive_{SEED + 3}", f"drive_{SEED + RUNS - 1}"
+    (mine / f"{first}.tum").unlink()
+    for path in (mine / f"{last}.tum", truth / f"{last}.tum"):
+        path.rename(path.with_stem("seed_7"))
+    (mine / "seed_7.tum").unlink()
+    out = mine.parent / "out"
+    done = slamgym("judge", mine, "--truth", truth, "--out", out)
+    printed = " ".join(done.stdout.split())
+    assert f"the worst first: drives 7, {first}" in printed
+    assert f"2 × {NO_FILE} (first: run 7)" in printed
+    (entry,) = json.loads((out / "summary.json").read_text())["estimators"].values()
+    assert [failure["run"] for failure in entry["failed_runs"]] == ["7", first]
+    with xr.open_dataset(out / "results.nc") as saved:
+        assert saved["run"].values[0] == "7"
+        assert saved.sel(run=first)["failed"].values.tolist() == [1]
 
 
 def test_an_estimate_is_judged_at_its_own_times(elsewhere):
