@@ -257,6 +257,17 @@ def test_hidden_identities_mark_clutter_and_walls_are_drawn(browser, tmp_path):
     assert browser.messages == browser.requests == []
 
 
+def test_the_whole_map_holds_every_true_landmark_as_the_picture_does(page, file):
+    trace = file[1][0].trace
+    assert len(trace.world_landmarks) == 20 > len(trace.landmarks)
+    box = page.evaluate("player.camera.box")
+    (left, low), (right, high) = (
+        extreme(trace.world_landmarks, axis=0) for extreme in (np.min, np.max)
+    )
+    assert box["left"] <= left + 1e-4 < right <= box["right"] + 1e-4
+    assert box["low"] <= low + 1e-4 < high <= box["high"] + 1e-4
+
+
 def test_a_hostile_name_is_only_text(browser, tmp_path):
     written_page(tmp_path / "run.html", filters=("ekf", HOSTILE))
     browser.open(tmp_path / "run.html")

@@ -104,7 +104,7 @@ class Camera {
     return metres(codes.reduce((most, code) => Math.max(most, code), 0));
   }
 
-  /** Box around paths and maps, and around what is true within the sensor's reach of it. */
+  /** Box around paths, maps, walls and all true landmarks. */
   boxAround(run) {
     const box = { left: Infinity, right: -Infinity, low: Infinity, high: -Infinity };
     const add = (x, y) => {
@@ -119,13 +119,8 @@ class Camera {
       filter.poses.x.forEach((x, i) => add(x, filter.poses.y[i]));
       filter.map(run.length - 1).forEach(({ x, y }) => add(x, y));
     }
-    const reach = this.longestRange(run);
-    const { left, right, low, high } = box;
-    const addNear = (x, y) => {
-      if (x > left - reach && x < right + reach && y > low - reach && y < high + reach) add(x, y);
-    };
-    run.walls.forEach(([x0, y0, x1, y1]) => (addNear(x0, y0), addNear(x1, y1)));
-    run.landmarks.forEach(({ x, y }) => addNear(x, y));
+    run.walls.forEach(([x0, y0, x1, y1]) => (add(x0, y0), add(x1, y1)));
+    run.landmarks.forEach(({ x, y }) => add(x, y));
     return box.left > box.right ? { left: -1, right: 1, low: -1, high: 1 } : box;
   }
 
