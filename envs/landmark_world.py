@@ -104,7 +104,7 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
     )
     replaced = (
         *("_np_random_seed", "_drawn_scenario", "_sensor", "_starts", "_key"),
-        *("_landmarks", "_start_estimate", "_steps_left"),
+        *("_landmarks", "_start_estimate", "_steps_left", "scenario"),
     )
     _spec: EnvSpec | None = None
 
@@ -242,8 +242,8 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         """
         self._refuse_before_reset()
         refuse_other_state(self, state, len(self.changing) + len(self.replaced))
-        drawn = state[len(self.changing) + self.replaced.index("_drawn_scenario")]
-        refuse_other_world(self.scenario, drawn.name)
+        scenario = state[len(self.changing) + self.replaced.index("scenario")]
+        refuse_other_world(self.scenario, scenario)
         super().restore(state)
 
     def render(self) -> ImageArray | None:
@@ -326,9 +326,7 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         return {"landmarks": measurements, "mask": mask, "odometry": odometry}, info
 
 
-def refuse_other_world(scenario: Scenario, name: str) -> None:
-    """Refuse the state of a world of another scenario."""
-    if name != scenario.name:
-        raise ValueError(
-            f"state must be of the world '{scenario.name}', got one of '{name}'"
-        )
+def refuse_other_world(own: Scenario, other: Scenario) -> None:
+    """Refuse the state of a world of another scenario, and name a difference."""
+    if own is not other and own != other:
+        raise ValueError(f"state must be of the same world: {own.difference(other)}")

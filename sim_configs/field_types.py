@@ -57,6 +57,15 @@ class Part(BaseModel):
         """Yield a message for each broken rule between fields; the first is raised."""
         return ()
 
+    def difference(self, other: Self) -> str:
+        """Name the first setting that differs in another table, with both values."""
+        for name, value in self:
+            if (found := getattr(other, name, None)) != value:
+                if isinstance(found, Part) and type(value) is type(found):
+                    return f"{name}.{value.difference(found)}"
+                return f"{name} must be {short_repr(value)}, got {short_repr(found)}"
+        return ""
+
 
 def setting(default: Any, description: str) -> Any:
     """Declare a field of a scenario by its default and its description."""

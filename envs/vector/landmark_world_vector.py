@@ -192,7 +192,7 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
         True
         """
         self._begun_worlds()
-        own = self.scenario.name, *self._generators(), *self._renderers
+        own = self.scenario, *self._generators(), *self._renderers
         return (*super().state(), copied(own))
 
     def restore(self, state: State) -> None:
@@ -201,8 +201,9 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
         own = *self._generators(), *self._renderers
         last: Any = state[-1] if isinstance(state, tuple) and state else None
         refuse_other_state(self, last, 1 + len(own))
-        name, *given = last
-        refuse_other_world(self.scenario, name)
+        scenario, *given = last
+        refuse_other_world(self.scenario, scenario)
+        self.scenario = scenario  # the same object is compared faster
         super().restore(state[:-1])
         for part, value in zip(own, given, strict=True):
             put_back(part, value)

@@ -1,5 +1,6 @@
 """Worlds return to earlier states, to the bit, whatever they have done since."""
 
+import pickle
 from functools import partial
 
 import gymnasium
@@ -162,9 +163,33 @@ def test_a_state_of_another_scenario_is_refused_and_changes_nothing():
         own.reset(seed=0)
         other.reset(seed=0)
         before = own.state()
-        with pytest.raises(ValueError, match=f"of the world '{names[0]}', got one"):
+        message = "same world: name must be '{}', got '{}'".format(*names)
+        with pytest.raises(ValueError, match=message):
             own.restore(other.state())
         assert same(before, own.state())
+
+
+@pytest.mark.parametrize("kind", [LandmarkWorldEnv, partial(LandmarkWorldVectorEnv, 2)])
+def test_a_state_of_other_settings_is_refused_by_their_names(kind):
+    own = kind("loop")
+    named_alike = {
+        r"dt must be 1\.0, got 0\.3": kind("loop", dt=0.3),
+        r"sensor\.max_range must be 5\.0, got 8\.0": kind(
+            "loop", sensor={"max_range": 8.0}
+        ),
+        r"compass must be None, got Compass\(": kind("loop", compass={"std": 0.1}),
+    }
+    twin = kind(own.scenario.model_copy())
+    for each in (own, twin, *named_alike.values()):
+        each.reset(seed=3)
+    before = own.state()
+    for message, other in named_alike.items():
+        with pytest.raises(ValueError, match=f"of the same world: {message}"):
+            own.restore(other.state())
+        assert same(before, own.state())
+    own.restore(pickle.loads(pickle.dumps(twin.state())))
+    actions = np.broadcast_to([0.5, 0.1], own.action_space.shape)
+    assert same(own.step(actions), twin.step(actions))
 
 
 def test_what_is_no_state_of_these_worlds_is_refused_and_changes_nothing():
