@@ -3,8 +3,9 @@
 import numpy as np
 from numeric_jacobian import numeric_jacobian
 
-from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
+from slamgym.estimator.models.bearing_range import wrap_angle
 from slamgym.estimator.models.motions import predict_pose
+from slamgym.estimator.models.sensors import BEARING_RANGE
 
 
 class DenseSmoother:
@@ -22,11 +23,17 @@ class DenseSmoother:
         start_std,
         *,
         bearing_std_metres=0,
-        sensor=None,
+        sensor=BEARING_RANGE,
     ):
         self.moves, self.scans, self.sensor = moves, scans, sensor
-        self.motion_std, self.measurement_std = motion_std, measurement_std
-        self.bearing_std_metres = bearing_std_metres
+        lengths = [len(seen) for _, seen in scans]
+        self.pose_of = np.repeat(np.arange(len(scans)), lengths)
+        self.seen = np.concatenate([np.asarray(seen, dtype=int) for _, seen in scans])
+        self.readings = np.vstack([np.reshape(z, (-1, 2)) for z, _ in scans])
+        self.motion_std = motion_std
+        self.reading_std = np.resize(measurement_std, self.readings.shape)
+        if bearing_std_metres:
+            self.reading_std[:, 0] += bearing_std_metres / self.readings[:, 1]
         self.start_std = np.asarray(start_std, dtype=float)
         self.fixes = []  # (pose, z, H, R) with z = H pose + noise of covariance R
 
@@ -40,19 +47,13 @@ class DenseSmoother:
             slip = poses[k + 1] - motion.pose
             slip[2] = wrap_angle(slip[2])
             parts.append(motion.jacobian_noise.T @ slip / self.motion_std)
-        for pose, (readings, seen) in zip(poses, self.scans, strict=True):
-            if self.sensor is not None:
-                expected = self.sensor.predict(pose, landmarks[seen]).measurement
-                apart = self.sensor.difference(readings, expected)
-                of_numbers = np.arange(self.sensor.size)
-                parts.append((apart[:, of_numbers] / self.measurement_std).ravel())
-                continue
-            expected = predict_measurement(pose, landmarks[seen]).measurement
-            innovation = np.asarray(readings).reshape(-1, 2) - expected
-            innovation[:, 0] = wrap_angle(innovation[:, 0])
-            std = np.tile(self.measurement_std, (len(innovation), 1))
-            std[:, 0] += self.bearing_std_metres / np.asarray(readings)[..., 1]
-            parts.append((innovation / std).ravel())
+        x, y, turn = poses[self.pose_of].T
+        dx, dy = landmarks[self.seen].T - (x, y)
+        c, s = np.cos(turn), np.sin(turn)
+        ahead = c * dx + s * dy
+        left = c * dy - s * dx
+        apart = self.sensor.difference(self.readings, self.sensor.read(ahead, left))
+        parts.append((apart / self.reading_std)[:, : self.sensor.size].ravel())
         for k, z, H, R in self.fixes:
             off = np.asarray(z) - H @ poses[k]
             angles = (H[:, :2] == 0).all(axis=1)
