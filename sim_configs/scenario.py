@@ -393,7 +393,7 @@ class Scenario(Part):
 
     @property
     def models(self) -> dict[str, Any]:
-        """Options that filters need beside the two std, where they are not defaults.
+        """Options of `make_estimator` beside the two std, where they are not defaults.
 
         Examples
         --------

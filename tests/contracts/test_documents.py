@@ -86,6 +86,14 @@ def test_python_in_a_document_runs_and_prints_what_it_shows(
     assert not output or printed == output
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["coarse_loop", "differential", "position"])
+def test_the_loop_of_the_readme_fits_every_world(name, capsys):
+    loop = next(code for code, _ in blocks(README, "python") if "gym.make" in code)
+    exec(loop.replace('"corridor"', f'"{name}"'), {})
+    assert float(capsys.readouterr().out.split()[0]) < 1.5
+
+
 def test_the_three_uses_fit_into_fifteen_lines_each():
     uses = README.split("## Three uses")[1].split("\n## ")[0]
     lengths = [
