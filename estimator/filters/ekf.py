@@ -211,7 +211,7 @@ class MapFilter(ObservesPoses):
         return self.map.steps
 
     def report(self) -> UpdateReport:
-        """Return the report of the last update once more."""
+        """Return the report of the last update once more; empty after an edit."""
         return self.map.last_report() if self._report is None else self._report
 
     def memory_for(self, landmarks: int) -> int:

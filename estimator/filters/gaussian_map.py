@@ -202,7 +202,7 @@ class GaussianMap:
             most = 8 + 2 * readings
         capacity = self.capacity_for(fitting) // 8 * 8  # it is rounded up
         capacity = max(capacity, self.capacity_for(landmarks))
-        return new_block(capacity, most, self.parts.values)
+        return new_block(capacity, most, self.parts.values[:NIS])  # of no scan
 
     def hold(
         self,

@@ -67,7 +67,7 @@ class RecordedSlam:
         self._last: Event | None = None
         #: Number of steps taken.
         self.steps = 0
-        self._report: interface.UpdateReport | None = None
+        self._report = interface.UpdateReport()
         for name, member in interface.optional_members(slam).items():
             setattr(self, name, member)
 
@@ -85,6 +85,7 @@ class RecordedSlam:
             self._slam.reset(pose, pose_std)
             first, std = np.array(pose, dtype=float), np.array(pose_std, dtype=float)
             self._last = Event(None, "start_at", (first, std))
+            self._report = interface.UpdateReport()
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad]; dt multiplies the noise variance."""
@@ -200,13 +201,13 @@ class RecordedSlam:
             )
         with undone_on_error(self.bookmark()):
             self._slam.load_state_dict(state)
-            self._last = history.item()
+            self._last, self._report = history.item(), interface.UpdateReport()
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
         return undo_all(bookmark(self._slam), attributes(self))
 
-    def report(self) -> interface.UpdateReport | None:
+    def report(self) -> interface.UpdateReport:
         """Return the report of the last update once more."""
         return self._report
 

@@ -18,6 +18,8 @@ FAMILY = (
     *("ekf", "invariant", "first_estimates", "observability_constrained"),
     *("iterated", "ideal", "robocentric", "unscented"),
 )
+SMOOTHER = "slamgym.estimator.smoother.recorded_slam:SmoothingSlam"
+REPORTING = (*FAMILY, "compressed", "sparse_information", "submaps", SMOOTHER)
 
 
 def scans(seed, identities, steps=60, most=6):
@@ -202,11 +204,34 @@ def test_a_report_that_is_held_does_not_keep_a_memory_that_was_replaced(
     assert report == expected
 
 
-@pytest.mark.parametrize("name", [*FAMILY, "compressed", "sparse_information"])
+@pytest.mark.parametrize("name", REPORTING)
 def test_the_report_before_the_first_scan_is_empty(name):
     slam = make_estimator(name, **NOISE)
     slam.predict((1.0, 0.0))
     assert slam.report().replace() == UpdateReport()
+
+
+@pytest.mark.parametrize("name", REPORTING)
+def test_a_report_is_that_of_the_last_scan_or_empty(name):
+    slam = make_estimator(name, **NOISE)
+    for scan in ([(0.1, 4.0), (0.5, 3.0), (-0.5, 5.0)], [(0.12, 3.1), (0.6, 2.1)]):
+        slam.predict((1.0, 0.0))
+        slam.update(scan, [*range(len(scan))])
+    last, empty = slam.report().replace(), UpdateReport()
+    assert last.nis > 0
+
+    def after(change):
+        changed = copy.deepcopy(slam)
+        change(changed)
+        again = pickle.loads(pickle.dumps(changed)).report().replace()
+        assert changed.report().replace() == again
+        return again
+
+    assert after(lambda s: s.predict((1.0, 0.0))) == last
+    assert after(lambda s: s.remove([2])) in (last, empty)
+    assert after(lambda s: s.merge(0, 2)) in (last, empty)
+    assert after(lambda s: s.load_state_dict(s.state_dict())) == empty
+    assert after(lambda s: s.reset((0, 0, 0), (0, 0, 0))) == empty
 
 
 def test_steps_count_what_the_belief_has_taken_in_and_nothing_else():

@@ -126,7 +126,6 @@ class SubmapSlam:
         self._rule = ClosingRule.checked(submap_size, heading_limit, extent_limit)
         self.belief_limit = argument_checks.whole("belief_limit", belief_limit, 1)
         self._folder = None if folder is None else FolderStore(folder)
-        self._report: UpdateReport | None = None
         self._begin(initial_pose, initial_pose_std)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
@@ -146,6 +145,7 @@ class SubmapSlam:
         self._active.begin()
         self._graph = SubmapGraph(LandmarkIndex(), chain, closed, self._active)
         self._neighbourhood.forget()
+        self._report = UpdateReport()
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move the pose by one odometry reading, as :meth:`EkfSlam.predict`."""
@@ -371,7 +371,7 @@ class SubmapSlam:
         """Number of steps taken; it changes together with the belief."""
         return self._active.filter.steps
 
-    def report(self) -> UpdateReport | None:
+    def report(self) -> UpdateReport:
         """Return the report of the last update once more."""
         return self._report
 
@@ -397,6 +397,7 @@ class SubmapSlam:
         with undone_on_error(self.bookmark()):
             self._active.filter.load_state_dict(without_prefix(state, "local", "_"))
             self._graph, self._neighbourhood = graph, near
+            self._report = UpdateReport()
             if isinstance(graph.closed.store, FolderStore):
                 self._folder = graph.closed.store
 
