@@ -1,6 +1,6 @@
-"""Check anybody's estimator against the interface of :class:`SlamEstimator`.
+"""Check an estimator against the interface of :class:`SlamEstimator`.
 
-A check is a function that tries estimators of a factory and yields a message for each
+A check is a function that makes estimators, calls them and yields a message for each
 finding. ``CHECKS`` lists the checks by level. The checks use a :class:`Trial`, which
 turns every exception of the estimator into a finding.
 """
@@ -58,7 +58,7 @@ class Finding(NamedTuple):
 
     #: "required" to run at all, "correct" for right beliefs, or "recommended".
     level: Level
-    #: The method, what is expected of it, and what it did.
+    #: The method, the expected result, and what the method did.
     message: str
 
     def __str__(self) -> str:
@@ -86,18 +86,18 @@ Check = Callable[[Factory], Iterator[str | CallError]]
 
 
 def check_estimator(factory: Factory | str) -> tuple[Finding, ...]:
-    """Check that an estimator works wherever slamgym uses one.
+    """Check that an estimator runs in slamgym and computes right beliefs.
 
-    Drives a small known world and reports all findings at once, by level: what the
-    estimator needs to run at all, where it computes wrong beliefs, and what is
-    recommended: informative reports, refusal of malformed readings, save and restore.
+    Drives the estimator through a small known world. All findings are reported at once:
+    what keeps it from running, which beliefs are wrong, and what is recommended, namely
+    informative reports, refusal of malformed readings, and saved states.
 
     Parameters
     ----------
     factory : callable or str
         Makes the estimator from the keywords ``motion_std``, ``measurement_std``,
-        ``initial_pose``, ``initial_pose_std``; a class will do, or a name as of
-        `make_estimator`.
+        ``initial_pose``, ``initial_pose_std``; usually a class. Or a name that
+        `make_estimator` accepts.
 
     Returns
     -------
@@ -110,7 +110,7 @@ def check_estimator(factory: Factory | str) -> tuple[Finding, ...]:
         If the estimator cannot run or computes wrong beliefs. The message lists all
         findings; the attribute ``findings`` holds them.
     TypeError
-        If the factory is not callable, such as an estimator already made.
+        If the factory is not callable, for example if it is an estimator.
     ValueError
         If there is no estimator of that name.
 

@@ -298,14 +298,15 @@ def p_text(p_value: float) -> str:
 # average of a run, or its number of wrong associations.
 
 POSE = 3
-#: NEES per degree from which on a filter is overconfident.
+#: Least NEES per degree of an overconfident filter.
 LEAST_RATIO = 1.1
-#: Share of the smallest possible variance below which a reported one is false.
+#: A variance is false if it is below this share of the smallest possible variance.
 KNOWABLE = 0.9
-#: Quantile of χ²(3) beyond which a run has diverged, and its rate that is accepted.
+#: A run has diverged if its NEES has a smaller p-value than the first number. The
+#: second is the accepted share of such runs.
 DIVERGED_LEVEL, DIVERGED_RATE = 1e-4, 1e-3
-#: Shares of the excess: with less noise, that of the linearisation falls below the
-#: first, and that of a wrong model exceeds the second.
+#: Factors on the excess NEES when the noise is reduced: below the first, the excess is
+#: due to the linearisation; above the second, to a wrong model.
 SHRINKS, GROWS = 0.5, 3.0
 SMALLEST_NOISE = 0.01
 _CLEARLY, _MOST = 2.0, 0.75
@@ -317,7 +318,7 @@ class Errors(NamedTuple):
     """How far the covariances are from the errors."""
 
     p_value: float
-    #: NEES per degree over runs and steps, of pose or heading: farthest from 1.
+    #: NEES per degree over runs and steps, of pose or heading: the one farther from 1.
     ratio: float
     #: Number of diverged runs.
     diverged: int

@@ -53,7 +53,7 @@ class ObservesPoses:
     map: GaussianMap
     #: What distinguishes this filter's updates from another's.
     rules: Rules
-    #: That of the last update, where the map has changed since.
+    #: The report of the last update, unless the memory of the map holds it.
     _report: UpdateReport | None = None
 
     @property
@@ -118,7 +118,7 @@ class ObservesPoses:
 
 
 class PoseReport(UpdateReport):
-    """The results of a reading of the pose; no memory holds them."""
+    """The results of a reading of the pose, which do not lie in the filter's memory."""
 
     is_detached = False
 

@@ -95,7 +95,7 @@ class GaussianMap:
     ) -> None:
         parts = parts or parts_of(block)
 
-        def newest() -> Any:  # until a scan is taken in
+        def newest() -> Any:  # `last`, until the next scan
             return None if parts.numbers[SCANNED] else last
 
         vars(self).update(block=block, parts=parts, _slots={}, _last=newest)
@@ -192,7 +192,7 @@ class GaussianMap:
         landmarks : int
             Landmarks that must have room.
         more : int
-            Landmarks to come, as far as memory allows.
+            Further landmarks that should have room, as far as memory allows.
         readings : int
             Readings of a scan that must have room.
         """
@@ -202,7 +202,7 @@ class GaussianMap:
             most = 8 + 2 * readings
         capacity = self.capacity_for(fitting) // 8 * 8  # it is rounded up
         capacity = max(capacity, self.capacity_for(landmarks))
-        return new_block(capacity, most, self.parts.values[:NIS])  # of no scan
+        return new_block(capacity, most, self.parts.values[:NIS])  # without a NIS
 
     def hold(
         self,
@@ -226,7 +226,7 @@ class GaussianMap:
         steps : int
             Number of steps that have led to this belief.
         report : UpdateReport, optional
-            Of the last of these steps, with ``detach`` as a `ScanReport`.
+            The report of the last of these steps; it has ``detach``, as a `ScanReport`.
         """
         self._detach_report()
         if block is None:
@@ -249,7 +249,7 @@ class GaussianMap:
 
     def take_in(self, update: UpdateKernel, readings: Array, ids: IntArray) -> int:
         """Update the map with a scan, as `update_map`; return the status."""
-        if (last := self._last()) is not None:  # without another call
+        if (last := self._last()) is not None:  # `_detach_report`, without its call
             last.detach()
         status = update(self.block, readings, ids)
         if status == NO_ROOM:
@@ -265,7 +265,7 @@ class GaussianMap:
         return report
 
     def _detach_report(self) -> None:
-        """Let a report that somebody still holds do without the present memory."""
+        """Copy the results of the last report, if it is still in use."""
         if (last := self._last()) is not None:
             last.detach()
 
@@ -283,7 +283,7 @@ class GaussianMap:
         self.keep_without(self.used, ids)
 
     def bookmark(self) -> Undo:
-        """Return what takes back later changes, but for those made by kernels."""
+        """Return what takes back later changes, except those made by kernels."""
         return partial(vars(self).update, vars(self).copy())
 
     @property
@@ -558,7 +558,7 @@ def without_landmarks(array: Array, slots: Iterable[int]) -> Array:
 
 
 class ScanRecord(NamedTuple):
-    """What an update has left of one scan, copied."""
+    """Copies of the results of one scan."""
 
     scan_ids: IntArray  # the landmark of each reading
     rows: Array  # (2m, at least 3 + 2m + META_WIDTH), the stacked system

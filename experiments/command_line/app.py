@@ -64,7 +64,7 @@ def estimators(*, given: Options) -> None:
 
 
 def _show(what: str, keys: str, facts: Sequence[Any], reporter: Reporter) -> None:
-    """Print rows of facts below their keys, or both as JSON."""
+    """Print facts as a table with the keys as headings, or as one JSON object."""
     from rich.table import Table
 
     rows = [dict(zip(keys.split(), each, strict=True)) for each in facts]

@@ -208,14 +208,15 @@ def _repeated(
     results: xr.Dataset,
     **engine: Any,
 ) -> tuple[dict[str, Array], dict[str, float]]:
-    """Repeat runs with less noise where that shows why a filter is not consistent.
+    """Repeat runs with less noise, to find why a filter is not consistent.
 
     Returns
     -------
     dict
         `SMALL_NOISE`, shape (estimators, runs); empty if nothing is repeated.
     dict
-        `SMALL_NOISE_SHARE` of the time; the results took the given seconds.
+        `SMALL_NOISE_SHARE`, the share of the time that this took; ``seconds`` is the
+        time of the other runs.
     """
     from .verdict import averages_of, runs_to_repeat, scores_of  # noqa: PLC0415
 

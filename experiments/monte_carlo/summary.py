@@ -146,8 +146,8 @@ def summarise_estimator(
         heading [rad]; ``ate`` and ``landmark_rmse``, ``{raw, aligned}`` [m];
         ``landmark_mahalanobis``, root mean square; ``area`` of the 3σ ellipses at the
         end [m²]; ``efficiency``, see :func:`.summary.efficiency_summary`;
-        ``diagnosis``, see :func:`.verdict.diagnosis_summary`; ``seeds_sentence``, of
-        runs to look at;
+        ``diagnosis``, see :func:`.verdict.diagnosis_summary`; ``seeds_sentence``, the
+        seeds of runs that deserve a look;
         ``association``, see :func:`.association.association_summary`;
         ``unused_readings``, the share of readings of known identity that corrected
         nothing and added no landmark, None where identities are hidden or readings of

@@ -48,16 +48,15 @@ def summarise(
     dict
         ``landmarks``, see :func:`landmark_table`; ``never_placed``, the ids of
         landmarks that the log names and the map never held; ``pose``,
-        ``pose_covariance``;
-        ``steps``, ``scans``, ``readings`` by what became of them; ``map_changes``, the
-        landmarks confirmed, removed and merged, and the most in the map; ``nis``, see
-        `nis_summary`; ``nees``, see `nees_summary`; ``ate``, the root mean
-        square distance of the path from the truth at the times of the truth, and
-        ``landmark_rmse``, that of the map, both ``{raw, aligned}`` [m];
-        ``association``, see `association_summary`; ``probably_lost``, whether the
-        filter reports so, None where identities are known; ``warnings``, see
-        `run_warnings`; ``log``, ``estimator``, ``settings``, and
-        ``slamgym``, the version.
+        ``pose_covariance``; ``steps``, ``scans``; ``readings``, counted by their
+        outcome; ``map_changes``, the numbers of landmarks confirmed, removed and
+        merged, and the largest size of the map; ``nis``, see `nis_summary`; ``nees``,
+        see `nees_summary`; ``ate``, the root mean square distance of the path from the
+        truth at the times of the truth, and ``landmark_rmse``, that of the map, both
+        ``{raw, aligned}`` [m]; ``association``, see `association_summary`;
+        ``probably_lost``, whether the filter reports that it is probably lost (None
+        where identities are known); ``warnings``, see `run_warnings`; ``log``,
+        ``estimator``, ``settings``, and ``slamgym``, the version.
     """
     log, trace = replay.log, replay.trace
     return {
@@ -98,9 +97,9 @@ def association_summary(
         assign wrongly under the noise of the settings;
         the ``resolution`` [m]; ``gospa`` of the map, ``raw`` and ``aligned``, with
         their parts, see :class:`~slamgym.evaluation.Gospa`, and the ``cutoff`` [m].
-        Without true ids all but ``gospa`` is None, and it compares the map with all
-        true landmarks.  None if all readings have identities, or the true landmarks are
-        unknown.
+        Without true ids, all entries except ``gospa`` are None, and ``gospa`` compares
+        the map with all true landmarks.  The result is None if all readings have
+        identities, or the true landmarks are unknown.
     """
     log, trace = replay.log, replay.trace
     if not ground_truth.hides_identities(log) or not len(log.landmarks):
@@ -292,7 +291,7 @@ def _finite_list(values: Array) -> list[float | None]:
 #: Share of rejected readings above which a filter may diverge.
 MOST_REJECTED = 0.05
 
-#: NIS per degree of freedom that is no reason to worry.
+#: NIS per degree of freedom that causes no warning.
 NIS_RANGE = (0.5, 2.0)
 
 #: A landmark within reach in this many scans should be in one of them.
@@ -302,7 +301,7 @@ MANY_SCANS = 10
 MOST_ABANDONED = 0.25
 
 
-#: Of a filter that is probably lost.
+#: The warning about a filter that is probably lost.
 LOST = (
     "The run is probably lost: the scans showed far fewer landmarks than the map "
     "promised, readings fitted nothing, or the heading became unknown."

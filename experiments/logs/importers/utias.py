@@ -231,7 +231,7 @@ def _timed_lines(path: Path, form: str) -> list[log_lines.LogLine]:
 
 
 def _lines(path: Path, form: str) -> list[log_lines.LogLine]:
-    """Read the lines without comments; each has as many fields as the form."""
+    """Read all lines except comments; refuse other numbers of fields than `form`."""
     read = log_lines.read_lines(there(path))
     lines = [line for line in read if not line.text.startswith("#")]
     for line in lines:
@@ -242,7 +242,7 @@ def _lines(path: Path, form: str) -> list[log_lines.LogLine]:
 
 
 def there(path: Path, what: str = "") -> Path:
-    """Return the path of a file that is there; raise a `LogError` for another."""
+    """Return the path of an existing file; raise a `LogError` if there is none."""
     if not path.is_file():
         name = f"{path.name}{what}"
         raise slamlog.LogError(f"{path.parent}: expected {name}, got no such file")
