@@ -51,7 +51,7 @@ COUNTS = {
 }
 WRONG_DENSITIES = {"a third of the density": 1 / 3, "three times the density": 3.0}
 """Hypotheses with an assumed density of clutter that is wrong by this factor."""
-LOST = 1.0  # [m]
+BAD = 1.0  # [m]
 NOISE = Noise(0.02, 0.1)  # [rad, m]
 
 
@@ -178,20 +178,20 @@ def crowded_scan() -> float:
     return 1e3 * float(np.median(times))
 
 
-def difference(lost: NDArray[np.bool_], of_first: NDArray[np.bool_]) -> str:
+def difference(bad: NDArray[np.bool_], of_first: NDArray[np.bool_]) -> str:
     """Return how many more runs are bad than with the first method, in percent.
 
     The 95 % interval of this difference follows in brackets.
     """
-    more, fewer = (lost & ~of_first).sum() + 0.5, (of_first & ~lost).sum() + 0.5
-    runs = len(lost) + 2
+    more, fewer = (bad & ~of_first).sum() + 0.5, (of_first & ~bad).sum() + 0.5
+    runs = len(bad) + 2
     share = (more - fewer) / runs
     half = 1.96 * np.sqrt(more + fewer - (more - fewer) ** 2 / runs) / runs
     low, high = 100 * (share - half), 100 * (share + half)
-    return f"{100 * (lost.mean() - of_first.mean()):.0f} ({low:.0f} to {high:.0f})"
+    return f"{100 * (bad.mean() - of_first.mean()):.0f} ({low:.0f} to {high:.0f})"
 
 
-def row_of(runs: list[Outcome], lost: NDArray[np.bool_], base: float) -> list[str]:
+def row_of(runs: list[Outcome], bad: NDArray[np.bool_], base: float) -> list[str]:
     """Return the entries of the table for one world and method."""
     errors = [run.error for run in runs]
     seconds = float(np.mean([run.seconds for run in runs]))
@@ -201,7 +201,7 @@ def row_of(runs: list[Outcome], lost: NDArray[np.bool_], base: float) -> list[st
     }
     return [
         f"{np.median(errors):.3f}",
-        f"{lost.sum()} of {len(runs)}",
+        f"{bad.sum()} of {len(runs)}",
         f"{scores['wrong']:.1f}",
         f"{scores['duplicate']:.2f}",
         f"{scores['map_size']:.1f}",
@@ -237,19 +237,19 @@ def main() -> None:
         seeds = range(options.seed, options.seed + options.runs)
         scans = [drive(world, seed, options.resolution) for seed in seeds]
         known = [follow(make(world), s, is_known=True).error for s in scans]
-        base, lost, median = 0.0, {}, f"{np.median(known):.3f}"
+        base, bad, median = 0.0, {}, f"{np.median(known):.3f}"
         for method in options.methods:
             policy = policy_of(method, world)
             runs = [follow(make(world, management=policy), s) for s in scans]
             base = base or float(np.mean([run.seconds for run in runs]))
             errors = np.array([run.error for run in runs])
-            lost[method] = errors > np.array(known) + LOST
-            row = " | ".join([name, method, median, *row_of(runs, lost[method], base)])
+            bad[method] = errors > np.array(known) + BAD
+            row = " | ".join([name, method, median, *row_of(runs, bad[method], base)])
             print(f"| {row} |", flush=True)
         first, *others = options.methods
         compared += [
             f"{name}: bad runs of {other} less those of {first} [%]: "
-            f"{difference(lost[other], lost[first])}"
+            f"{difference(bad[other], bad[first])}"
             for other in others
         ]
     print("", *compared, sep="\n")
