@@ -337,10 +337,10 @@ def accepted_models(
     Raises
     ------
     ValueError
-        If the estimator does not take the ``sensor`` or ``motion`` among them.
+        If the estimator does not take the ``sensor``, ``motion`` or noise among them.
     """
     accepted = accepted_options(factory, models)
-    for name in (models.keys() - accepted.keys()) & {"sensor", "motion"}:
+    for name in sorted(models.keys() - accepted.keys() - {"noise_at_rest"}):
         raise ValueError(f"the estimator does not accept {name} = '{models[name]}'")
     return accepted
 

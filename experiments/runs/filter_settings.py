@@ -10,7 +10,7 @@ import hashlib
 import inspect
 import marshal
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -58,6 +58,7 @@ NOISE_KEYS = (
     "noise_at_rest",
 )
 
+_GROWING = "range_std_per_metre", "bearing_std_metres"
 _ASSUMED_NOISE = {"motion_std": (0.1, 0.1, 0.03), "measurement_std": (0.026, 0.3)}
 
 
@@ -162,7 +163,7 @@ def settings_for(
     ------
     ValueError
         If neither the caller nor the log specifies a noise, or the estimator is
-        unknown.
+        unknown, or does not accept the noise of the log.
     LogError
         If a value in the header is malformed.
     """
@@ -170,6 +171,7 @@ def settings_for(
     estimator = OFFLINE.get(name, name)
     factory = registry.find_estimator(estimator)
     header = {"start_sigma": "0,0,0"} | _noise_header(log)
+    needed = _GROWING if measurement_std is None else ()
     if measurement_std is not None:
         header.pop("bearing_std_metres", None)
     identified = _flag(log.name, "identities", header.get("identities", "true"))
@@ -180,7 +182,7 @@ def settings_for(
         measurement_std=_std(log.name, header, "measurement_std", measurement_std),
         initial_pose_std=_std(log.name, header, "start_sigma", initial_pose_std),
         options={
-            **_header_options(log.name, header, factory),
+            **_header_options(log.name, header, factory, needed),
             **registry.accepted_models(factory, _models(log)),
             **managed,
             **(options or {}),
@@ -278,21 +280,28 @@ def _meant(header: Mapping[str, str], key: str) -> str:
 
 
 def _header_options(
-    name: str, header: Mapping[str, str], factory: registry.EstimatorFactory
+    name: str,
+    header: Mapping[str, str],
+    factory: registry.EstimatorFactory,
+    needed: Collection[str],
 ) -> dict[str, Any]:
-    """Return the options in the header that the estimator accepts."""
+    """Return the options in the header that the estimator accepts.
+
+    An estimator that does not accept a noise among those needed is refused.
+    """
     options: dict[str, Any] = {}
     if not _flag(name, "noise_at_rest", header.get("noise_at_rest", "false")):
         options["noise_at_rest"] = False
-    for key in ("range_std_per_metre", "bearing_std_metres"):
+    for key in _GROWING:
         if key in header:
             options[key] = _number(name, key, header[key])
     accepted = registry.accepted_options(factory, options)
-    if options.get("bearing_std_metres") and "bearing_std_metres" not in accepted:
-        raise ValueError(
-            f"the noise of {name} needs bearing_std_metres, which the estimator does "
-            "not have: give it another --measurement-std"
-        )
+    for key in needed:
+        if options.get(key) and key not in accepted:
+            raise ValueError(
+                f"the noise of {name} contains {key}, an argument that the estimator "
+                "does not have: give it another --measurement-std"
+            )
     return accepted
 
 

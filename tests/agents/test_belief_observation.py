@@ -266,6 +266,11 @@ def test_the_noise_of_the_world_is_told_to_the_filter():
     np.testing.assert_array_equal(env.belief.covariance, slam.belief().covariance)
 
 
+def test_a_filter_without_the_noise_of_the_world_is_refused():
+    with pytest.raises(ValueError, match="does not accept range_std_per_metre"):
+        BeliefObservation(world("coarse_loop"), MatchesByPlace)
+
+
 class MatchesByPlace:
     """Associates by order of sight: rubbish, but of its own identities."""
 

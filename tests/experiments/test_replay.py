@@ -427,8 +427,17 @@ def test_noise_of_positions_in_the_header_is_taken_unless_the_user_gives_a_noise
     log = SlamLog("log", header)
     assert settings_for(log).options == {"bearing_std_metres": 0.1}
     assert settings_for(log, measurement_std=(0.01, 0.1)).options == {}
-    with pytest.raises(ValueError, match="the noise of log needs bearing_std_metres"):
-        settings_for(log, estimator=f"{__name__}:Simple")
+
+
+@pytest.mark.parametrize("noise", ["bearing_std_metres", "range_std_per_metre"])
+def test_a_filter_without_a_noise_of_the_log_is_refused_unless_the_user_gives_one(
+    noise,
+):
+    header = {"motion_std": "0.1,0.2,0.3", "measurement_std": "0,0.1", noise: "0.1"}
+    log, simple = SlamLog("log", header), f"{__name__}:Simple"
+    with pytest.raises(ValueError, match=f"the noise of log contains {noise}"):
+        settings_for(log, estimator=simple)
+    assert settings_for(log, estimator=simple, measurement_std=(1, 1)).options == {}
 
 
 def test_a_robot_that_reports_rest_stands_still_unless_log_or_filter_object():
