@@ -51,7 +51,7 @@ COUNTS = {
 }
 WRONG_DENSITIES = {"a third of the density": 1 / 3, "three times the density": 3.0}
 """Hypotheses with an assumed density of clutter that is wrong by this factor."""
-BAD = 1.0  # [m]
+BAD_ERROR = 1.0  # [m]
 NOISE = Noise(0.02, 0.1)  # [rad, m]
 
 
@@ -243,7 +243,7 @@ def main() -> None:
             runs = [follow(make(world, management=policy), s) for s in scans]
             base = base or float(np.mean([run.seconds for run in runs]))
             errors = np.array([run.error for run in runs])
-            bad[method] = errors > np.array(known) + BAD
+            bad[method] = errors > np.array(known) + BAD_ERROR
             row = " | ".join([name, method, median, *row_of(runs, bad[method], base)])
             print(f"| {row} |", flush=True)
         first, *others = options.methods

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
-from association import BAD, METHODS, Scan, drive, make, worlds
+from association import BAD_ERROR, METHODS, Scan, drive, make, worlds
 
 from slamgym.evaluation import pose_nees, position_accuracy
 from slamgym.sim_configs import Scenario, load_scenario
@@ -129,7 +129,7 @@ def outcome(world: Scenario, how: str, seed: int) -> tuple[int, bool]:
     known = follow(make(assumed_world), scans, known=True)
     slam: Any = make(assumed_world, management=METHODS[method])
     found = follow(slam, scans, known=False)
-    is_worse = found.error > known.error + BAD
+    is_worse = found.error > known.error + BAD_ERROR
     is_overconfident = not found.nees <= OVERCONFIDENT
     kind = BETWEEN if is_worse != is_overconfident else BAD if is_worse else SOUND
     if kind == BAD and found.aligned <= known.aligned + TURNED_BY:

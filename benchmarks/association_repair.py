@@ -17,7 +17,7 @@ import time
 from typing import Any
 
 import numpy as np
-from association import BAD, Scan, drive, follow, make, worlds
+from association import BAD_ERROR, Scan, drive, follow, make, worlds
 
 from slamgym.estimator.models.sensors import BEARING_RANGE, Sensor
 from slamgym.estimator.smoother import Drive, reassociate, smooth
@@ -117,8 +117,8 @@ def main() -> None:
         entries = " | ".join(f"{value:.4g}" for value in rows[-1])
         print(f"| {seed} | {entries} |", flush=True)
     table = np.array(rows)
-    before = int((table[:, 0] > table[:, 1] + BAD).sum())
-    after = int((table[:, 2] > table[:, 3] + BAD).sum())
+    before = int((table[:, 0] > table[:, 1] + BAD_ERROR).sum())
+    after = int((table[:, 2] > table[:, 3] + BAD_ERROR).sum())
     print(f"\nbad: {before} of {len(rows)}, repaired {after} of {len(rows)}")
 
 
