@@ -156,7 +156,7 @@ def beliefs_of(drive: Trajectory, file: str) -> Estimate:
     if drive.belief_poses is None:
         raise ValueError(
             f"{file} must hold the beliefs of a filter to be judged: it was generated "
-            "without --estimator; give the files of estimates, and it as the drives"
+            "without --estimator; to judge other estimates, give it as drives"
         )
     beliefs = {name: array_of(drive, name) for name in BELIEFS}
     return _of_arrays(file, beliefs, drive.scenario.sensor.identities)
@@ -191,7 +191,8 @@ def _of_npz(file: Path) -> Iterator[tuple[Any, Estimate]]:
             known = [name for name in ("seed", *BELIEFS) if name in archive.files]
             arrays = {name: archive[name] for name in known}
     except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{file} is truncated, or no npz: {error}") from None
+        reason = "" if isinstance(error, ValueError) else f": {error}"  # of pickles
+        raise ValueError(f"{file} is truncated, or no npz{reason}") from None
     lacking = [name for name in BELIEFS[:2] if name not in arrays]
     if lacking:
         raise ValueError(

@@ -192,7 +192,7 @@ def _drives(place: Place | None, sources: dict[str, list[Path]]) -> _Task:
         if more or not (place / MANIFEST).is_file():
             raise ValueError(
                 "drives must be the folder of slamgym generate that holds the truth, "
-                f"or truth must be given: {place} holds no truth"
+                "or truth must be given, got neither"
             )
     folder, data = Path(place), load_trajectories(place)
     job = data.manifest.job

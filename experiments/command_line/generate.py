@@ -104,7 +104,7 @@ def _message(manifest: "Manifest", place: Path, size: int) -> str:
     return (
         f"{place}: {job.episodes:,} episodes of {job.scenario.steps:,} steps as "
         f"{job.format}, {size / 1e6:,.1f} MB in {shards} shard{'s' * (shards > 1)}\n"
-        "from slamgym.experiments.trajectories import load_trajectories\n"
+        "from slamgym import load_trajectories\n"
         f'for trajectory in load_trajectories("{place.as_posix()}"): ...'
     )
 

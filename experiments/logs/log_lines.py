@@ -105,7 +105,7 @@ def to_lines(text: str, file: str) -> list[LogLine]:
     stripped = (line.strip() for line in text.split("\n"))
     lines = [LogLine(file, k, line) for k, line in enumerate(stripped, 1) if line]
     if not lines:
-        raise LogLine(file, 1, "").error("a log", "an empty file")
+        raise LogLine(file, 1, "").error("rows", "an empty file")
     return lines
 
 

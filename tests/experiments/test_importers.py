@@ -214,7 +214,7 @@ def test_reading_before_the_first_odometry_is_at_time_zero(file):
         ("LANDMARK 3 7 1 1\n", "line 1: expected odometry"),
         ("EDGE2 0 1 1 0 0\nEDGE2 1 2 1 0 0\nEDGE2 2 0 -2 0 0\n",
          "line 3: expected readings of landmarks, as a"),
-        ("", "expected a log, got an empty file"),
+        ("", "expected rows, got an empty file"),
     ],
 )  # fmt: skip
 def test_a_wrong_line_of_a_log_is_named(file, text, message):

@@ -479,9 +479,12 @@ def test_a_malformed_csv_is_refused_with_its_line(text, drives, tmp_path):
 
 def test_a_damaged_or_foreign_npz_is_refused(drives, tmp_path):
     path = tmp_path / "mine.npz"
-    path.write_bytes(b"PK\x03\x04 from a bad disk")
-    with pytest.raises(ValueError, match=r"mine\.npz is truncated, or no npz"):
-        judge(path, drives)
+    for content in b"PK\x03\x04 from a bad disk", b"PK":
+        path.write_bytes(content)
+        with pytest.raises(
+            ValueError, match=r"mine\.npz is truncated, or no npz(?!.*pickle)"
+        ):
+            judge(path, drives)
     P = np.zeros((1, 3, 3))
     for poses, others, message in (
         (np.zeros((3, 3)), {}, "no belief_pose_covariances"),
@@ -500,7 +503,7 @@ def test_what_matches_no_drive_is_refused(drives, beliefs, tmp_path):
     empty.mkdir()
     for call, message in (
         (lambda: judge(path, drives), f"such as seed_{SEED:08d}.csv, got .*seed_7"),
-        (lambda: judge(path), "holds no truth"),
+        (lambda: judge(path), "got neither"),
         (lambda: judge(path, drives, truth=path),
          "truth must be None where drives are given"),
         (lambda: judge(path, drives, covariances="up"),

@@ -217,8 +217,8 @@ def test_a_wrong_row_is_named_with_file_line_and_reason(tmp_path, row, message):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "line 1: expected a log, got an empty file"),
-        (b"\n \n", "line 1: expected a log, got an empty file"),
+        (b"", "line 1: expected rows, got an empty file"),
+        (b"\n \n", "line 1: expected rows, got an empty file"),
         (b"odometry,1,3,0,1\n", "line 1: expected # format: slamlog 1, got 'odometry"),
         (b"# format: slamlog 2\n", "line 1: expected # format: slamlog 1, got"),
         (b"# format: slamlog 1\nodometry\xff\n",
