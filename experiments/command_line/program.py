@@ -268,7 +268,8 @@ def message_of(error: Exception) -> str:
     if isinstance(error, ValueError | OSError | ImportError):
         return _one_line(str(error))
     what = f"{type(error).__name__}: {_one_line(str(error))}"
-    return f"internal error, {what} (SLAMGYM_TRACEBACK=1 shows where)"
+    where = ", ".join(getattr(error, "__notes__", ["internal error"]))
+    return f"{where}: {what} (SLAMGYM_TRACEBACK=1 shows where)"
 
 
 @contextlib.contextmanager

@@ -226,6 +226,9 @@ def _naming_time(log: slamlog.SlamLog, step: recording.Step) -> Iterator[None]:
         is_numerical = isinstance(error, np.linalg.LinAlgError)
         kind = np.linalg.LinAlgError if is_numerical else ValueError
         raise kind(f"{log.name}, t = {step.t:g}: {error}") from error
+    except Exception as error:
+        error.add_note(f"the estimator failed, {log.name}, t = {step.t:g}")
+        raise
 
 
 class ReadingCounts(NamedTuple):

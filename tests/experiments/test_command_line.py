@@ -569,7 +569,21 @@ def test_a_bug_is_one_line_too(log, monkeypatch):
 
     monkeypatch.setattr(run_files, "write_figures", stumble)
     message = refused("replay", log, code=1)
-    assert message.startswith("internal error, KeyError: 'oops'")
+    assert message.startswith("internal error: KeyError: 'oops'")
+
+
+def test_a_bug_of_the_users_filter_is_not_called_internal(of_a_user):
+    with open("of_a_user.py", "a") as file:
+        file.write("""
+class Late(Plain):
+    def predict(self, odometry, dt=1.0):
+        super().predict(odometry, dt)
+        self.steps = getattr(self, "steps", 0) + 1
+        if self.steps == 20:
+            raise KeyError("oops")
+""")
+    message = refused("run", "loop", "-e", "of_a_user:Late", code=1)
+    assert message.startswith("the estimator failed, loop, t = 20: KeyError: 'oops'")
 
 
 @pytest.mark.parametrize("out", ["little.csv/out", "little.csv/deep/out"])
