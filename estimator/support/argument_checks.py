@@ -154,7 +154,9 @@ def identity_array(ids: LandmarkIds | None, count: int, estimator: object) -> In
         try:
             array = np.asarray(ids)
         except ValueError:  # a list of lists of several lengths
-            raise ValueError(f"landmark_ids must be integers, got {ids!r}") from None
+            raise ValueError(
+                f"landmark_ids must be a list of int64, got {ids!r}"
+            ) from None
     if array.dtype is not _INT64 or not array.flags.carray or array.ndim != 1:
         array = np.array(_as_signed(array, ids), dtype=np.int64)
     if len(array) != count:
@@ -168,7 +170,7 @@ def identity_array(ids: LandmarkIds | None, count: int, estimator: object) -> In
 def _as_signed(array: AnyArray, given: LandmarkIds | None) -> AnyArray:
     """Return ids that are unsigned or none at all, or refuse what is neither."""
     if array.size and (array.dtype.kind not in "iu" or array.ndim != 1):
-        raise ValueError(f"landmark_ids must be integers, got {given!r}")
+        raise ValueError(f"landmark_ids must be a list of int64, got {given!r}")
     if array.dtype == np.uint64 and (array > np.iinfo(np.int64).max).any():
         raise ValueError(f"landmark_ids must fit 64 bits, got {given!r}")
     return array.ravel()
