@@ -309,7 +309,7 @@ def runs_table(runs: "Sequence[NoiseRun]") -> Table:
     title = "Final 3σ areas and RMS errors; for NEES and NIS, 1 is expected"
     rows: list[dict[str, Any]] = [run.row._asdict() for run in runs]
     shown = [key for key in _COLUMNS if any(row[key] is not None for row in rows)]
-    table = _table((), title=title)
+    table = _table((), title=title, collapse_padding=True)  # fits 80
     for name in ("noise", "value"):
         table.add_column(name, no_wrap=True)
     for key in shown:

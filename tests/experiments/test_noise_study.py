@@ -2,11 +2,14 @@ import math
 import subprocess
 import sys
 from dataclasses import replace
+from io import StringIO
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from slamgym.envs.controllers import OpenLoop
+from slamgym.experiments.command_line.tables import runs_table
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.logs.slamlog import Scan
 from slamgym.experiments.noise_study import scaled_scenario, study_log, study_scenario
@@ -78,6 +81,16 @@ def test_a_filter_that_trusts_its_range_less_ends_with_larger_ellipses(of_log):
     assert narrow.landmark_area < reference.landmark_area < wide.landmark_area
     assert narrow.pose_area < reference.pose_area < wide.pose_area
     assert narrow.nis_per_degree > reference.nis_per_degree > wide.nis_per_degree
+
+
+def test_the_table_cuts_no_number_at_80_columns(of_log):
+    long = dict.fromkeys(of_log[0].row._fields[3:], 0.00123456)
+    run = of_log[1]._replace(
+        title="σx ÷ 10 = 0.000884 m", row=of_log[1].row._replace(**long)
+    )
+    console = Console(width=80, file=StringIO())
+    console.print(runs_table([run]))
+    assert "…" not in console.file.getvalue()
 
 
 def test_areas_are_those_of_the_final_3_sigma_ellipses(of_log):
