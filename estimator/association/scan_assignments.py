@@ -328,6 +328,19 @@ def located(pose: Array, readings: Array, noise: Noise) -> tuple[Array, Array, A
     return places, to_pose, J * variances[:, None] @ J.mT
 
 
+def with_readings(view: MapView, readings: Array, noise: Noise) -> MapView:
+    """Return a map, without room behind it, with a new landmark for each reading."""
+    places, to_pose, spread = located(view.mean[:3], readings, noise)
+    P, m = view.covariance, len(readings)
+    J = to_pose.reshape(2 * m, 3)
+    cross = J @ P[:3]
+    own = cross[:, :3] @ J.T
+    own.reshape(m, 2, m, 2)[range(m), :, range(m)] += spread
+    P = np.block([[P, cross.T], [cross, own]])
+    mean = np.append(view.mean, places)
+    return MapView(mean, P, range(len(view.ids) + m))
+
+
 class Sensor(NamedTuple):
     """The properties of the sensor that association uses."""
 

@@ -142,11 +142,13 @@ class ScanAssociation:
         found = assign_scan(self._policy, view, readings[rows], noise, density, most=1)
         slots = found.ranked[0].slots
         pairs = list(zip(rows.tolist(), slots.tolist(), strict=True))
-        for n, (row, slot) in enumerate(pairs):
+        for row, slot in pairs:
             if slot >= 0:
                 self.labels[row] = int(tentative.labels[slot])
-                reading = readings[row]
-                tentative = tentative.with_sighting(slot, reading, noise, density[n])
+        again = slots >= 0
+        sightings = slots[again], readings[rows[again]], noise, density[again]
+        if again.any():
+            tentative = tentative.with_sightings(*sightings)
         chance = self._detections.chance_to_miss(view, self._density.longest)
         tentative = tentative.with_misses(chance)
         needed = self._policy.confirm[0]
@@ -163,8 +165,10 @@ class ScanAssociation:
         labels = (self.scan << LABEL_BITS) + fresh
         for row, label in zip(fresh.tolist(), labels.tolist(), strict=True):
             self.labels[row] = label
-        self._tentative = tentative.chosen(~enough).with_new(
-            readings[fresh], noise, labels, self._density.landmark_share
+        self._tentative = (
+            tentative.chosen(~enough)
+            .with_new(readings[fresh], noise, labels, self._density.landmark_share)
+            .settled()
         )
 
     def _has_waited(self, landmark_id: int) -> bool:
@@ -225,12 +229,12 @@ class Candidates(NamedTuple):
         lost = LostEvidence(*saved["lost"].tolist())
         lost = lost._replace(first_new=int(lost.first_new))
         most_lost = max(lost.lasting, lost.unknown, lost.unexplained)
-        density, C = saved["density"], saved["covariances"]
-        likely = saved_states.is_semidefinite((C + C.transpose(0, 2, 1)) / 2)
+        density, C = saved["density"], saved["covariance"]
+        likely = saved_states.is_semidefinite((C + C.T) / 2)
         seen, expected, returned = saved["detected"]
         is_share = (returned >= 0) & (returned <= seen) & (seen <= expected)
         for name, wanted, is_so in (
-            ("covariances", "positive semidefinite", likely),
+            ("covariance", "positive semidefinite", likely),
             ("density", "> 0", density[:4].min() > 0),
             ("density", ">= 0", density[4] >= 0),
             ("unexplained", ">= 0", saved["unexplained"].min() >= 0),

@@ -1,23 +1,30 @@
 """Tentative landmarks: seen too rarely to be in the map, and kept outside it.
 
-Each has a position q in the robot's frame with a covariance C.  Odometry and further
-sightings change both::
+They have a map of their own: a mean and a covariance of (x, y, θ, q1x, q1y, …) in the
+frame of the robot after the last scan, as in robocentric mapping [1]_.  Odometry moves
+its pose, and the readings of a scan correct pose and positions together, as in any EKF.
+A heading that slips turns all readings of a scan alike, so that these reveal the slip.
+After the scan, the positions are those in the new frame, and the pose is 0::
 
-    predict   q ← R(−α) (q − (d, 0)),   C ← R(−α) (C + diag(σx², σy²)) R(α)
-              C ← C + σα² (J q) (J q)ᵀ
-    sighting  H = ∂(β, r)/∂q,   S = H C Hᵀ + Q
-              q ← q + C Hᵀ S⁻¹ ν,   C ← C − C Hᵀ S⁻¹ H C
+    q ← R(−θ) (q − p)
 
-They do not depend on the belief of the filter or its frame.  A tentative landmark that
-is never confirmed leaves the belief unchanged.
+This map does not depend on the belief of the filter or its frame.  A tentative landmark
+that is never confirmed leaves the belief unchanged.
 
 o are the odds that a tentative landmark is a landmark, not clutter.  They begin with
 the share of the readings that match no mapped landmark and proved to be of a new one.
-ρ is the density of all readings that match no mapped landmark::
+ρ is the density of all readings that match no mapped landmark, and ν and S are those
+of a reading given the other readings of its scan::
 
     new       o ← share / (1 − share)
     sighting  o ← o N(ν; S) / ρ
     miss      o ← o (1 − P_D)
+
+References
+----------
+.. [1] J. A. Castellanos, R. Martinez-Cantin, J. D. Tardós, J. Neira, Robocentric map
+   joining: Improving the consistency of EKF-SLAM, Robotics and Autonomous Systems 55,
+   2007.
 """
 
 from collections.abc import Sequence
@@ -29,9 +36,9 @@ from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
 from ..interface import MapView
 from ..models.bearing_range import predict_measurement, wrap_angle
-from ..models.rigid_motion import as_covariance, rotation
+from ..models.rigid_motion import as_covariance, predict, rotation
 from ..support import saved_states
-from .scan_assignments import Noise, located
+from .scan_assignments import Noise, with_readings
 
 #: Cells over the bearings, and over the ranges up to the longest reading.
 SECTORS, RINGS = 16, 8
@@ -55,15 +62,15 @@ class TentativeLandmarks(NamedTuple):
 
     >>> noise, none = Noise(0.1, 0.1), TentativeLandmarks()
     >>> one = none.with_new(np.array([[0.0, 4.0]]), noise, np.array([1]), share=0.5)
-    >>> two = one.next_scan(5).with_sighting(0, np.array([0.1, 4.1]), noise, 0.05)
-    >>> two.sightings.tolist()
+    >>> again = np.array([0]), np.array([[0.1, 4.1]]), noise, np.array([0.05])
+    >>> one.next_scan(5).with_sightings(*again).sightings.tolist()
     [2]
     """
 
-    #: q, shape (t, 2) [m].
-    places: Array = np.empty((0, 2))
-    #: C, shape (t, 2, 2) [m²].
-    covariances: Array = np.empty((0, 2, 2))
+    #: (x, y, θ, q1x, q1y, …), shape (3 + 2t,) [m, m, rad, m, …].
+    mean: Array = np.zeros(3)
+    #: Shape (3 + 2t, 3 + 2t).
+    covariance: Array = np.zeros((3, 3))
     #: One bit per scan, the latest scan lowest: whether the landmark was seen, (t,).
     seen: IntArray = np.empty(0, np.int64)
     #: Unique number of each, shape (t,).
@@ -76,17 +83,19 @@ class TentativeLandmarks(NamedTuple):
         """Number of sightings of each within the scans that count, shape (t,)."""
         return np.bitwise_count(self.seen).astype(np.int64)
 
+    @property
+    def places(self) -> Array:
+        """Positions relative to the robot, shape (t, 2) [m]."""
+        x, y, heading = self.mean[:3]
+        return np.asarray((self.mean[3:].reshape(-1, 2) - (x, y)) @ rotation(heading))
+
     def moved(
         self, displacement: tuple[float, float, float], variance: Array
     ) -> "TentativeLandmarks":
-        """Follow the robot by (dx, dy, α) in its frame, with noise (σx², σy², σα²)."""
-        *shift, turn = displacement
-        back = rotation(-turn)
-        places = (self.places - shift) @ back.T
-        spread = back @ (self.covariances + np.diag(variance[:2])) @ back.T
-        lever = places[:, ::-1] * (-1.0, 1.0)
-        spread += variance[2] * lever[:, :, None] * lever[:, None, :]
-        return self._replace(places=places, covariances=spread)
+        """Move the robot by (dx, dy, α) in its frame, with noise (σx², σy², σα²)."""
+        mean, P = self.mean.copy(), self.covariance.copy()
+        predict(mean, P, mean, len(mean), *displacement, variance, 0)
+        return self._replace(mean=mean, covariance=P)
 
     def next_scan(self, scans: int) -> "TentativeLandmarks":
         """Begin a scan: drop sightings ``scans`` old, then landmarks without any."""
@@ -96,38 +105,46 @@ class TentativeLandmarks(NamedTuple):
         return self._replace(seen=seen).chosen(seen > 0)
 
     def view(self) -> MapView:
-        """Return them as a map in the robot's frame, its pose known."""
-        t = len(self.seen)
-        mean, covariance = np.zeros(3 + 2 * t), np.zeros((3 + 2 * t, 3 + 2 * t))
-        mean[3:] = self.places.ravel()
-        blocks = covariance[3:, 3:].reshape(t, 2, t, 2)
-        blocks[np.arange(t), :, np.arange(t), :] = self.covariances
-        return MapView(mean, covariance, tuple(range(t)))
+        """Return their map."""
+        return MapView(self.mean, self.covariance, range(len(self.seen)))
 
     def with_misses(self, chance: Array) -> "TentativeLandmarks":
         """Lower the odds of those that this scan misses; chance (t,) is 1 − P_D."""
         missed = self.seen & 1 == 0
         return self._replace(odds=self.odds + np.where(missed, np.log(chance), 0.0))
 
-    def with_sighting(
-        self, which: int, reading: Array, noise: Noise, density: float
+    def with_sightings(
+        self, slots: IntArray, readings: Array, noise: Noise, density: Array
     ) -> "TentativeLandmarks":
-        """Correct one landmark by another reading (β, r), where the density is ρ."""
-        C, here = self.covariances[which], self.places[which : which + 1]
-        (expected,), _, (H,) = predict_measurement(np.zeros(3), here)
-        nu = reading - expected
-        nu[0] = wrap_angle(float(nu[0]))
-        variances = noise.variances(reading[1:])[0]
-        S = H @ C @ H.T + np.diag(variances)
-        gain = np.linalg.solve(S, H @ C).T
-        volume = max(np.linalg.det(S), variances.prod())  # less by rounding alone
-        unlikelihood = nu @ np.linalg.solve(S, nu) + np.log(volume)
-        after = TentativeLandmarks._make(part.copy() for part in self)
-        after.places[which] += gain @ nu
-        after.covariances[which] = as_covariance(C - gain @ H @ C)
-        after.seen[which] |= 1
-        after.odds[which] -= unlikelihood / 2 + np.log(2 * np.pi * density)
-        return after
+        """Correct k landmarks by a reading of each (k, 2), where the density is ρ.
+
+        With Λ = S⁻¹, a reading has the covariance Λᵢᵢ⁻¹ and the innovation Λᵢᵢ⁻¹ (Λν)ᵢ
+        given the others.
+        """
+        k, landmarks = len(slots), self.view().landmarks[slots]
+        expected, by_pose, by_place = predict_measurement(self.mean[:3], landmarks)
+        nu, variances = readings - expected, noise.variances(readings[:, 1])
+        nu[:, 0] = wrap_angle(nu[:, 0])
+        H = np.zeros((k, 2, len(self.mean)))
+        H[:, :, :3] = by_pose
+        columns = 3 + 2 * slots[:, None, None] + (0, 1)
+        np.put_along_axis(H, np.repeat(columns, 2, axis=1), by_place, axis=2)
+        slopes = H.reshape(2 * k, -1)
+        rows = slopes @ self.covariance
+        S = rows @ slopes.T + np.diag(variances.ravel())
+        information: Array = np.asarray(np.linalg.inv(S))
+        own = information.reshape(k, 2, k, 2)[range(k), :, range(k)]
+        C, white = np.linalg.inv(own), (information @ nu.ravel()).reshape(k, 2)
+        volume = np.maximum(
+            np.linalg.det(C), variances.prod(axis=1)
+        )  # but for rounding
+        unlikelihood = np.einsum("ki,kij,kj->k", white, C, white) + np.log(volume)
+        odds, seen = self.odds.copy(), self.seen.copy()
+        odds[slots] -= unlikelihood / 2 + np.log(2 * np.pi * density)
+        seen[slots] |= 1
+        mean = self.mean + white.ravel() @ rows
+        P = as_covariance(self.covariance - rows.T @ information @ rows)
+        return TentativeLandmarks(mean, P, seen, self.labels, odds)
 
     def with_new(
         self, readings: Array, noise: Noise, labels: IntArray, share: float
@@ -136,16 +153,29 @@ class TentativeLandmarks(NamedTuple):
         if not len(readings):
             return self
         share = min(max(share, LEAST_SHARE), 0.5)
-        places, _, spread = located(np.zeros(3), readings, noise)
         odds = np.full(len(readings), np.log(share / (1 - share)))
-        new = places, spread, np.ones(len(readings), np.int64), labels, odds
-        return TentativeLandmarks(*map(np.concatenate, zip(self, new, strict=True)))
+        new = np.ones(len(readings), np.int64), labels, odds
+        rest = map(np.concatenate, zip(self[2:], new, strict=True))
+        map_ = with_readings(self.view(), readings, noise)
+        return TentativeLandmarks(map_.mean, map_.covariance, *rest)
+
+    def settled(self) -> "TentativeLandmarks":
+        """Return them in the robot's frame, at the pose 0."""
+        places, t = self.places, len(self.seen)
+        back, lever = rotation(-self.mean[2]), places[:, ::-1] * (1.0, -1.0)
+        by_pose = np.hstack([np.tile(-back, (t, 1)), lever.reshape(-1, 1)])
+        T = np.hstack([by_pose, np.kron(np.eye(t), back)])
+        P = np.pad(as_covariance(T @ self.covariance @ T.T), (3, 0))
+        return self._replace(mean=np.append(np.zeros(3), places), covariance=P)
 
     def chosen(self, which: BoolArray) -> "TentativeLandmarks":
         """Return some of them."""
         if which.all():
             return self
-        return self._replace(**{k: part[which] for k, part in self._asdict().items()})
+        columns = np.append([True, True, True], np.repeat(which, 2))
+        P = self.covariance[np.ix_(columns, columns)]
+        rest = self.labels[which], self.odds[which]
+        return TentativeLandmarks(self.mean[columns], P, self.seen[which], *rest)
 
 
 class UnexplainedDensity(NamedTuple):
@@ -277,8 +307,8 @@ def _count_readings(
 
 #: What a saved state holds about them, in the order of the fields.
 TENTATIVE: saved_states.Table = {
-    "places": (saved_states.NUMBERS, "t", 2),
-    "covariances": (saved_states.NUMBERS, "t", 2, 2),
+    "mean": (saved_states.NUMBERS, "n"),
+    "covariance": (saved_states.NUMBERS, "n", "n"),
     "seen": (saved_states.COUNTS._replace(dtype=np.uint64), "t"),
     "labels": (saved_states.WHOLE, "t"),
     "odds": (saved_states.NUMBERS, "t"),

@@ -44,7 +44,7 @@ from ..association.constellations import (
     moved,
     turn_between,
 )
-from ..association.scan_assignments import Noise, located
+from ..association.scan_assignments import Noise, with_readings
 from ..interface import MapView
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import squared_offsets
@@ -236,7 +236,7 @@ def places_of_scan(
     rows = np.argsort(partners, kind="stable")[(partners == 0).sum() :]
     if len(rows) < FEWEST_READINGS:
         return []
-    both = _with_readings(_part(view, used), readings[rows], noise)
+    both = with_readings(_part(view, used), readings[rows], noise)
     known = np.arange(len(used))
     places = _two_places(both, len(used) + np.arange(len(rows)), known)
     feasible = feasible[np.ix_(rows, used)]
@@ -290,19 +290,6 @@ def _gaps(view: MapView, readings: Array, noise: Noise) -> Array:
             both = squared_offsets(slope + start, S) - own - rest
             turn = np.clip(-both / 2 / (own + 1 / variance), -np.pi, np.pi)
     return np.asarray(found)
-
-
-def _with_readings(view: MapView, readings: Array, noise: Noise) -> MapView:
-    """Return a map, without room behind it, with a new landmark for each reading."""
-    places, to_pose, spread = located(view.mean[:3], readings, noise)
-    P, m = view.covariance, len(readings)
-    J = to_pose.reshape(2 * m, 3)
-    cross = J @ P[:3]
-    own = cross[:, :3] @ J.T
-    own.reshape(m, 2, m, 2)[range(m), :, range(m)] += spread
-    P = np.block([[P, cross.T], [cross, own]])
-    mean = np.append(view.mean, places)
-    return MapView(mean, P, range(len(view.ids) + m))
 
 
 def _two_places(view: MapView, local: IntArray, older: IntArray) -> TwoPlaces:

@@ -144,6 +144,10 @@ def tracked(readings):
     return TentativeLandmarks().with_new(rows, NOISE, labels, share=0.2)
 
 
+def sighting(slot, reading, density):
+    return np.array([slot]), np.array([reading]), NOISE, np.array([density])
+
+
 def test_a_tentative_landmark_starts_where_it_was_read():
     reading = np.array([0.7, 6.0])
     one = tracked([reading])
@@ -154,46 +158,52 @@ def test_a_tentative_landmark_starts_where_it_was_read():
     J = numeric_jacobian(place, reading)
     Q = sensor_noise(NOISE, 6.0)
     np.testing.assert_allclose(one.places[0], place(reading))
-    np.testing.assert_allclose(one.covariances[0], J @ Q @ J.T, rtol=1e-6)
+    np.testing.assert_allclose(one.covariance[3:, 3:], J @ Q @ J.T, rtol=1e-6)
 
 
-def test_odometry_moves_a_tentative_landmark_and_its_doubt():
-    one, motion_std = tracked([(0.7, 6.0)]), np.array([0.3, 0.2, 0.1])
-    moved = one.moved((1.5, 0.0, 0.4), motion_std**2)
+def test_tentative_landmarks_are_settled_in_the_frame_of_the_robot():
+    both, motion_std = tracked([(0.7, 6.0), (-0.2, 3.0)]), np.array([0.3, 0.2, 0.1])
+    moved = both.moved((1.5, 0.0, 0.4), motion_std**2)
 
     def in_robot_frame(values):
-        q, slip = values[:2], values[2:]
+        q, slip = values[:4].reshape(2, 2), values[4:]
         pose = predict_pose(np.zeros(3), np.array([1.5, 0.4]))
         x, y, heading = pose.pose + pose.jacobian_noise @ slip
         c, s = np.cos(heading), np.sin(heading)
-        return np.array([[c, s], [-s, c]]) @ (q - (x, y))
+        return ((q - (x, y)) @ np.array([[c, -s], [s, c]])).ravel()
 
-    at = np.concatenate([one.places[0], np.zeros(3)])
-    J = numeric_jacobian(in_robot_frame, at)
-    P = np.zeros((5, 5))
-    P[:2, :2], P[2:, 2:] = one.covariances[0], np.diag(motion_std**2)
-    np.testing.assert_allclose(moved.places[0], in_robot_frame(at), atol=1e-12)
-    np.testing.assert_allclose(moved.covariances[0], J @ P @ J.T, rtol=1e-6)
+    at = np.concatenate([both.places.ravel(), np.zeros(3)])
+    J, P = numeric_jacobian(in_robot_frame, at), np.diag([0.0] * 4 + [*motion_std**2])
+    P[:4, :4] = both.covariance[3:, 3:]
+    settled = moved.settled()
+    for found in (moved, settled):
+        np.testing.assert_allclose(found.places.ravel(), in_robot_frame(at), atol=1e-12)
+    np.testing.assert_allclose(settled.covariance[3:, 3:], J @ P @ J.T, rtol=1e-6)
+    np.testing.assert_array_equal(settled.mean[:3], 0.0)
+    np.testing.assert_array_equal(settled.covariance[:3], 0.0)
 
 
-def test_a_sighting_corrects_a_tentative_landmark_like_any_filter():
-    motion, reading = (1.0, 0.0, 0.2), (0.6, 5.2)
-    one = tracked([(0.7, 6.0)]).moved(motion, np.ones(3) * 0.01)
-    P = np.zeros((5, 5))
-    P[3:, 3:] = one.covariances[0]
-    expected = predict_measurement(np.zeros(3), one.places)
-    H = expected.jacobian_landmark[0]
-    S = H @ one.covariances[0] @ H.T
-    S += sensor_noise(NOISE, 5.2)
-    K = one.covariances[0] @ H.T @ np.linalg.inv(S)
-    seen = one.with_sighting(0, np.array(reading), NOISE, density=0.03)
-    place = one.places[0] + K @ (np.array(reading) - expected.measurement[0])
-    np.testing.assert_allclose(seen.places[0], place, rtol=1e-10)
-    left = (np.eye(2) - K @ H) @ one.covariances[0]
-    np.testing.assert_allclose(seen.covariances[0], left, rtol=1e-9)
-    likelihood = multivariate_normal(expected.measurement[0], S).pdf(reading)
-    odds = 0.2 / 0.8 * likelihood / 0.03
-    np.testing.assert_allclose(seen.odds, np.log(odds), rtol=1e-9)
+def test_sightings_correct_tentative_landmarks_like_any_filter():
+    first, again = [(0.7, 6.0), (-0.2, 3.0), (2.0, 4.0)], [(1.6, 6.2), (0.7, 3.1)]
+    motion_std, (bearing_std, range_std, growth, metres) = (0.2, 0.1, 0.9), NOISE
+    growths = {"range_std_per_metre": growth, "bearing_std_metres": metres}
+    oracle = make_estimator(
+        "ekf", motion_std=motion_std, measurement_std=(bearing_std, range_std),
+        **growths, range_noise_at="reading",
+    )  # fmt: skip
+    oracle.update(first, [0, 1, 2])
+    oracle.predict((1.0, 0.2))
+    report = oracle.update(again, [0, 1])
+    moved = tracked(first).moved((1.0, 0.0, 0.2), np.square(motion_std))
+    seen = moved.with_sightings(np.arange(2), np.array(again), NOISE, np.full(2, 0.03))
+    np.testing.assert_allclose(seen.mean, oracle.belief().mean, rtol=1e-9)
+    np.testing.assert_allclose(seen.covariance, oracle.belief().covariance, atol=1e-12)
+    for k in range(2):  # p(one | other) = p(both) / p(other)
+        S, rows = report.innovation_covariance, [2 - 2 * k, 3 - 2 * k]
+        both = multivariate_normal(cov=S).pdf(report.innovation.ravel())
+        other = multivariate_normal(cov=S[np.ix_(rows, rows)])
+        odds = 0.25 / 0.03 * both / other.pdf(report.innovation.ravel()[rows])
+        np.testing.assert_allclose(seen.odds[k], np.log(odds), rtol=1e-9)
 
 
 def test_sightings_count_as_long_as_they_are_recent():
@@ -202,19 +212,42 @@ def test_sightings_count_as_long_as_they_are_recent():
     for seen in (True, False, False, True, False, False, False, False):
         landmark = landmark.next_scan(4)
         if seen:
-            landmark = landmark.with_sighting(0, np.array([0.0, 5.0]), NOISE, 1.0)
+            landmark = landmark.with_sightings(*sighting(0, (0.0, 5.0), 1.0))
         counts += landmark.sightings.tolist()
     assert counts == [2, 2, 2, 2, 1, 1, 1]  # and at last it is forgotten
 
 
 def test_a_miss_counts_against_a_tentative_landmark():
     both = tracked([(0.0, 5.0), (1.0, 5.0)]).next_scan(8)
-    one = both.with_sighting(0, np.array([0.0, 5.0]), NOISE, density=0.1)
+    one = both.with_sightings(*sighting(0, (0.0, 5.0), density=0.1))
     missed = one.with_misses(np.array([0.3, 0.05]))
     np.testing.assert_allclose(missed.odds - one.odds, [0.0, np.log(0.05)])
 
 
 # --- all of it ---
+
+
+@pytest.mark.parametrize("seed", range(3, 6))
+def test_landmarks_are_found_by_a_robot_whose_heading_slips_by_a_radian(seed):
+    world = load_scenario("slippery").with_changes(sensor={"identities": False})
+    noise = {"motion_std": world.motion.std, "measurement_std": world.sensor.std}
+    start = {"initial_pose": world.start.pose, "initial_pose_std": world.start.std}
+    known, hidden = (
+        make_estimator("invariant", **noise, **start, **options)
+        for options in ({}, {"management": True})
+    )
+    env = LandmarkWorldEnv(world)
+    observation, info = env.reset(seed=seed)
+    for action in [*action_sequence(world), None]:
+        known.update(observation["landmarks"], info["landmark_ids"])
+        hidden.update(observation["landmarks"])
+        if action is not None:
+            observation, *_, info = env.step(action)
+            for slam in (known, hidden):
+                slam.predict(observation["odometry"])
+    assert len(hidden.landmark_ids) == 6
+    gap = hidden.belief().pose - known.belief().pose
+    assert np.hypot(*gap[:2]) < 0.5
 
 
 @pytest.mark.slow

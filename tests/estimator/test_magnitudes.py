@@ -78,7 +78,8 @@ def test_the_odds_of_a_landmark_that_is_too_far_for_its_noise_are_finite(distanc
         held = TentativeLandmarks().with_new(first, noise, np.zeros(1, int), 0.1)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            held = held.with_sighting(0, first[0] + (0.02, 0.1), noise, 1e-3)
+            again = np.array([0]), np.add(first, (0.02, 0.1)), noise, np.array([1e-3])
+            held = held.with_sightings(*again)
         assert np.isfinite(held.odds).all()
 
 

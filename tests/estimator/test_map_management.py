@@ -226,7 +226,7 @@ def test_a_tentative_landmark_stays_as_it_is_while_a_robot_without_noise_rests()
     before = slam.state_dict()
     slam.predict((0.0, 0.0))
     after = slam.state_dict()
-    key = "tentative.covariances"
+    key = "tentative.covariance"
     np.testing.assert_array_equal(before[key], after[key])
     slam.predict((0.1, 0.0))
     assert (np.linalg.det(slam.state_dict()[key]) > np.linalg.det(before[key])).all()
@@ -235,9 +235,9 @@ def test_a_tentative_landmark_stays_as_it_is_while_a_robot_without_noise_rests()
 def test_a_saved_tentative_landmark_of_negative_variance_is_refused():
     slam = make(management={})
     slam.update(polar([(3, 4)]))
-    key = "tentative.covariances"
+    key = "tentative.covariance"
     state = slam.state_dict()
-    with pytest.raises(ValueError, match=r"covariances'\] must be positive semidef"):
+    with pytest.raises(ValueError, match=r"covariance'\] must be positive semidef"):
         slam.load_state_dict(state | {key: -state[key]})
 
 
