@@ -331,12 +331,15 @@ def located(pose: Array, readings: Array, noise: Noise) -> tuple[Array, Array, A
 def with_readings(view: MapView, readings: Array, noise: Noise) -> MapView:
     """Return a map, without room behind it, with a new landmark for each reading."""
     places, to_pose, spread = located(view.mean[:3], readings, noise)
-    P, m = view.covariance, len(readings)
+    n, m = len(view.mean), len(readings)
     J = to_pose.reshape(2 * m, 3)
-    cross = J @ P[:3]
-    own = cross[:, :3] @ J.T
+    P = np.empty((n + 2 * m, n + 2 * m))
+    P[:n, :n] = view.covariance
+    P[n:, :n] = J @ view.covariance[:3]
+    P[:n, n:] = P[n:, :n].T
+    own = P[n:, :3] @ J.T
     own.reshape(m, 2, m, 2)[range(m), :, range(m)] += spread
-    P = np.block([[P, cross.T], [cross, own]])
+    P[n:, n:] = own
     mean = np.append(view.mean, places)
     return MapView(mean, P, range(len(view.ids) + m))
 

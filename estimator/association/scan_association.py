@@ -59,7 +59,7 @@ class ScanAssociation:
         self, policy: AssociationPolicy, candidates: Candidates, readings: Array
     ) -> None:
         self._policy, self._readings = policy, readings
-        self._tentative = candidates.tentative.next_scan(policy.confirm[1])
+        self._tentative = candidates.tentative
         self._waiting = dict(candidates.waiting)
         self._next_id, self.scan = candidates.next_id, candidates.scan
         self._density, self._detections = candidates.density, candidates.detections
@@ -95,7 +95,8 @@ class ScanAssociation:
             firsts = {i: label >> LABEL_BITS for i, label in self.confirmed.items()}
             self.price = detections.cost_of_new(view, firsts, self._density.longest)
             detections = detections.with_pose(self.scan, view, self._density.longest)
-        changed = self._tentative, self._waiting, self._next_id, self.scan + 1
+        tentative = self._tentative.after_scan(self._policy.confirm[1])
+        changed = tentative, self._waiting, self._next_id, self.scan + 1
         return Candidates(*changed, density, detections)
 
     def assign(self, slots: IntArray, view: MapView, noise: Noise) -> None:
@@ -165,10 +166,8 @@ class ScanAssociation:
         labels = (self.scan << LABEL_BITS) + fresh
         for row, label in zip(fresh.tolist(), labels.tolist(), strict=True):
             self.labels[row] = label
-        self._tentative = (
-            tentative.chosen(~enough)
-            .with_new(readings[fresh], noise, labels, self._density.landmark_share)
-            .settled()
+        self._tentative = tentative.chosen(~enough).with_new(
+            readings[fresh], noise, labels, self._density.landmark_share
         )
 
     def _has_waited(self, landmark_id: int) -> bool:
@@ -322,7 +321,7 @@ def _unexplained_density(
     density = candidates.density.at(readings, policy.density)
     if policy.association in ("nearest", "compatibility"):  # they use none
         return density
-    tentative = candidates.tentative.next_scan(policy.confirm[1])
+    tentative = candidates.tentative
     if not len(tentative.seen):
         return density
     fit = innovation_distances(tentative.view(), readings, noise, policy.new_gate)

@@ -1,10 +1,11 @@
 """Tentative landmarks: seen too rarely to be in the map, and kept outside it.
 
 They have a map of their own: a mean and a covariance of (x, y, θ, q1x, q1y, …) in the
-frame of the robot after the last scan, as in robocentric mapping [1]_.  Odometry moves
-its pose, and the readings of a scan correct pose and positions together, as in any EKF.
-A heading that slips turns all readings of a scan alike, so that these reveal the slip.
-After the scan, the positions are those in the new frame, and the pose is 0::
+frame of the robot after a recent scan, as in robocentric mapping [1]_.  Odometry moves
+its pose, and readings correct pose and positions together, as in any EKF.  A heading
+that slips turns all readings of a scan alike, so that these reveal the slip.  Once the
+heading is too uncertain for linearised equations, the positions are expressed in the
+frame of the robot, where its pose is 0::
 
     q ← R(−θ) (q − p)
 
@@ -49,6 +50,9 @@ MEMORY = 0.98
 #: A range counts up to this many times the longest one of a landmark seen again.
 BEYOND = 4.0
 
+#: Up to this σ of the heading, the frame remains that of an earlier scan [rad].
+STRAIGHT = 0.05
+
 #: Least prior probability of being a landmark: the robot may enter a new region.
 LEAST_SHARE = 0.01
 
@@ -63,7 +67,7 @@ class TentativeLandmarks(NamedTuple):
     >>> noise, none = Noise(0.1, 0.1), TentativeLandmarks()
     >>> one = none.with_new(np.array([[0.0, 4.0]]), noise, np.array([1]), share=0.5)
     >>> again = np.array([0]), np.array([[0.1, 4.1]]), noise, np.array([0.05])
-    >>> one.next_scan(5).with_sightings(*again).sightings.tolist()
+    >>> one.after_scan(5).with_sightings(*again).sightings.tolist()
     [2]
     """
 
@@ -71,7 +75,7 @@ class TentativeLandmarks(NamedTuple):
     mean: Array = np.zeros(3)
     #: Shape (3 + 2t, 3 + 2t).
     covariance: Array = np.zeros((3, 3))
-    #: One bit per scan, the latest scan lowest: whether the landmark was seen, (t,).
+    #: One bit per scan, the present scan lowest: whether the landmark was seen, (t,).
     seen: IntArray = np.empty(0, np.int64)
     #: Unique number of each, shape (t,).
     labels: IntArray = np.empty(0, np.int64)
@@ -96,13 +100,6 @@ class TentativeLandmarks(NamedTuple):
         mean, P = self.mean.copy(), self.covariance.copy()
         predict(mean, P, mean, len(mean), *displacement, variance, 0)
         return self._replace(mean=mean, covariance=P)
-
-    def next_scan(self, scans: int) -> "TentativeLandmarks":
-        """Begin a scan: drop sightings ``scans`` old, then landmarks without any."""
-        if not len(self.seen):
-            return self
-        seen = (self.seen << 1) & ((1 << scans) - 1)
-        return self._replace(seen=seen).chosen(seen > 0)
 
     def view(self) -> MapView:
         """Return their map."""
@@ -159,14 +156,22 @@ class TentativeLandmarks(NamedTuple):
         map_ = with_readings(self.view(), readings, noise)
         return TentativeLandmarks(map_.mean, map_.covariance, *rest)
 
-    def settled(self) -> "TentativeLandmarks":
-        """Return them in the robot's frame, at the pose 0."""
-        places, t = self.places, len(self.seen)
-        back, lever = rotation(-self.mean[2]), places[:, ::-1] * (1.0, -1.0)
+    def after_scan(self, scans: int) -> "TentativeLandmarks":
+        """Return those seen in the last ``scans`` − 1 scans, in a frame close by."""
+        seen = (self.seen << 1) & ((1 << scans) - 1)
+        left = self._replace(seen=seen).chosen(seen > 0)
+        if not (t := len(left.seen)):
+            return TentativeLandmarks()
+        if left.covariance[2, 2] <= STRAIGHT**2:
+            return left
+        places, P, back = left.places, left.covariance, rotation(-left.mean[2])
+        lever = places[:, ::-1] * (1.0, -1.0)
         by_pose = np.hstack([np.tile(-back, (t, 1)), lever.reshape(-1, 1)])
-        T = np.hstack([by_pose, np.kron(np.eye(t), back)])
-        P = np.pad(as_covariance(T @ self.covariance @ T.T), (3, 0))
-        return self._replace(mean=np.append(np.zeros(3), places), covariance=P)
+        for _ in range(2):  # T P, then T (T P)ᵀ
+            own = back @ P[3:].reshape(t, 2, -1)
+            P = (by_pose @ P[:3] + own.reshape(2 * t, -1)).T
+        mean, P = np.append(np.zeros(3), places), np.pad(as_covariance(P), (3, 0))
+        return left._replace(mean=mean, covariance=P)
 
     def chosen(self, which: BoolArray) -> "TentativeLandmarks":
         """Return some of them."""

@@ -175,7 +175,7 @@ def test_tentative_landmarks_are_settled_in_the_frame_of_the_robot():
     at = np.concatenate([both.places.ravel(), np.zeros(3)])
     J, P = numeric_jacobian(in_robot_frame, at), np.diag([0.0] * 4 + [*motion_std**2])
     P[:4, :4] = both.covariance[3:, 3:]
-    settled = moved.settled()
+    settled = moved.after_scan(8)
     for found in (moved, settled):
         np.testing.assert_allclose(found.places.ravel(), in_robot_frame(at), atol=1e-12)
     np.testing.assert_allclose(settled.covariance[3:, 3:], J @ P @ J.T, rtol=1e-6)
@@ -210,7 +210,7 @@ def test_sightings_count_as_long_as_they_are_recent():
     landmark = tracked([(0.0, 5.0)])
     counts = []
     for seen in (True, False, False, True, False, False, False, False):
-        landmark = landmark.next_scan(4)
+        landmark = landmark.after_scan(4)
         if seen:
             landmark = landmark.with_sightings(*sighting(0, (0.0, 5.0), 1.0))
         counts += landmark.sightings.tolist()
@@ -218,7 +218,7 @@ def test_sightings_count_as_long_as_they_are_recent():
 
 
 def test_a_miss_counts_against_a_tentative_landmark():
-    both = tracked([(0.0, 5.0), (1.0, 5.0)]).next_scan(8)
+    both = tracked([(0.0, 5.0), (1.0, 5.0)]).after_scan(8)
     one = both.with_sightings(*sighting(0, (0.0, 5.0), density=0.1))
     missed = one.with_misses(np.array([0.3, 0.05]))
     np.testing.assert_allclose(missed.odds - one.odds, [0.0, np.log(0.05)])

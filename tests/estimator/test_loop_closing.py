@@ -18,9 +18,9 @@ from slamgym.estimator.map_management.loop_closing import (
     OFFSET_GATE,
     _gaps,
     _offsets,
-    _with_readings,
     lost,
     places_of_scan,
+    with_readings,
 )
 from slamgym.estimator.map_management.map_editor import MapEditor
 from slamgym.estimator.map_management.policy import as_policy
@@ -366,7 +366,7 @@ def test_a_reading_extends_the_map_as_a_new_landmark_of_the_filter():
     readings = np.array([[0.3, 4.0], [-2.0, 1.5]])
     before = given.belief()
     view = MapView(before.mean, before.covariance, before.landmark_ids)
-    extended = _with_readings(view, readings, Noise(0.01, 0.03))
+    extended = with_readings(view, readings, Noise(0.01, 0.03))
     given.update(readings, [90, 91])
     np.testing.assert_allclose(extended.mean, given.belief().mean, atol=1e-9)
     np.testing.assert_allclose(
@@ -413,7 +413,7 @@ def _of_a_turned_map(view, phi, readings, noise):
     known = np.eye(len(P)) * 1e-12  # less would be singular
     given = view.mean + gain * phi, P - np.outer(gain, P[2]) + known
     n, m = len(view.ids), len(readings)
-    both = _with_readings(MapView(*given, view.ids), readings, noise)
+    both = with_readings(MapView(*given, view.ids), readings, noise)
     squared, _ = _offsets(both, n + np.arange(m), np.arange(n))
     return phi**2 / P[2, 2] + squared
 
