@@ -144,8 +144,8 @@ def load_results(path: str | Path) -> xr.Dataset:
         results = xr.open_dataset(file, engine="netcdf4")
     except (OSError, KeyError, ValueError) as error:
         raise ValueError(
-            f"{file} is truncated, or holds no results: {error}; if there is blocks/ "
-            "beside it, the same command makes the file again from them"
+            f"{file} is truncated, or holds no results: {error}; if a folder blocks "
+            "lies beside it, the same command makes the file again from it"
         ) from error
     lacking = sorted(set(run_measures.VARIABLES) - set(results.variables))
     if lacking:
