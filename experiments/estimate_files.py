@@ -115,11 +115,12 @@ def paths_by_label(estimates: Any) -> dict[str, list[Path]]:
     """Return paths by the labels of estimators."""
 
     def paths_in(given: Any) -> list[Path]:
-        return list(map(Path, [given] if isinstance(given, str | PathLike) else given))
+        each = [given] if isinstance(given, str | PathLike) else given
+        if not isinstance(each, Iterable):
+            raise TypeError(f"estimates must be paths of files, got {given!r}")
+        return list(map(Path, each))
 
     named: dict[str, list[Path]] = {}
-    if not isinstance(estimates, str | PathLike | Iterable):
-        raise TypeError(f"estimates must be paths of files, got {estimates!r}")
     if isinstance(estimates, Mapping):
         named = {str(label): paths_in(each) for label, each in estimates.items()}
     else:

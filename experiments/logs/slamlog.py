@@ -59,6 +59,12 @@ ROW_FORMS = {
 }
 
 
+def refuse_other_log(log: object) -> None:
+    """Refuse what is no log, for example the path of its file."""
+    if not isinstance(log, SlamLog):
+        raise TypeError(f"log must be a SlamLog, as read_log returns it, got {log!r}")
+
+
 @dataclass(frozen=True, eq=False)
 class SlamLog:
     """One drive: the readings of the robot, and the truth as far as it is known.

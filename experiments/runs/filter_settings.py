@@ -27,7 +27,7 @@ from ...sim_configs import Scenario
 from ...suggestions import closest
 from ..logs.ground_truth import hides_identities
 from ..logs.recording import log_header
-from ..logs.slamlog import UNICYCLES, LogError, SlamLog
+from ..logs.slamlog import UNICYCLES, LogError, SlamLog, refuse_other_log
 
 if TYPE_CHECKING:
     from .simulated_runs import SimulatedRuns
@@ -167,6 +167,7 @@ def settings_for(
     LogError
         If a value in the header is malformed.
     """
+    refuse_other_log(log)
     name, own = registry.read_label(estimator)
     estimator = OFFLINE.get(name, name)
     factory = registry.find_estimator(estimator)

@@ -116,7 +116,8 @@ def replay(
         If the estimator refuses a reading, naming the time in the log; before the
         first step, if the log names more landmarks than a belief of it may hold.
     TypeError
-        If the estimator is no filter, but a class or a name, for example.
+        If the estimator is no filter, but a class or a name, for example, or the log
+        is a path.
     numpy.linalg.LinAlgError
         If its covariance degenerates or is not finite, naming the time too.
     MemoryError
@@ -132,6 +133,7 @@ def replay(
     >>> replay(log, slam).readings
     ReadingCounts(associated=1, added=1, rejected=0, skipped=0, near=1, ...
     """
+    slamlog.refuse_other_log(log)
     if isinstance(estimator, type) or not hasattr(estimator, "predict"):
         raise TypeError(
             f"estimator must be a filter, as make_estimator returns it, got {estimator}"

@@ -752,6 +752,7 @@ def test_the_example_of_gtsam_names_the_frame(tmp_path):
     ("call", "message"),
     [
         (judge, "estimates must be paths of files, got None"),
+        (lambda _: judge({"mine": 3}), "estimates must be paths of files, got 3"),
         (smooth, "drive must be a Drive, got None"),
     ],
 )

@@ -596,3 +596,9 @@ def test_a_truth_that_is_known_at_some_steps_only_gives_no_warning_of_numpy():
 def test_what_is_no_filter_is_refused_by_replay(given):
     with pytest.raises(TypeError, match="estimator must be a filter, as make_estimat"):
         replay(SlamLog("empty"), given)
+
+
+@pytest.mark.parametrize("use", [replay, settings_for])
+def test_the_path_of_a_log_is_no_log(use):
+    with pytest.raises(TypeError, match=r"log must be a SlamLog, .*, got 'a\.csv'"):
+        use("a.csv", estimator="ekf")
