@@ -63,6 +63,7 @@ _BINS = 70
 _FEW_DOTS = 100
 #: Of one estimator in `runs_figure`, which shows quantiles of more runs.
 MOST_DOTS = 300
+_LEAST_RATIO = 1e-6  # of NEES / 3; smaller ones, such as 0 of the truth, are drawn here
 
 
 def report_figures(
@@ -153,7 +154,7 @@ def nees_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
             axes.axhline(end, color=GREY, lw=0.8, label=name)
     extremes = [band]
     for scores, look in shown:
-        average = scores.ratios(frame).mean(axis=0)
+        average = np.maximum(scores.ratios(frame).mean(axis=0), _LEAST_RATIO)
         steps = np.arange(scores.first, scores.first + len(average))
         axes.plot(*thinned(steps, average), **look.line(plain(scores.label)))
         _mark_grid(axes, summary["estimators"][scores.label]["decisions"], look)
@@ -174,13 +175,14 @@ def runs_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
     figure = new_figure(study.width, 0.8 + 1.0 * len(shown))
     axes = figure.subplots()
     size = 3.4 if len(shown[0][0].good) <= _FEW_DOTS else 2.6
-    each = [_dots(scores.ratios(frame).mean(axis=1)) for scores, _ in shown]
-    logs = np.log10(np.concatenate(each))
+    averages = [scores.ratios(frame).mean(axis=1) for scores, _ in shown]
+    each = [np.log10(np.maximum(_dots(ratios), _LEAST_RATIO)) for ratios in averages]
+    logs = np.concatenate(each)
     edges = np.linspace(min(logs.min(), -0.5), max(logs.max(), 0.6), _BINS + 1)
     for row, ((scores, look), dots) in enumerate(zip(shown, each, strict=True)):
-        x, lift = _swarm(np.log10(dots), edges)
+        x, lift = _swarm(dots, edges)
         axes.plot(10**x, row + lift, "o", color=look.colour, ms=size, mew=0, alpha=0.75)
-        median = np.median(scores.ratios(frame).mean(axis=1))
+        median = max(float(np.median(averages[row])), _LEAST_RATIO)
         label = "median of the runs" if row == 0 else None
         ends = [row - 0.34, row + 0.34]
         axes.plot([median] * 2, ends, color=INK, lw=1.6, label=label)
@@ -288,7 +290,7 @@ def _mark_grid(
     if decisions is None:
         return
     grid = decisions["grid"]
-    steps, ratios = np.array(grid["steps"]), np.array(grid["statistic"], dtype=float)
+    steps, ratios = np.array(grid["steps"]), np.maximum(grid["statistic"], _LEAST_RATIO)
     rejected = np.array(grid["rejected"])
     for chosen, face in ((rejected, look.colour), (~rejected, "white")):
         if not chosen.any():
@@ -395,8 +397,9 @@ def log_ticks(axes: Axes, which: str) -> None:
     getattr(axes, f"set_{which}scale")("log")
     axis = getattr(axes, f"{which}axis")
     low, high = axis.get_view_interval()
-    wide = high > 100 * low
-    axis.set_major_locator(LogLocator(subs=(1, 3) if wide else (1, 2, 5), numticks=12))
+    decades = math.log10(high / low)
+    subs = (1,) if decades > 4 else (1, 3) if decades > 2 else (1, 2, 5)
+    axis.set_major_locator(LogLocator(subs=subs, numticks=12))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 

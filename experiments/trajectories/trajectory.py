@@ -106,8 +106,8 @@ def array_of(trajectory: Trajectory, name: str) -> AnyArray:
     value = getattr(trajectory, name)
     if value is None:
         raise ValueError(
-            f"the trajectory of seed {trajectory.seed} must have {name} to be written "
-            "in this format, got None"
+            f"the trajectory of seed {trajectory.seed} must have {name}, got None: "
+            "the format of its data set may not hold it"
         )
     array: AnyArray = value
     return array

@@ -18,7 +18,9 @@ from slamgym.estimator.smoother import smooth
 from slamgym.evaluation.nees import normalised_squared_error
 from slamgym.experiments import (
     generate_trajectories,
+    nees_figure,
     read_slamlog,
+    runs_figure,
     summarise_monte_carlo,
 )
 from slamgym.experiments.conventions import (
@@ -331,8 +333,11 @@ def test_the_errors_of_a_filter_are_no_stray_poses():
 
 
 def test_the_truth_is_not_an_estimate(drives, beliefs, written):
-    found = entry_of(judge(written(beliefs[3], beliefs[2]), drives))
-    assert "the poses are the true ones" in found["diagnosis"]["sentence"]
+    results = judge(written(beliefs[3], beliefs[2]), drives)
+    assert "the poses are the true ones" in entry_of(results)["diagnosis"]["sentence"]
+    assert not results.pose_nees_invariant.any()
+    for draw in nees_figure, runs_figure:  # on logarithmic axes
+        draw(results).draw_without_rendering()
 
 
 FRAMES = {
