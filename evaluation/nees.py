@@ -14,11 +14,13 @@ import numpy as np
 
 from ..arrays import Array
 from ..estimator.models.rigid_motion import (
+    ERROR_FRAMES,
     ErrorFrame,
     additive_error,
     invariant_covariance,
     invariant_error,
 )
+from ..estimator.support.argument_checks import one_of
 
 #: Conditional variance, as a share of the variance, below which it counts as zero.
 SINGULAR = 1e-10
@@ -217,7 +219,7 @@ def _in_frame(
     true_states: Array, means: Array, covariances: Array, frame: ErrorFrame
 ) -> tuple[Array, Array]:
     """Return errors and their claimed covariances in a named frame."""
-    if frame == "invariant":
+    if one_of("frame", frame, ERROR_FRAMES) == "invariant":
         errors = invariant_error(true_states, means)
         return errors, invariant_covariance(means, covariances)
     return additive_error(true_states, means), covariances

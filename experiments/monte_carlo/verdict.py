@@ -17,7 +17,8 @@ import numpy as np
 import xarray as xr
 
 from ...arrays import Array, BoolArray, IntArray
-from ...estimator.models.rigid_motion import ErrorFrame
+from ...estimator.models.rigid_motion import ERROR_FRAMES, ErrorFrame
+from ...estimator.support.argument_checks import one_of
 from ...evaluation.consistency_report import (
     FEW_AVERAGES,
     FEW_RUNS,
@@ -605,6 +606,7 @@ def scores_of(dataset: xr.Dataset, label: str, frame: ErrorFrame) -> EstimatorSc
     frame : {"additive", "invariant"}
         Error coordinates whose NEES must be finite, and below 1e100.
     """
+    one_of("frame", frame, ERROR_FRAMES)
     results = dataset.sel(estimator=label)
     nees = results[f"pose_nees_{frame}"].values
     nis, freedom = results["nis"].values, results["nis_dof"].values

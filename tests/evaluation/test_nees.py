@@ -93,3 +93,14 @@ def test_a_covariance_singular_within_rounding_has_no_nees(size):
     nees = normalised_squared_error(np.ones((2, size)), covariance)
     assert nees[0] == pytest.approx(size)
     assert np.isnan(nees[1])
+
+
+@pytest.mark.parametrize(
+    "function", [pose_nees, position_nees, state_nees, landmark_nees]
+)
+def test_an_unknown_frame_is_not_taken_for_the_additive_one(function):
+    states, P = np.zeros((2, 5)), np.tile(np.eye(5), (2, 1, 1))
+    if function in (pose_nees, position_nees):
+        states, P = states[:, :3], P[:, :3, :3]
+    with pytest.raises(ValueError, match="frame must be 'additive' or 'invariant'"):
+        function(states, states, P, frame="right")

@@ -368,6 +368,8 @@ def test_the_frame_can_be_chosen():
     last = typical()["pose_nees_additive"].sel(estimator="ekf", step=29)
     assert decision["statistic"] == pytest.approx(float(last.mean()) / 3)
     assert "additive frame" in table_text(summary, 100)
+    with pytest.raises(ValueError, match="frame must be 'additive' or 'invariant'"):
+        summarise_monte_carlo(typical(), frame="right")
 
 
 def test_other_noise_than_the_worlds_is_told():
