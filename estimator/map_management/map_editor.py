@@ -74,7 +74,7 @@ class MapEditor:
         if not can_save or not {*DENSE} <= set(slam.state_dict()):
             methods = "methods remove and merge" if merging else "method remove"
             raise TypeError(
-                f"{type(slam).__name__} cannot be managed so: it needs the {methods}, "
+                f"{type(slam).__name__} cannot be managed: it needs the {methods}, "
                 f"or state_dict() and load_state_dict() with {', '.join(DENSE)}"
             )
 

@@ -301,7 +301,7 @@ def _header_options(
         if options.get(key) and key not in accepted:
             raise ValueError(
                 f"the noise of {name} contains {key}, an argument that the estimator "
-                "does not have: give it another --measurement-std"
+                "does not have; for a log, another --measurement-std replaces it"
             )
     return accepted
 
