@@ -231,7 +231,8 @@ def make_batch(
         name, motion_std=motion_std, measurement_std=measurement_std, **options
     )
     if not isinstance(estimator, ekf.EkfSlam):
-        raise ValueError(f"{name} cannot run in batches")
+        managed = " with landmark management" if "management" in options else ""
+        raise ValueError(f"{name}{managed} cannot run in batches")
     return BatchSlam(
         estimator,
         runs,

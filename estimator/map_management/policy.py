@@ -68,8 +68,8 @@ class LandmarkPolicy(AssociationPolicy):
             argument_checks.above("merge_within", self.merge_within, 0.0)
         if not isinstance(self.constellations, Constellations | None):
             raise ValueError(
-                "constellations must be Constellations, its fields as a mapping, True, "
-                f"or None, got {self.constellations!r}"
+                "constellations must be Constellations or None (management= also takes "
+                f"its fields as a mapping, and True), got {self.constellations!r}"
             )
         if not isinstance(self.view, FieldOfView | None):
             raise ValueError(f"view must be a FieldOfView or None, got {self.view!r}")

@@ -134,6 +134,8 @@ def test_a_filter_either_runs_in_batches_or_says_that_it_cannot(name):
             make_batch(name, **settings)
     else:
         assert make_batch(name, **settings).runs == 2
+        with pytest.raises(ValueError, match=f"{name} with landmark management cannot"):
+            make_batch(name, **settings, management=True)
 
 
 @pytest.mark.parametrize(
