@@ -26,8 +26,13 @@ from ..kernels.assignment_search import (
     largest_change,
     reading_covariance,
 )
-from ..models.bearing_range import locate_landmark, reading_slopes_jit, wrap_angle_jit
-from ..models.sensors import only_bearing_range, sensor_in
+from ..models.bearing_range import (
+    locate_landmark,
+    reading_slopes_jit,
+    reading_variances_jit,
+    wrap_angle_jit,
+)
+from ..models.sensors import bearing_range_std, only_bearing_range, sensor_in
 from ..support import argument_checks
 
 #: Assignments of a scan e^8 times less likely than the best one are not considered.
@@ -307,12 +312,7 @@ class Noise(NamedTuple):
 
     def variances(self, ranges: Array) -> Array:
         """Return the variances of bearing and range at ranges (m,) > 0, (m, 2)."""
-        std = np.empty((len(ranges), 2))
-        std[:, 0] = self.bearing_std
-        if self.bearing_std_metres:
-            std[:, 0] += self.bearing_std_metres / ranges
-        std[:, 1] = self.range_std + self.range_std_per_metre * ranges
-        return np.asarray(std**2)
+        return np.array(bearing_range_std(self, ranges)).T ** 2
 
 
 def located(pose: Array, readings: Array, noise: Noise) -> tuple[Array, Array, Array]:
@@ -379,15 +379,10 @@ def likely_variances_jit(
     spread : float
         C, the variance of h [m²].
     """
-    std = noise.range_std + noise.range_std_per_metre * expected
-    total = spread + std * std
+    total = spread + reading_variances_jit(noise, expected)[1]
     if total > 0:
         expected += spread / total * (measured - expected)
-    across = noise.bearing_std
-    if noise.bearing_std_metres > 0:
-        across += noise.bearing_std_metres / expected
-    std = noise.range_std + noise.range_std_per_metre * expected
-    return across * across, std * std
+    return reading_variances_jit(noise, expected)
 
 
 # What a reading is of, where it is not a slot of the map.
