@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
@@ -34,8 +34,8 @@ from .loop_closing import AROUND
 from .managed_slam import ManagedSlam
 from .policy import LandmarkPolicy, as_policy
 
-#: Cost, the hypothesis that it continues, and what completes the association.
-Option = tuple[float, int, Callable[[], ScanAssociation]]
+#: Cost, the filter that takes it, and what completes the association.
+Option = tuple[float, ManagedSlam, Callable[[], ScanAssociation]]
 
 #: Hypotheses e^20 times less probable than the best one are discarded.
 SPREAD = 40.0
@@ -188,9 +188,12 @@ class HypothesisSlam:
         self._policy = as_policy(management)
         noise = motion_std, measurement_std
         options |= {"management": self._policy}
-        self._pool = FilterPool(partial(ManagedSlam, estimator, *noise, **options))
+        self._make = partial(ManagedSlam, estimator, *noise, **options)
+        #: All filters, and those of them that no hypothesis uses.
+        self._filters: list[ManagedSlam] = []
+        self._spare: list[ManagedSlam] = []
         #: The hypotheses, the most probable first.
-        self.hypotheses = [Hypothesis(0.0, self._pool.fresh())]
+        self.hypotheses = [Hypothesis(0.0, self._fresh())]
         #: Number of steps taken.
         self.steps = 0
 
@@ -280,35 +283,29 @@ class HypothesisSlam:
         """
         readings = argument_checks.scan(measurements)
         views = (h.slam.bookmark_views() for h in self.hypotheses)
-        undo = undo_all(*views, attributes(self._pool))
-        with undone_on_error(undo, unless_moved=self):
-            known = self.hypotheses
+        with undone_on_error(undo_all(*views, attributes(self)), unless_moved=self):
             if landmark_ids is None:
-                known = [*known, *self._at_places(readings)]
-                options = self._options(known, readings)
-            else:
-                given = argument_checks.identities(landmark_ids, len(readings))
-                options = [
-                    (h.cost, k, partial(h.slam.as_given, readings, given))
-                    for k, h in enumerate(known)
-                ]
-            return self._take(readings, options, [h.slam for h in known])
+                return self._take(readings, self._options(readings))
+            given = argument_checks.identities(landmark_ids, len(readings))
+            options = [
+                (h.cost, h.slam, partial(h.slam.as_given, readings, given))
+                for h in self.hypotheses
+            ]
+            return self._take(readings, options)
 
-    def _take(
-        self, readings: Array, options: Sequence[Option], before: Sequence[ManagedSlam]
-    ) -> UpdateReport:
+    def _take(self, readings: Array, options: Sequence[Option]) -> UpdateReport:
         """Update filters by their associations, and continue with the best of them."""
         errors: dict[int, Exception] = {}
         costs, origins, completions = zip(*options, strict=True)
         plans = [complete() for complete in completions]
         slams: list[ManagedSlam] = []
-        for slam in [before[k] for k in origins]:  # copied where a hypothesis splits
+        for slam in origins:  # copied where a hypothesis splits
             is_taken = slam in slams
-            slams.append(self._pool.resumed(slam.snapshot()) if is_taken else slam)
+            slams.append(self._resumed(slam.snapshot()) if is_taken else slam)
 
         def take(k: int) -> None:
             try:
-                slams[k].take(readings, lambda: plans[k])
+                slams[k].take(readings, plans[k])
             except (np.linalg.LinAlgError, MemoryError) as error:
                 errors[k] = error
 
@@ -320,16 +317,34 @@ class HypothesisSlam:
             kept.sort(key=lambda hypothesis: hypothesis.cost)
             return self._take_over(distinct(kept, self._policy.hypotheses))
 
-        try:
-            return self._carry_out(slams, take, then)
-        finally:
-            self._keep(self.hypotheses, [*before, *slams])
+        return self._carry_out(slams, take, then)
 
-    def _take_over(self, hypotheses: list[Hypothesis]) -> UpdateReport:
-        """Continue with hypotheses, the best first; return the report of this one."""
+    def _take_over(self, hypotheses: Sequence[Hypothesis]) -> UpdateReport:
+        """Continue with hypotheses, the best first; return the report of this one.
+
+        All other filters are reused later.
+        """
         least = hypotheses[0].cost
         self.hypotheses = [Hypothesis(h.cost - least, h.slam) for h in hypotheses]
+        kept = self._slams
+        self._spare = [slam for slam in self._filters if slam not in kept]
+        for slam in self._spare:
+            slam.forget_scans()
         return self.report()
+
+    def _fresh(self) -> ManagedSlam:
+        """Return a filter that no hypothesis uses, in any state."""
+        if not self._spare:
+            self._spare = [self._make()]
+            self._filters = [*self._filters, *self._spare]
+        *self._spare, slam = self._spare
+        return slam
+
+    def _resumed(self, before: tuple[Any, ...]) -> ManagedSlam:
+        """Return a filter that no hypothesis uses, continuing from a snapshot."""
+        slam = self._fresh()
+        slam.resume(before)
+        return slam
 
     def _carry_out(
         self,
@@ -370,7 +385,7 @@ class HypothesisSlam:
         """Change the best hypothesis; only this one continues."""
         with undone_on_error(self.bookmark()):
             change(self.best)
-            self._keep(self.hypotheses[:1])
+            self._take_over(self.hypotheses[:1])
 
     def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
         """Return the belief of the most probable hypothesis."""
@@ -405,10 +420,10 @@ class HypothesisSlam:
         if not costs or min(costs) < 0:
             raise ValueError(f"state['costs'] must be numbers >= 0, got {costs}")
         with undone_on_error(self.bookmark()):
-            loaded = [Hypothesis(cost, self._pool.fresh()) for cost in costs]
+            loaded = [Hypothesis(cost, self._fresh()) for cost in costs]
             for k, hypothesis in enumerate(loaded):
                 hypothesis.slam.load_state_dict(without_prefix(state, str(k)))
-            self._keep(loaded)
+            self._take_over(loaded)
 
     def snapshot(self) -> tuple[Any, ...]:
         """Return the present state of every hypothesis, for :meth:`resume`."""
@@ -418,104 +433,59 @@ class HypothesisSlam:
     def resume(self, before: tuple[Any, ...]) -> None:
         """Return to a :meth:`snapshot` of a filter with the same settings."""
         kept, self.steps = before
-        slams = self._slams
-        slams += [self._pool.fresh() for _ in kept[len(slams) :]]
-        for (_, own), slam in zip(kept, slams, strict=False):
-            slam.resume(own)
-        costs = [cost for cost, _ in kept]
-        self._keep([*map(Hypothesis, costs, slams)])
+        self._spare = self._filters
+        self._take_over([Hypothesis(cost, self._resumed(own)) for cost, own in kept])
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
         slams = (h.slam.bookmark() for h in self.hypotheses)
-        return undo_all(*slams, attributes(self, self._pool))
+        return undo_all(*slams, attributes(self))
 
     def report(self) -> UpdateReport:
         """Return the report of the last update once more."""
         return self.best.report()
 
-    def _at_places(self, readings: Array) -> list[Hypothesis]:
-        """Return the parts of the hypotheses around the places that a scan shows.
-
-        The part around a pose c among landmarks is the prior times exp(−½ ‖z − c‖²) in
-        the metric of R, where z is the pose relative to them.  Its weight is that of c
-        in the prior of z with R added, relative to N(0; 0, R).
-        """
-        parts: list[Hypothesis] = []
-        found = ((h, h.slam.places_of_scan(readings)) for h in self.hypotheses)
-        for h, places in islice(filter(itemgetter(1), found), PER_BASIN):
-            for place in places:
-                slam = self._pool.resumed(h.slam.snapshot())
-                reports = slam.move_to(*place)
-                if all(report.degrees_of_freedom for report in reports):
-                    cost = sum(map(cost_of, reports)) - log(np.linalg.det(AROUND))
-                    parts.append(Hypothesis(h.cost + cost, slam))
-                else:  # the gate of the filter refuses it
-                    self._pool.free([slam])
-        return parts
-
-    def _options(self, known: Sequence[Hypothesis], readings: Array) -> list[Option]:
-        """Return cost, hypothesis and association of the best, the cheapest first."""
+    def _options(self, readings: Array) -> list[Option]:
+        """Return the best associations of a scan, the cheapest first."""
+        astray = [h for h in self.hypotheses if h.slam.is_astray(readings)]
         options: list[Option] = []
         most, ceiling = TRIED * self._policy.hypotheses, np.inf
-        for k, h in enumerate(known):
+        for h in [*self.hypotheses, *self._at_places(readings, astray)]:
             found = h.slam.alternatives(readings, ceiling - h.cost)
-            options += [(h.cost + cost, k, plan) for cost, plan in found]
-            options.sort(key=lambda option: option[:2])
+            if h in astray:
+                found += h.slam.deferred(readings, *found[0])
+            options += [(h.cost + cost, h.slam, plan) for cost, plan in found]
+            options.sort(key=itemgetter(0))
             ceiling = options[0][0] + SPREAD
             options = [o for o in options[:most] if o[0] <= ceiling]
             if len(options) == most:
                 ceiling = options[-1][0]
         return options
 
+    def _at_places(
+        self, readings: Array, astray: Sequence[Hypothesis]
+    ) -> list[Hypothesis]:
+        """Return the parts of hypotheses around the places that a scan shows.
+
+        The part around a pose c among landmarks is the prior times exp(−½ ‖z − c‖²) in
+        the metric of R, where z is the pose relative to them.  Its weight is that of c
+        in the prior of z with R added, relative to N(0; 0, R).
+        """
+        parts: list[Hypothesis] = []
+        found = ((h, h.slam.places_of_scan(readings)) for h in astray)
+        for h, places in islice(filter(itemgetter(1), found), PER_BASIN):
+            for place in places:
+                slam = self._resumed(h.slam.snapshot())
+                reports = slam.move_to(*place)
+                if all(report.degrees_of_freedom for report in reports):  # in the gate
+                    cost = sum(map(cost_of, reports)) - log(np.linalg.det(AROUND))
+                    parts.append(Hypothesis(h.cost + cost, slam))
+        return parts
+
     @property
     def _slams(self) -> list[ManagedSlam]:
         return [hypothesis.slam for hypothesis in self.hypotheses]
 
-    def _keep(
-        self, hypotheses: list[Hypothesis], others: Sequence[ManagedSlam] = ()
-    ) -> None:
-        """Continue with these hypotheses, and reuse all other filters."""
-        slams, kept = [*self._slams, *others], [h.slam for h in hypotheses]
-        self.hypotheses = hypotheses
-        self._pool.free(slam for slam in slams if slam not in kept)
-
     def __repr__(self) -> str:
         count = len(self.hypotheses)
         return repr(self.best) + (f", best of {count} hypotheses" if count > 1 else "")
-
-
-class FilterPool:
-    """Copies managed filters, and reuses those that are no longer needed.
-
-    Parameters
-    ----------
-    make : callable
-        Makes a filter.
-    """
-
-    def __init__(self, make: Callable[[], ManagedSlam]) -> None:
-        self._make = make
-        self._spare: list[ManagedSlam] = []
-
-    def __len__(self) -> int:
-        """Return how many filters nobody uses."""
-        return len(self._spare)
-
-    def fresh(self) -> ManagedSlam:
-        """Return a filter that nobody uses, in any state."""
-        *self._spare, slam = self._spare or [self._make()]
-        return slam
-
-    def resumed(self, before: tuple[Any, ...]) -> ManagedSlam:
-        """Return a filter that nobody uses, and that continues from a snapshot."""
-        slam = self.fresh()
-        slam.resume(before)
-        return slam
-
-    def free(self, slams: Iterable[ManagedSlam]) -> None:
-        """Take filters back."""
-        for slam in slams:
-            if slam not in self._spare:
-                slam.forget_scans()
-                self._spare = [*self._spare, slam]

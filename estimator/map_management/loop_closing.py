@@ -94,9 +94,14 @@ def lost(view: MapView, rules: Constellations | None) -> BoolArray:
     return is_lost if can_match or rules.always else np.zeros_like(is_lost)
 
 
-def without_lost(view: MapView, rules: Constellations, within: float) -> MapView:
-    """Return a view of the landmarks within a distance [m] that are not lost."""
+def without_lost(view: MapView, rules: Constellations | None, within: float) -> MapView:
+    """Return a view without lost landmarks, and without those beyond a distance [m].
+
+    Where none is lost, it is the view as it is.
+    """
     is_lost = lost(view, rules)
+    if rules is None or not is_lost.any():
+        return view
     away = np.hypot(*(view.landmarks - view.mean[:2]).T)
     is_near = away <= within + NEAR_STDS * rules.lost_std
     return _part(view, np.flatnonzero(~is_lost & is_near))
@@ -124,18 +129,23 @@ def same_landmarks(
         Reach of the readings [m].
     """
     is_lost, doubtful = lost(view, rules), doubtful & set(view.mapped)
-    new = np.array([k for k, i in enumerate(view.ids) if i in added], dtype=np.int64)
+    new = slots_of(view, added)
     if len(new) and is_lost.any():
         squared, _ = _offsets(view, new, np.flatnonzero(is_lost))
         fitting = new[(squared <= OFFSET_GATE).any(axis=1)]
         doubtful |= {view.ids[k] for k in fitting.tolist()}
-    slots = [k for k, i in enumerate(view.ids) if i in doubtful]
-    if not slots:
+    slots = slots_of(view, doubtful)
+    if not len(slots):
         return doubtful, []
-    pairs = _found_again(view, np.array(slots), is_lost, ACCURATE * rules.lost_std)
+    pairs = _found_again(view, slots, is_lost, ACCURATE * rules.lost_std)
     if added and not pairs:
         pairs = _recognised(view, is_lost, within, rules)
     return doubtful, pairs
+
+
+def slots_of(view: MapView, ids: Collection[int]) -> IntArray:
+    """Return the places of landmarks in a view, in its order."""
+    return np.array([k for k, i in enumerate(view.ids) if i in ids], dtype=np.int64)
 
 
 def _found_again(
@@ -195,10 +205,10 @@ def places_of_scan(
     view: MapView,
     readings: Array,
     noise: Noise,
-    rules: Constellations | None,
+    rules: Constellations,
     min_range: float = 0.0,
 ) -> list[tuple[Array, IntArray]]:
-    """Return where the robot may be if it knows no landmark accurately.
+    """Return where a robot may be that knows no landmark accurately.
 
     Parameters
     ----------
@@ -208,8 +218,8 @@ def places_of_scan(
         The scan, rows (β, r) [rad, m].
     noise : Noise
         Of the sensor.
-    rules : Constellations or None
-        None: the answer is empty.
+    rules : Constellations
+        Limits of the search.
     min_range : float
         Readings closer than this are not used [m].
 
@@ -222,10 +232,8 @@ def places_of_scan(
     Raises
     ------
     ValueError
-        If no landmark is known accurately, and a bearing is not finite.
+        If a bearing is not finite.
     """
-    if rules is None or len(readings) < FEWEST_READINGS or not is_astray(view, rules):
-        return []
     r = readings[:, 1]
     readings = readings[(r >= min_range) & (r <= LARGEST)]
     argument_checks.refuse_unusable(readings)

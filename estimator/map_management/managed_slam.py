@@ -177,10 +177,8 @@ class ManagedSlam:
         if type(dt) is not float or dt != 1.0:
             argument_checks.duration(dt)
         candidates, noise = self.candidates, self._motion_noise
-        displacement = reading[0], 0.0, reading[1]
-        if noise.motion is not UNICYCLE:
-            displacement = noise.motion.moved(reading)
         if len(candidates.tentative.seen):
+            displacement = noise.motion.moved(reading)
             variance = noise.over(displacement, dt)
             moved = candidates.tentative.moved(displacement, variance)
             candidates = candidates._replace(tentative=moved)
@@ -219,14 +217,13 @@ class ManagedSlam:
             all is then as before.
         """
         readings = argument_checks.scan(measurements)
-
-        def associate() -> ScanAssociation:
+        with undone_on_error(self.bookmark_views(), unless_moved=self):
             if landmark_ids is None:
-                return self.alternatives(readings)[0][1]()
-            given = argument_checks.identities(landmark_ids, len(readings))
-            return self.as_given(readings, given)
-
-        return self.take(readings, associate)
+                plan = self.alternatives(readings)[0][1]()
+            else:
+                given = argument_checks.identities(landmark_ids, len(readings))
+                plan = self.as_given(readings, given)
+            return self.take(readings, plan)
 
     def observe_pose(
         self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
@@ -263,34 +260,41 @@ class ManagedSlam:
         """Associate readings (m, 2) without identity, in every way to consider.
 
         Of those that cost more than ``ceiling`` only the most likely is of interest.
-        If the robot is astray, and the best one uses too few landmarks to recognise a
-        place, the last one defers the decision to later scans: it leaves out all
-        readings, and costs as much as the best.
         """
         argument_checks.refuse_unusable(readings)
         known, view = self.candidates, self._pruner.view_for(readings)
-        policy, sensor = self._policy, self._sensor
-        options = associate(policy, known, readings, view, sensor, ceiling)
-        around, rules = self._pruner.view_around(readings), policy.constellations
-        if rules is None or policy.association != "hypotheses" or not len(readings):
-            return options
-        cost, best = options[0]
-        if not is_astray(around, rules):
-            return options
+        return associate(self._policy, known, readings, view, self._sensor, ceiling)
+
+    def is_astray(self, readings: Array) -> bool:
+        """Return whether a scan (m, 2) finds the robot astray in its map."""
+        rules = self._policy.constellations
+        if rules is None or not len(readings):
+            return False
+        return is_astray(self._pruner.view_around(readings), rules)
+
+    def deferred(
+        self, readings: Array, cost: float, best: Callable[[], ScanAssociation]
+    ) -> list[Option]:
+        """Return an option that leaves the decision about a scan to later ones.
+
+        It leaves out all readings, and costs as much as the best association.  There is
+        none if this one uses enough landmarks to recognise a place.
+        """
         if sum(i is not None for i in best().row_ids) >= FEWEST_READINGS:
-            return options
-        deferred = ScanAssociation(policy, known, readings)
-        deferred.explained.update(around.ids)
-        deferred.ambiguous_rows.extend(range(len(readings)))
-        return [*options, (cost, lambda: deferred)]
+            return []
+        plan = ScanAssociation(self._policy, self.candidates, readings)
+        plan.explained.update(self._pruner.view_around(readings).ids)
+        plan.ambiguous_rows.extend(range(len(readings)))
+        return [(cost, lambda: plan)]
 
     def places_of_scan(self, readings: Array) -> list[tuple[Array, IntArray]]:
-        """Return places that a scan (m, 2) shows, see :func:`places_of_scan`.
+        """Return places that a scan (m, 2) shows to a robot that is astray.
 
         A filter whose belief cannot be moved observes its absolute pose there: only
         landmarks of accurate absolute position count.
         """
         view, rules = self._pruner.view_around(readings), self._policy.constellations
+        assert rules is not None  # else the robot is not astray
         noise, min_range = self._sensor
         places = places_of_scan(view, readings, noise, rules, min_range)
         if not places or self._editor.can_move:
@@ -313,21 +317,17 @@ class ManagedSlam:
         self._recent.scans, self._recent.motions = [], ()
         return [part.report()]
 
-    def take(
-        self, readings: Array, associate: Callable[[], ScanAssociation]
-    ) -> UpdateReport:
+    def take(self, readings: Array, plan: ScanAssociation) -> UpdateReport:
         """Correct the belief with readings (m, 2) as associated, then prune the map."""
-        with undone_on_error(self.bookmark_views(), unless_moved=self):
-            plan = associate()
-            missed = self._pruner.expected(readings) - plan.explained
-            fed = self._recent.with_scan(readings, plan)
-            step = partial(self._recent.feed, fed)
-            follow = partial(self._follow, readings, fed, missed)
-            if fed.first is None:
-                return advance(self._filter, step, follow, undo_all(), self.bookmark)
-            # The filter repeats its steps since a saved state, in new arrays.
-            with undone_on_error(self.bookmark()):
-                return follow(step())
+        missed = self._pruner.expected(readings) - plan.explained
+        fed = self._recent.with_scan(readings, plan)
+        step = partial(self._recent.feed, fed)
+        follow = partial(self._follow, readings, fed, missed)
+        if fed.first is None:
+            return advance(self._filter, step, follow, undo_all(), self.bookmark)
+        # The filter repeats its steps since a saved state, in new arrays.
+        with undone_on_error(self.bookmark()):
+            return follow(step())
 
     def _follow(
         self, readings: Array, fed: FedScans, missed: set[int], report: UpdateReport

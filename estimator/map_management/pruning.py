@@ -15,7 +15,7 @@ from ..association.scan_association import ScanAssociation
 from ..filters.conditioning import separation
 from ..interface import MapView
 from ..support import saved_states
-from .loop_closing import Pairs, lost, same_landmarks, without_lost
+from .loop_closing import Pairs, lost, same_landmarks, slots_of, without_lost
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy
 
@@ -53,8 +53,6 @@ class MapPruner:
     def view_for(self, readings: Array) -> MapView:
         """Return a view of the landmarks that readings (m, 2) may belong to."""
         view, rules = self.view_around(readings), self._policy.constellations
-        if rules is None or not lost(view, rules).any():
-            return view
         return without_lost(view, rules, self._policy.reach(readings))
 
     def expected(self, scan: Array) -> set[int]:
@@ -120,11 +118,10 @@ class MapPruner:
         ids = [i if i in seen else None for i in row_ids]
         self.records.note_sightings(ids, readings, view.mean[2], self._noise)
         if within is not None:
-            shown = [i for i in ids if i is not None]
-            places = view.landmarks[self._places(view, shown)]
-            close = _distances(places, places) < 2 * within
-            pairs = np.argwhere(np.triu(close, 1)).tolist()
-            apart = {_ordered(shown[i], shown[j]) for i, j in pairs}
+            shown = view.landmarks[slots := slots_of(view, seen)]
+            close = _distances(shown, shown) < 2 * within
+            pairs = slots[np.argwhere(np.triu(close, 1))].tolist()
+            apart = {_ordered(view.ids[i], view.ids[j]) for i, j in pairs}
             self.records.apart = self.records.apart | apart
 
     def _remove_missing(self, missed: set[int]) -> list[int]:
@@ -155,20 +152,13 @@ class MapPruner:
         if within is None:
             return None
         view = self._editor.map_view()
-        slots = self._places(view, [i for i in view.ids if i in seen])
+        slots = slots_of(view, seen)
         near = _distances(view.landmarks[slots], view.landmarks) < within
         for row, other in np.argwhere(near).tolist():
             kept, gone = sorted((int(slots[row]), other))
             if kept != gone and self._is_one(view, kept, gone):
                 return view.ids[kept], view.ids[gone]
         return None
-
-    def _places(self, view: MapView, ids: Sequence[int]) -> IntArray:
-        """Return the places of landmarks in the order of a view."""
-        if view.whole is None:
-            return self.records.slots(ids)
-        places = {i: place for place, i in enumerate(view.ids)}
-        return np.array([places[i] for i in ids], dtype=np.int64)
 
     def _is_one(self, view: MapView, kept: int, gone: int) -> bool:
         if _ordered(view.ids[kept], view.ids[gone]) in self.records.apart:

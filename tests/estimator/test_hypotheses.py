@@ -13,7 +13,6 @@ from slamgym.estimator.interface import MapView
 from slamgym.estimator.map_management.hypotheses import (
     OVERLAP,
     PER_BASIN,
-    FilterPool,
     Hypothesis,
     HypothesisSlam,
     distinct,
@@ -276,14 +275,14 @@ def test_where_every_filter_fails_nothing_has_changed(slippery_drive, monkeypatc
     before = digest(slam)
     for hypothesis in slam.hypotheses:
         failing_after(hypothesis.slam, 0)
-    make_filter = filters_of(slam).fresh
+    make_filter = slam._fresh
 
     def make_failing():
         fresh = make_filter()
         failing_after(fresh, 0)
         return fresh
 
-    monkeypatch.setattr(slam, "_pool", FilterPool(make_failing))
+    monkeypatch.setattr(slam, "_fresh", make_failing)
     with pytest.raises(np.linalg.LinAlgError, match="degenerate"):
         slam.update(readings)
     assert digest(slam) == before
@@ -311,26 +310,26 @@ def test_loading_again_and_again_makes_no_more_filters(slippery_drive):
     slam, _ = several_hypotheses(scans, world)
     state = slam.state_dict()
     slam.load_state_dict(state)
-    count = len(filters_of(slam))
+    filters, _ = filters_of(slam)
     for _ in range(3):
         slam.load_state_dict(state)
-    assert len(filters_of(slam)) == count
+    assert filters_of(slam)[0] == filters
 
 
 def test_no_more_filters_are_made_than_hypotheses_are_allowed(slippery_drive):
     world, scans = slippery_drive
     slam, _ = several_hypotheses(scans, world)
     allowed = slam.policy.hypotheses
-    assert len(filters_of(slam)) + len(slam.hypotheses) <= allowed + 1
+    assert len(filters_of(slam)[0]) <= allowed + 1
 
 
 def test_a_discarded_hypothesis_keeps_no_scans(slippery_drive):
     world, scans = slippery_drive
     slam = make(world, association="hypotheses")
     follow(slam, scans[:60])
-    pool = filters_of(slam)
-    assert len(pool) > 0
-    assert all(not pool.fresh().decisions for _ in range(len(pool)))
+    _, spare = filters_of(slam)
+    assert len(spare) > 0
+    assert not any(each.decisions for each in spare)
 
 
 def test_alternatives_that_are_skipped_would_not_have_been_kept(
@@ -371,9 +370,9 @@ def test_a_sighting_of_clutter_does_not_drag_a_new_landmark_along():
 def test_an_interrupted_update_loses_no_filter(slippery_drive, monkeypatch):
     world, scans = slippery_drive
     slam = make(world, association="hypotheses")
-    pool, made, take_over = filters_of(slam), [], HypothesisSlam._take_over
-    make_one = pool._make
-    pool._make = lambda: made.append(0) or make_one()
+    made, take_over = [], HypothesisSlam._take_over
+    make_one = slam._make
+    slam._make = lambda: made.append(0) or make_one()
 
     def interrupted(self, hypotheses):
         monkeypatch.undo()
@@ -389,7 +388,8 @@ def test_an_interrupted_update_loses_no_filter(slippery_drive, monkeypatch):
 
     with pytest.raises(KeyboardInterrupt):
         go_on()
-    assert len(slam.hypotheses) + len(pool) == 1 + len(made)
+    filters, spare = filters_of(slam)
+    assert len(filters) == len(slam.hypotheses) + len(spare) == 1 + len(made)
 
 
 def test_an_interrupted_reading_of_the_pose_has_its_cost_in_every_hypothesis(
@@ -563,7 +563,7 @@ def test_a_copy_continues_like_its_original_where_views_are_a_part_of_the_map():
         copied.resume(slam.snapshot())
         complete = slam.alternatives(readings)[0][1]
         for each in (slam, copied):
-            each.take(readings, complete)
+            each.take(readings, complete())
         assert digest(copied) == digest(slam)
 
 

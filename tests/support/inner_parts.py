@@ -38,8 +38,8 @@ def map_of(slam):
 
 
 def filters_of(slam):
-    """Return the pool of filters of a filter with several hypotheses."""
-    return slam._pool
+    """Return the filters of a filter with several hypotheses, and the spare ones."""
+    return slam._filters, slam._spare
 
 
 def spied(monkeypatch, owner, name, note):
