@@ -7,6 +7,7 @@ neighbour, or the most likely joint assignment.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from math import exp, inf, log, pi
@@ -44,20 +45,14 @@ TINY = float(np.finfo(np.float64).tiny)
 SAME = 1.0
 
 
-class Assignment(NamedTuple):
-    """Landmarks of the readings of one scan."""
-
-    #: −2 ln of the likelihood, up to a constant of the scan; 0 by nearest neighbour.
-    cost: float
-    #: Place in the map of each reading's landmark, `NEW` or `AMBIGUOUS`, shape (m,).
-    slots: IntArray
-
-
 class Assignments(NamedTuple):
-    """The assignments to consider for one scan."""
+    """The M assignments to consider for one scan, the most likely first."""
 
-    #: The most likely first.
-    ranked: list[Assignment]
+    #: −2 ln of the likelihood, up to a constant of the scan, shape (M,); 0 by nearest
+    #: neighbour.
+    costs: Array
+    #: Place in the map of each reading's landmark, `NEW` or `AMBIGUOUS`, shape (M, m).
+    slots: IntArray
     #: Landmarks that some reading may belong to, shape (k,).
     explained: IntArray
 
@@ -95,39 +90,34 @@ def assign_scan(
     if policy.association == "nearest":
         fit = innovation_distances(view, readings, noise, policy.new_gate)
         explained = np.flatnonzero(np.isfinite(fit.squared).any(axis=0))
-        ranked = [Assignment(0.0, nearest_neighbours(fit, policy))]
-        return Assignments(ranked, explained)
+        return Assignments(
+            np.zeros(1), nearest_neighbours(fit, policy)[None], explained
+        )
     pairs_first, count = policy.association == "compatibility", len(readings)
     missing = np.zeros(count) if pairs_first else missing_costs(density)
     if most is None:
         most = policy.branches if policy.association == "hypotheses" else 1
     scan = readings, missing, _limits(policy.pair_gate if pairs_first else inf, count)
     gates = float(policy.new_gate), float(policy.pair_gate), float(ceiling)
-    search = pairs_first, policy.search_nodes
-    slots = np.empty((most, count), dtype=np.int64)
-    found = costs, _, explained = np.empty(most), slots, np.arange(len(view.ids))
-    best, near = assign_jointly(view[:2], scan, tuple(noise), gates, search, found)
-    if not near:
-        costs[0] = missing.sum()
-    ranked = [*map(Assignment, costs[:best].tolist(), slots)]
-    return Assignments(ranked, explained[:near])
+    search = pairs_first, most, policy.search_nodes
+    belief = *view[:2], len(view.ids)
+    return Assignments(*assign_jointly(belief, scan, tuple(noise), gates, search))
 
 
 @jit
 def assign_jointly(
-    belief: tuple[Array, Array],
+    belief: tuple[Array, Array, int],
     scan: tuple[Array, Array, Array],
     of_sensor: tuple[float, ...],
     gates: tuple[float, float, float],
-    search: tuple[bool, int],
-    result: tuple[Array, IntArray, IntArray],
-) -> tuple[int, int]:
-    """Assign a scan; return the numbers of assignments and of explained landmarks.
+    search: tuple[bool, int, int],
+) -> tuple[Array, IntArray, IntArray]:
+    """Assign a scan; return the fields of :class:`Assignments`.
 
     Parameters
     ----------
     belief : tuple
-        Mean and covariance of the map.
+        Mean and covariance of the map, and its number of landmarks.
     scan : tuple
         The readings (m, 2), and ``missing`` and ``limits`` of the :class:`Problem`.
     of_sensor : tuple
@@ -136,22 +126,19 @@ def assign_jointly(
         Largest νᵀ S⁻¹ ν of a reading and an explained landmark, and of a pair; cost
         beyond which only the first assignment found is of interest.
     search : tuple
-        ``pairs_first`` of the :class:`Problem`, and the limit of nodes.
-    result : tuple
-        Overwritten: costs (M,), slots (M, m), explained landmarks (n,).
+        ``pairs_first`` of the :class:`Problem`, the largest number of assignments, and
+        the limit of nodes.
     """
-    (mean, P), (readings, missing, limits) = belief, scan
-    (new_gate, pair_gate, ceiling), (pairs_first, nodes) = gates, search
-    costs, slots, explained = result
+    (mean, P, landmarks), (readings, missing, limits) = belief, scan
+    (new_gate, pair_gate, ceiling), (pairs_first, most, nodes) = gates, search
     noise, rows = Noise(*of_sensor), len(readings)
-    squared = np.full((rows, len(explained)), np.inf)
+    squared = np.full((rows, landmarks), np.inf)
     _compare(mean, P, readings, of_sensor, new_gate, (squared, squared.copy()))
-    near = 0
-    for j in range(len(explained)):
-        explained[near] = j
-        near += np.isfinite(squared[:, j]).any()
+    is_near = [np.isfinite(squared[:, j]).any() for j in range(landmarks)]
+    explained = np.flatnonzero(np.array(is_near))
+    near = len(explained)
     expected, joint = np.empty((near, 2)), np.empty((2 * near, 2 * near))
-    fill_expected(mean, P, explained[:near], expected, joint)
+    fill_expected(mean, P, explained, expected, joint)
     innovations, variances = np.empty((rows, near, 2)), np.empty((rows, near, 2))
     feasible = np.empty((rows, near), np.bool_)
     for i in range(rows):
@@ -165,17 +152,19 @@ def assign_jointly(
             feasible[i, j] = squared[i, explained[j]] <= pair_gate
     of_scan = innovations, joint, variances, feasible, missing
     problem = *of_scan, pair_gate, limits, pairs_first
-    found = best_assignments(problem, len(costs), BRANCH_SPREAD, ceiling, nodes)
-    marks, kept = found[1], 0
+    costs, marks, distances, _ = best_assignments(
+        problem, most, BRANCH_SPREAD, ceiling, nodes
+    )
+    slots, kept = np.empty_like(marks), 0
     for s in range(len(marks)):
         for i in range(rows):
-            slots[kept, i] = AMBIGUOUS if found[2][s, i] <= pair_gate else NEW
+            slots[kept, i] = AMBIGUOUS if distances[s, i] <= pair_gate else NEW
             if marks[s, i] != UNPAIRED:
                 slots[kept, i] = explained[marks[s, i]]
         if not _is_superfluous(problem, marks[:kept], marks[s], slots[kept]):
-            costs[kept], marks[kept] = found[0][s], marks[s]
+            costs[kept], marks[kept] = costs[s], marks[s]
             kept += 1
-    return kept, near
+    return costs[:kept], slots[:kept], explained
 
 
 @njit_allocating
@@ -277,19 +266,14 @@ class AssociationPolicy:
 
 
 def _k_of_n(value: Any) -> tuple[int, int]:
-    try:
-        k, n = value
-    except (TypeError, ValueError):
-        raise ValueError(
-            f"confirm must be two whole numbers (k, n), got {value!r}"
-        ) from None
-    k = argument_checks.whole("confirm[0]", k, 1)
-    n = argument_checks.whole("confirm[1]", n, 1)
-    if not k <= n <= MOST_SCANS:
-        raise ValueError(
-            f"confirm must be (k, n) with k <= n <= {MOST_SCANS}, got ({k}, {n})"
-        )
-    return k, n
+    with suppress(TypeError, ValueError):
+        k, n = (argument_checks.whole("confirm", each, 1) for each in value)
+        if k <= n <= MOST_SCANS:
+            return k, n
+    raise ValueError(
+        f"confirm must be whole numbers (k, n) with 1 <= k <= n <= {MOST_SCANS}, "
+        f"got {value!r}"
+    )
 
 
 class Noise(NamedTuple):
@@ -510,7 +494,7 @@ def nearest_neighbours(fit: Distances, policy: AssociationPolicy) -> IntArray:
     >>> nearest_neighbours(Distances(d, d), AssociationPolicy(ambiguity=0)).tolist()
     [0, -2, -2, -1]
     """
-    rows, landmarks = fit.squared.shape
+    rows = len(fit.squared)
     chosen = np.full(rows, NEW, dtype=np.int64)
     if not fit.squared.size:
         return chosen
@@ -519,11 +503,8 @@ def nearest_neighbours(fit: Distances, policy: AssociationPolicy) -> IntArray:
     best = scores.argmin(axis=1)
     every = np.arange(rows)
     score = scores[every, best]
-    is_clear = np.isfinite(score) & (scores.argmin(axis=0)[best] == every)
-    if landmarks > 1 and policy.ambiguity > 0:
-        others = scores.copy()
-        others[every, best] = np.inf
-        gap = others.min(axis=1) - np.where(is_clear, score, 0.0)
-        is_clear &= gap > policy.ambiguity
+    is_mutual = scores.argmin(axis=0)[best] == every
+    scores[every, best] = np.inf
+    is_clear = is_mutual & (scores.min(axis=1) > score + policy.ambiguity)
     chosen[is_clear] = best[is_clear]
     return chosen

@@ -141,7 +141,7 @@ class ScanAssociation:
         density = self._density.at(readings[rows], self._policy.density)
         view = tentative.view()
         found = assign_scan(self._policy, view, readings[rows], noise, density, most=1)
-        slots = found.ranked[0].slots
+        slots = found.slots[0]
         pairs = list(zip(rows.tolist(), slots.tolist(), strict=True))
         for row, slot in pairs:
             if slot >= 0:
@@ -301,7 +301,7 @@ def associate(
 
     options = []
     known, longest = candidates.detections, candidates.density.longest
-    for cost, slots in found.ranked:
+    for cost, slots in zip(found.costs.tolist(), found.slots, strict=True):
         scan = slots, found.explained, used
         missed, detections = known.after(view, scan, longest)
         if policy.density is None:  # the Poisson probability of no other reading

@@ -308,11 +308,9 @@ class RecentScan(NamedTuple):
 
     def feed(self, slam: SlamEstimator) -> UpdateReport:
         """Update a filter with the rows that it uses."""
-        ids = [i for i in self.row_ids if i is not None]
-        if len(ids) == len(self.row_ids):
-            return slam.update(self.readings.copy(), ids)  # the scan may be repeated
         rows = [row for row, i in enumerate(self.row_ids) if i is not None]
-        return slam.update(self.readings[rows], ids)
+        ids = [i for i in self.row_ids if i is not None]
+        return slam.update(self.readings[rows], ids)  # a copy, kept for a repetition
 
     def without(self, landmark_id: int) -> RecentScan:
         """Return the scan with the reading of a landmark, if any, left out."""

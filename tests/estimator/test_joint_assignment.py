@@ -185,8 +185,8 @@ def test_a_scan_is_assigned_as_step_by_step_in_numpy(method):
             policy, view, readings, noise, density, limits=limits, most=most
         )
         np.testing.assert_array_equal(found.explained, explained)
-        np.testing.assert_array_equal([each.cost for each in found.ranked], costs)
-        np.testing.assert_array_equal([each.slots for each in found.ranked], slots)
+        np.testing.assert_array_equal(found.costs, costs)
+        np.testing.assert_array_equal(found.slots, slots)
         several += len(costs) > 1
         ambiguous += sum((each == AMBIGUOUS).sum() for each in slots)
     assert several > 30 or method != "hypotheses"

@@ -75,8 +75,6 @@ def assign_plainly(policy, view, readings, noise, density, *, limits, most):
         limits,
         pairs_first,
     )
-    if not len(explained):
-        return [problem.missing.sum()], [np.full(len(readings), NEW)], explained
     found = solve(problem, most, BRANCH_SPREAD)
     kept, chosen = [], []
     for cost, marks, distances in zip(*found[:3], strict=True):
