@@ -205,8 +205,7 @@ class LostEvidence(NamedTuple):
         is_unknown = has_map and variance - self.surest > UNKNOWN
         unknown = self.unknown + MOST_OF_SCAN / 2 if is_unknown else 0.0
         largest, surest = max(self.largest, unknown), min(self.surest, variance)
-        sums = self.present, self.lasting, largest  # `_replace` takes twice the time
-        return LostEvidence(*sums, self.first_new, surest, unknown, *self[6:])
+        return self._replace(largest=largest, surest=surest, unknown=unknown)
 
     def with_readings(
         self, strange: int, explained: int, before: UnexplainedDensity
@@ -218,8 +217,7 @@ class LostEvidence(NamedTuple):
         unexplained = max(0.0, self.unexplained + min(ratio, MOST_OF_SCAN / 2) / 2)
         total = MEMORY * self.explained + explained
         largest = max(self.largest, unexplained)
-        sums = self.present, self.lasting, largest
-        return LostEvidence(*sums, *self[3:6], unexplained, total)
+        return self._replace(largest=largest, unexplained=unexplained, explained=total)
 
 
 class Detections(NamedTuple):
@@ -270,10 +268,8 @@ class Detections(NamedTuple):
         is_telling = np.array(proven, dtype=np.bool_)
         missed = np.array([self.missed.get(i, 1.0) for i in ids])
         cost, fewer = _count(view[:2], scan, is_telling, longest, counts, missed)
-        left, chances = self.missed, missed.tolist()
-        if left or min(chances, default=1.0) < 1:
-            left = {**left, **dict(zip(ids, chances, strict=True))}
-            left = {i: chance for i, chance in left.items() if chance < 1}
+        left = {**self.missed, **dict(zip(ids, missed.tolist(), strict=True))}
+        left = {i: chance for i, chance in left.items() if chance < 1}
         shown, seen = self.shown, [ids[k] for k in scan[0].tolist() if k >= 0]
         if rare := [i for i in seen if shown.get(i, 0) < PROVEN]:
             shown = {**shown, **{i: 1 + shown.get(i, 0) for i in rare}}

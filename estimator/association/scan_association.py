@@ -211,8 +211,6 @@ class Candidates(NamedTuple):
             "waiting": waiting,
             "density": self.density[:5],
             "unexplained": self.density.cells,
-            "missed": list(self.detections.missed.items()),
-            "shown": list(self.detections.shown.items()),
         }
         return saved_states.write(found, CANDIDATES)
 

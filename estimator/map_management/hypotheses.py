@@ -17,21 +17,14 @@ from ...arrays import Array
 from ..association.scan_assignments import SAME
 from ..association.scan_association import ScanAssociation
 from ..filters.conditioning import PoseReading
-from ..interface import (
-    Answer,
-    Belief,
-    MapView,
-    ScanDecisions,
-    SlamEstimator,
-    UpdateReport,
-)
+from ..interface import Answer, MapView, SlamEstimator, UpdateReport
 from ..models.bearing_range import wrap_angle
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 from ..support.saved_states import with_prefix, without_prefix
 from ..support.undo import Undo, attributes, to_the_end, undo_all, undone_on_error
 from .loop_closing import AROUND
-from .managed_slam import ManagedSlam
+from .managed_slam import ManagedFilter, ManagedSlam
 from .policy import LandmarkPolicy, as_policy
 
 #: Cost, the filter that takes it, and what completes the association.
@@ -140,7 +133,7 @@ def cost_of(report: UpdateReport) -> float:
     return report.nis + 2 * float(np.log(report.innovation_factor.diagonal()).sum())
 
 
-class HypothesisSlam:
+class HypothesisSlam(ManagedFilter):
     """A managed filter that follows several associations side by side.
 
     Each hypothesis splits into the most likely joint assignments of a scan.  The costs
@@ -201,41 +194,6 @@ class HypothesisSlam:
     def best(self) -> ManagedSlam:
         """The filter of the most probable hypothesis."""
         return self.hypotheses[0].slam
-
-    @property
-    def policy(self) -> LandmarkPolicy:
-        """The policy that decides about landmarks."""
-        return self._policy
-
-    @property
-    def filter(self) -> SlamEstimator:
-        """The filter inside the most probable hypothesis."""
-        return self.best.filter
-
-    @property
-    def tentative_landmarks(self) -> Array:
-        """Estimated positions of unconfirmed landmarks, shape (t, 2) [m]."""
-        return self.best.tentative_landmarks
-
-    @property
-    def landmark_ids(self) -> tuple[int, ...]:
-        """The mapped landmarks, in the order of the belief."""
-        return self.best.landmark_ids
-
-    @property
-    def lost_score(self) -> float:
-        """Evidence that the most probable hypothesis is lost, see `ManagedSlam`."""
-        return self.best.lost_score
-
-    @property
-    def probably_lost(self) -> bool:
-        """Whether the most probable hypothesis is probably lost."""
-        return self.best.probably_lost
-
-    @property
-    def decisions(self) -> Sequence[ScanDecisions]:
-        """The decisions of the most probable hypothesis about the scans so far."""
-        return self.best.decisions
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
@@ -326,10 +284,11 @@ class HypothesisSlam:
         """
         least = hypotheses[0].cost
         self.hypotheses = [Hypothesis(h.cost - least, h.slam) for h in hypotheses]
-        kept = self._slams
-        self._spare = [slam for slam in self._filters if slam not in kept]
-        for slam in self._spare:
+        used = {*self._slams}
+        spare = [slam for slam in self._filters if slam not in used]
+        for slam in {*spare}.difference(self._spare):
             slam.forget_scans()
+        self._spare = spare
         return self.report()
 
     def _fresh(self) -> ManagedSlam:
@@ -387,14 +346,6 @@ class HypothesisSlam:
             change(self.best)
             self._take_over(self.hypotheses[:1])
 
-    def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
-        """Return the belief of the most probable hypothesis."""
-        return self.best.belief(landmark_ids)
-
-    def map_view(self) -> MapView:
-        """Return the pose and map of the most probable hypothesis without a copy."""
-        return self.best.map_view()
-
     def state_dict(self) -> dict[str, Any]:
         """Return the state of every hypothesis, as arrays."""
         state: dict[str, Any] = {
@@ -433,6 +384,8 @@ class HypothesisSlam:
     def resume(self, before: tuple[Any, ...]) -> None:
         """Return to a :meth:`snapshot` of a filter with the same settings."""
         kept, self.steps = before
+        for slam in self._slams:
+            slam.forget_scans()
         self._spare = self._filters
         self._take_over([Hypothesis(cost, self._resumed(own)) for cost, own in kept])
 
@@ -440,10 +393,6 @@ class HypothesisSlam:
         """Return what takes back later calls, as far as no kernel has run."""
         slams = (h.slam.bookmark() for h in self.hypotheses)
         return undo_all(*slams, attributes(self))
-
-    def report(self) -> UpdateReport:
-        """Return the report of the last update once more."""
-        return self.best.report()
 
     def _options(self, readings: Array) -> list[Option]:
         """Return the best associations of a scan, the cheapest first."""
@@ -477,7 +426,8 @@ class HypothesisSlam:
             for place in places:
                 slam = self._resumed(h.slam.snapshot())
                 reports = slam.move_to(*place)
-                if all(report.degrees_of_freedom for report in reports):  # in the gate
+                # The gate of the filter may refuse the place.
+                if all(report.degrees_of_freedom for report in reports):
                     cost = sum(map(cost_of, reports)) - log(np.linalg.det(AROUND))
                     parts.append(Hypothesis(h.cost + cost, slam))
         return parts

@@ -175,8 +175,6 @@ def _recognised(
     local = np.flatnonzero(~is_lost & (away <= LOCAL_REACH * within))
     local = local[np.argsort(away[local], kind="stable")]
     older = np.flatnonzero(is_lost)
-    if min(len(local), len(older)) < rules.least:
-        return []
     feasible = _offsets(view, local, older)[0] <= OFFSET_GATE
     used = feasible.any(axis=0)
     older, feasible = older[used], feasible[:, used]
@@ -234,6 +232,8 @@ def places_of_scan(
     ValueError
         If a bearing is not finite.
     """
+    if len(readings) < FEWEST_READINGS:
+        return []
     r = readings[:, 1]
     readings = readings[(r >= min_range) & (r <= LARGEST)]
     argument_checks.refuse_unusable(readings)
@@ -242,8 +242,6 @@ def places_of_scan(
     feasible = gaps <= min(OFFSET_GATE, compared.max(initial=0.0))
     partners, used = feasible.sum(axis=1), np.flatnonzero(feasible.any(axis=0))
     rows = np.argsort(partners, kind="stable")[(partners == 0).sum() :]
-    if len(rows) < FEWEST_READINGS:
-        return []
     both = with_readings(_part(view, used), readings[rows], noise)
     known = np.arange(len(used))
     places = _two_places(both, len(used) + np.arange(len(rows)), known)

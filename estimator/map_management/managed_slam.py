@@ -54,7 +54,69 @@ from .pruning import LandmarkRecords, MapPruner
 from .recent_scans import FedScans, RecentScans
 
 
-class ManagedSlam:
+class ManagedFilter:
+    """What a managed filter shows; of several hypotheses, the most probable one."""
+
+    _policy: LandmarkPolicy
+
+    @property
+    def best(self) -> ManagedSlam:
+        """The filter of the most probable hypothesis."""
+        raise NotImplementedError
+
+    @property
+    def policy(self) -> LandmarkPolicy:
+        """The policy that decides about landmarks."""
+        return self._policy
+
+    @property
+    def filter(self) -> SlamEstimator:
+        """The filter inside."""
+        return self.best._filter
+
+    @property
+    def tentative_landmarks(self) -> Array:
+        """Estimated positions of tentative landmarks, shape (t, 2) [m]."""
+        places = self.best.candidates.tentative.places
+        x, y, heading = self.best._editor.map_view().mean[:3]
+        return np.asarray(places @ rotation(heading).T + (x, y))
+
+    @property
+    def lost_score(self) -> float:
+        """Evidence that the run is lost, see `LostEvidence` [-]; 0 at the start."""
+        return self.best.candidates.detections.lost.largest
+
+    @property
+    def probably_lost(self) -> bool:
+        """Whether the run is probably lost: `lost_score` is above `LOST_SCORE`."""
+        return self.lost_score > LOST_SCORE
+
+    @property
+    def decisions(self) -> list[ScanDecisions]:
+        """The decisions about the scans since the start or the last loaded state."""
+        return self.best._recent.decisions
+
+    @property
+    def landmark_ids(self) -> tuple[int, ...]:
+        """The mapped landmarks, in the order of the belief."""
+        return mapped_ids(self.filter)
+
+    def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
+        """Return the present belief, of the whole map or of pose and some landmarks."""
+        if landmark_ids is None:
+            return self.filter.belief()
+        return marginal(self.filter, landmark_ids)
+
+    def map_view(self) -> MapView:
+        """Return pose and map, without a copy where possible, until the next step."""
+        return view_map(self.filter)
+
+    def report(self) -> UpdateReport:
+        """Return the report of the last update once more."""
+        return self.best._report
+
+
+class ManagedSlam(ManagedFilter):
     """A filter of any kind that associates, confirms, removes and merges landmarks.
 
     A :class:`LandmarkPolicy` decides which landmark each reading belongs to, when a new
@@ -130,36 +192,9 @@ class ManagedSlam:
             setattr(self, name, member)
 
     @property
-    def policy(self) -> LandmarkPolicy:
-        """The policy that decides about landmarks."""
-        return self._policy
-
-    @property
-    def filter(self) -> SlamEstimator:
-        """The filter inside."""
-        return self._filter
-
-    @property
-    def tentative_landmarks(self) -> Array:
-        """Estimated positions of tentative landmarks, shape (t, 2) [m]."""
-        places = self.candidates.tentative.places
-        x, y, heading = self._editor.map_view().mean[:3]
-        return np.asarray(places @ rotation(heading).T + (x, y))
-
-    @property
-    def lost_score(self) -> float:
-        """Evidence that the run is lost, see `LostEvidence` [-]; 0 at the start."""
-        return self.candidates.detections.lost.largest
-
-    @property
-    def probably_lost(self) -> bool:
-        """Whether the run is probably lost: `lost_score` is above `LOST_SCORE`."""
-        return self.lost_score > LOST_SCORE
-
-    @property
-    def decisions(self) -> list[ScanDecisions]:
-        """The decisions about the scans since the start or the last loaded state."""
-        return self._recent.decisions
+    def best(self) -> ManagedSlam:
+        """The filter itself, which follows one hypothesis."""
+        return self
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
@@ -368,21 +403,6 @@ class ManagedSlam:
             self._pruner.join([(kept, gone)])
             self._recent.note_edits((), [(kept, gone)])
 
-    def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
-        """Return the present belief, of the whole map or of pose and some landmarks."""
-        if landmark_ids is None:
-            return self._filter.belief()
-        return marginal(self._filter, landmark_ids)
-
-    def map_view(self) -> MapView:
-        """Return pose and map, without a copy where possible, until the next step."""
-        return view_map(self._filter)
-
-    @property
-    def landmark_ids(self) -> tuple[int, ...]:
-        """The mapped landmarks, in the order of the belief."""
-        return mapped_ids(self._filter)
-
     def state_dict(self) -> dict[str, Any]:
         """Return the filter's state and the records of landmarks, as arrays."""
         return {
@@ -420,10 +440,6 @@ class ManagedSlam:
     def bookmark_views(self) -> Undo:
         """Return what takes back that associations have looked at the map."""
         return self._editor.bookmark()
-
-    def report(self) -> UpdateReport:
-        """Return the report of the last update once more."""
-        return self._report
 
     def snapshot(self) -> tuple[Any, ...]:
         """Return the present state, decisions included, for :meth:`resume`."""

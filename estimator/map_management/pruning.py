@@ -115,8 +115,10 @@ class MapPruner:
         self.records.follow(view.mapped)
         if not seen:
             return
-        ids = [i if i in seen else None for i in row_ids]
-        self.records.note_sightings(ids, readings, view.mean[2], self._noise)
+        rows = [row for row, i in enumerate(row_ids) if i in seen]
+        slots = self.records.slots(i for i in row_ids if i in seen)
+        sighting = readings[rows], view.mean[2], self._noise
+        _add_sightings(self.records.renewed(), slots, *sighting)
         if within is not None:
             shown = view.landmarks[slots := slots_of(view, seen)]
             close = _distances(shown, shown) < 2 * within
@@ -223,8 +225,7 @@ class LandmarkRecords(Restorable):
     --------
     >>> records = LandmarkRecords()
     >>> records.follow([7, 9])
-    >>> readings = np.array([[0.0, 9.0], [0.0, 4.0]])
-    >>> records.note_sightings([7, 9], readings, 0.0, (0.1, 0.1, 0.0, 0.0))
+    >>> records.information[:] = [(9.0, 0.0, 1.0), (5.0, 1.0, 3.0)]  # Λxx, Λxy, Λyy
     >>> records.by_information([9, 7])
     [7, 9]
     """
@@ -261,30 +262,6 @@ class LandmarkRecords(Restorable):
         self.apart = {pair for pair in self.apart if self._slots.keys() >= {*pair}}
         self.ids = tuple(ids)  # last: an interrupted call begins anew
 
-    def note_sightings(
-        self,
-        ids: Sequence[int | None],
-        readings: Array,
-        heading: float,
-        noise: tuple[float, float, float, float],
-    ) -> None:
-        """Add the information of one sighting of each landmark, which forgives misses.
-
-        Parameters
-        ----------
-        ids : sequence of int or None, length m
-            The landmark of each reading, if any, without repetition.
-        readings : ndarray, shape (m, 2)
-            The scan, rows (β, r) [rad, m].
-        heading : float
-            Heading of the robot [rad].
-        noise : tuple of float
-            The first four fields of :class:`Noise`.  A plain tuple reaches a kernel
-            faster.
-        """
-        rows = np.array([-1 if i is None else self._slots[i] for i in ids], np.int64)
-        _add_sightings(self.renewed(), rows, readings, heading, noise)
-
     def renewed(self) -> tuple[IntArray, Array]:
         """Replace misses and information by copies; return the copies.
 
@@ -317,9 +294,7 @@ class LandmarkRecords(Restorable):
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all, as arrays."""
-        tables = {"apart": sorted(self.apart), "aliases": list(self.aliases.items())}
-        found = vars(self) | tables | {"doubtful": sorted(self.doubtful)}
-        return saved_states.write(found, RECORDS)
+        return saved_states.write(vars(self), RECORDS)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned; refuse what does not fit."""
@@ -349,15 +324,14 @@ def _add_sightings(
     heading: float,
     noise: tuple[float, float, float, float],
 ) -> None:
-    """Forgive misses for each reading with a slot ≥ 0; Λ ← Λ + H_lᵀ Q⁻¹ H_l.
+    """Forgive the misses of landmarks seen; Λ ← Λ + H_lᵀ Q⁻¹ H_l.
 
-    ``counts`` are misses, and the information as xx, xy, yy.
+    ``counts`` are misses, and the information as xx, xy, yy.  ``slots`` are the places
+    of the landmarks of the readings.
     """
     misses, information = counts
     bearing_std, range_std, per_metre, metres = noise
     for k in range(len(slots)):
-        if slots[k] < 0:
-            continue
         misses[slots[k]] = 0
         bearing, distance = readings[k, 0] + heading, readings[k, 1]
         along = (range_std + per_metre * distance) ** -2.0

@@ -105,10 +105,8 @@ class RecentScans(Restorable):
         decided = tuple(plan.row_ids), tuple(plan.labels)
         # The caller may reuse the array of readings.
         scan = RecentScan(plan.scan, self.motions, readings.copy(), *decided)
-        if not self._window:
-            return FedScans(plan, [scan], None)
-        # Where a tentative landmark is seen for the first time:
-        if max(scan.labels, default=NO_LABEL) >= scan.number << LABEL_BITS:
+        newest = max(scan.labels, default=NO_LABEL)
+        if self._window and newest >= scan.number << LABEL_BITS:  # its first sighting
             scan = scan._replace(before=self._slam.state_dict())
         scans = [*self.scans, scan][-self._window - 1 :]
         first = _relabel(scans, plan.confirmed) if plan.confirmed else None
@@ -310,7 +308,7 @@ class RecentScan(NamedTuple):
         """Update a filter with the rows that it uses."""
         rows = [row for row, i in enumerate(self.row_ids) if i is not None]
         ids = [i for i in self.row_ids if i is not None]
-        return slam.update(self.readings[rows], ids)  # a copy, kept for a repetition
+        return slam.update(self.readings[rows], ids)  # a copy: it may be repeated
 
     def without(self, landmark_id: int) -> RecentScan:
         """Return the scan with the reading of a landmark, if any, left out."""

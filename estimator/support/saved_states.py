@@ -75,10 +75,16 @@ def read(
 
 
 def write(values: Mapping[str, Any], table: Table) -> dict[str, Any]:
-    """Return copies of the entries that a table declares, as arrays."""
+    """Return copies of the entries that a table declares, as arrays.
+
+    A set is saved in order, and a mapping as its pairs.
+    """
     saved = {}
     for key, (kind, *shape) in table.items():
-        array = np.array(values[key], dtype=kind.dtype)
+        value = values[key]
+        if isinstance(value, set | Mapping):
+            value = sorted(value) if isinstance(value, set) else list(value.items())
+        array = np.array(value, dtype=kind.dtype)
         if array.ndim < len(shape):  # an empty list of rows
             array = array.reshape([_length(size, {}) for size in shape])
         saved[key] = array
