@@ -15,7 +15,7 @@ from scipy.linalg import cho_solve, solve_triangular
 
 from ...arrays import Array, IntArray
 from ..interface import Belief, SlamEstimator, SupportsSmoothing
-from ..map_management.hypotheses import HypothesisSlam
+from ..map_management.managed_slam import ManagedFilter
 from ..models.bearing_range import locate_landmark, wrap_angle
 from ..models.sensors import BEARING_RANGE
 from ..support import argument_checks
@@ -445,5 +445,5 @@ class SmoothedDrive:
 
 def smoother_in(slam: SlamEstimator) -> SupportsSmoothing | None:
     """Return the smoother, that of the most probable hypothesis; None without one."""
-    inner = slam.best if isinstance(slam, HypothesisSlam) else slam
+    inner = slam.best if isinstance(slam, ManagedFilter) else slam
     return inner if isinstance(inner, SupportsSmoothing) else None

@@ -15,7 +15,7 @@ import numpy as np
 from ...arrays import Array
 from ...estimator import interface
 from ...estimator.interface import Belief, MapView, SlamEstimator, UpdateReport
-from ...estimator.map_management import hypotheses, managed_slam
+from ...estimator.map_management.managed_slam import ManagedFilter
 from ..logs import ground_truth, recording, slamlog
 from .filter_settings import one_blas_thread, refuse_large_map
 from .trace import (
@@ -194,7 +194,7 @@ def _name_of(estimator: SlamEstimator, given: str | None) -> str:
     """Return a given name, or that of the class; of a managed filter, the filter's."""
     if given:
         return given
-    if isinstance(estimator, managed_slam.ManagedSlam | hypotheses.HypothesisSlam):
+    if isinstance(estimator, ManagedFilter):
         return type(estimator.filter).__name__
     return type(estimator).__name__
 
