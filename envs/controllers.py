@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
-from ..sim_configs import Robot, Scenario, action_sequence
+from ..sim_configs import Robot, Scenario, action_sequence, load_scenario
 from ..sim_configs.field_types import unknown_choice
 from .drives import drive_of
 from .robot import displacement, wrap_angle
@@ -45,7 +45,7 @@ CONTROLLERS = ("open_loop", "waypoints", "random")
 
 
 def make_controller(
-    name: str, scenario: Scenario, rng: np.random.Generator
+    name: str, scenario: Scenario | str, rng: np.random.Generator
 ) -> Controller:
     """Make the controller of a name for a scenario.
 
@@ -55,25 +55,20 @@ def make_controller(
         ``"open_loop"`` executes the scenario's controls. ``"waypoints"`` steers along
         the path that they take without noise. ``"random"`` is a random walk near that
         path.
-    scenario : Scenario
-        Source of the controls, the step and the robot.
+    scenario : Scenario or str
+        Source of the controls, the step and the robot; a str as in `load_scenario`.
     rng : numpy.random.Generator
         Used by ``"random"`` only.
 
     Raises
     ------
     ValueError
-        If there is no such controller.
+        If there is no such controller, or the robot cannot drive as it demands.
     """
     match name:
         case "open_loop":
             return OpenLoop.for_scenario(scenario)
         case "waypoints":
-            if scenario.robot.drive == "bicycle":
-                raise ValueError(
-                    "controller 'waypoints' turns the robot at rest, but a robot with "
-                    "drive = 'bicycle' cannot do this: use 'open_loop' or 'random'"
-                )
             return Waypoints.for_scenario(scenario)
         case "random":
             return RandomWalk.for_scenario(scenario, rng)
@@ -237,8 +232,9 @@ class OpenLoop:
         self.actions = np.clip(finite_rows(actions, "actions"), -limits, limits)
 
     @classmethod
-    def for_scenario(cls, scenario: Scenario) -> Self:
+    def for_scenario(cls, scenario: Scenario | str) -> Self:
         """Make the controller that executes a scenario's controls."""
+        scenario = load_scenario(scenario)
         return cls(action_sequence(scenario), scenario.robot)
 
     def act(self, pose: ArrayLike, step: int) -> Array:
@@ -320,8 +316,9 @@ class RandomWalk:
         self._state = np.zeros(2)
 
     @classmethod
-    def for_scenario(cls, scenario: Scenario, rng: np.random.Generator) -> Self:
+    def for_scenario(cls, scenario: Scenario | str, rng: np.random.Generator) -> Self:
         """Make a random walk within the circle around a scenario's planned path."""
+        scenario = load_scenario(scenario)
         positions = planned_path(scenario)[:, :2]
         low, high = positions.min(axis=0), positions.max(axis=0)
         x, y = (low + high) / 2
@@ -450,11 +447,17 @@ class Waypoints:
         self._next = 0
 
     @classmethod
-    def for_scenario(cls, scenario: Scenario) -> Self:
+    def for_scenario(cls, scenario: Scenario | str) -> Self:
         """Make the controller that follows the planned path of a scenario.
 
         A position counts as reached half a step before it.
         """
+        scenario = load_scenario(scenario)
+        if scenario.robot.drive == "bicycle":
+            raise ValueError(
+                "controller 'waypoints' turns the robot at rest, but a robot with "
+                "drive = 'bicycle' cannot do this: use 'open_loop' or 'random'"
+            )
         positions = planned_path(scenario)[:, :2]
         legs = np.hypot(*np.diff(positions, axis=0).T)
         return cls(

@@ -282,4 +282,4 @@ def _outcome(accepted: bool) -> str:
 def few_runs(runs: int) -> str:
     """Warn of a study with fewer than FEW_RUNS runs."""
     needed = f"at least {FEW_RUNS} are needed to find more than large errors"
-    return f"Only {runs} runs: {needed}."
+    return f"Only {runs} run{'s' * (runs != 1)}: {needed}."

@@ -152,7 +152,8 @@ def diagnose(
     sums = None if noise is None else _checked_sums(noise, len(pose))
     runs = len(pose)
     if runs < FEWEST_RUNS:
-        text = f"cannot tell: {runs} runs succeeded, and {FEWEST_RUNS} are needed."
+        good = f"{runs} run{'s' * (runs != 1)} succeeded"
+        text = f"cannot tell: {good}, and {FEWEST_RUNS} are needed."
         return Diagnosis(CANNOT_TELL, 1.0, text)
     errors = errors_of(pose, heading)
     findings = noise_findings.significant_findings

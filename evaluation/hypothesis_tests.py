@@ -503,6 +503,11 @@ def average_band(
     probability : float
         Probability of lying inside.
 
+    Raises
+    ------
+    ValueError
+        If a number is not whole or below 1, or the probability not between 0 and 1.
+
     Examples
     --------
     Bailey's 50 runs of a pose:
@@ -510,8 +515,11 @@ def average_band(
     >>> average_band(50, 3)
     Band(low=2.359..., high=3.716...)
     """
-    tail = (1 - probability) / 2
-    return to_band(chi_square_limits(runs * degrees_of_freedom, tail) / runs)
+    freedom = argument_checks.whole("degrees_of_freedom", degrees_of_freedom, 1)
+    freedom *= argument_checks.whole("runs", runs, 1)
+    if not 0 < probability < 1:
+        raise ValueError(f"probability must be between 0 and 1, got {probability!r}")
+    return to_band(chi_square_limits(freedom, (1 - probability) / 2) / runs)
 
 
 def family_band(

@@ -536,8 +536,9 @@ class Scenario(Part):
         for key in changes:
             if key not in fields:
                 raise UnknownKeywordError(
-                    f"unexpected keyword argument '{key}': unknown key '{key}' in the "
-                    f"scenario{closest(key, fields, else_all=True)}"
+                    f"unknown key '{key}' in the scenario"
+                    f"{closest(key, fields, else_all=True)} "
+                    f"(unexpected keyword argument '{key}')"
                 )
         return self.from_table(_merge(self.model_dump(), changes))
 

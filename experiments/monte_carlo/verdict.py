@@ -303,8 +303,8 @@ def run_warnings(entries: Mapping[str, Mapping[str, Any]], runs: int) -> list[st
         return [*found, few_runs(runs)]
     for label, entry in entries.items():
         if (good := entry["good_runs"]) < FEW_RUNS:
-            succeeded = f"only {good} runs succeeded" if good else "no run succeeded"
-            found.append(f"{label}: {succeeded}; at least {FEW_RUNS} are needed.")
+            some = f"only {good} run{'s' * (good > 1)}" if good else "no run"
+            found.append(f"{label}: {some} succeeded; at least {FEW_RUNS} are needed.")
     return found
 
 

@@ -9,7 +9,7 @@ from gymnasium.utils.env_checker import check_env
 
 from slamgym import make_estimator
 from slamgym.envs import LandmarkWorldEnv, LandmarkWorldVectorEnv
-from slamgym.envs.controllers import make_controller, planned_path
+from slamgym.envs.controllers import Waypoints, make_controller, planned_path
 from slamgym.envs.drives import drive_of
 from slamgym.envs.rendering.render_state import drawn_readings
 from slamgym.envs.vector import WorldBatch
@@ -180,7 +180,7 @@ def test_what_a_model_does_not_have_is_refused(changes, message):
 
 def test_a_car_has_no_controller_that_turns_at_rest():
     with pytest.raises(ValueError, match="'waypoints' turns the robot at rest"):
-        make_controller("waypoints", load_scenario("bicycle"), np.random.default_rng(0))
+        Waypoints.for_scenario("bicycle")
 
 
 def test_the_unicycle_has_no_drive_of_its_own():

@@ -153,6 +153,13 @@ def test_the_family_band_is_wider_for_more_times():
     assert family_band(50, 3, 10).high == pytest.approx(chi2.ppf(1 - 0.0025, 150) / 50)
 
 
+@pytest.mark.parametrize("numbers", [(0, 3), (2.5, 3), (5, 0), (5, 3, 0), (5, 3, 1)])
+def test_a_band_of_nothing_is_refused(numbers):
+    probability = dict(zip(["probability"], numbers[2:], strict=False))
+    with pytest.raises(ValueError, match=r"must be (a whole number >= 1|between 0)"):
+        average_band(*numbers[:2], **probability)
+
+
 @pytest.mark.parametrize(
     ("factor", "runs"),
     [(1.05, 2933), (1.1, 767), (1.2, 209), (1.3, 101), (1.5, 42), (2.0, 15)],

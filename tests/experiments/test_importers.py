@@ -239,9 +239,9 @@ def test_a_wrong_world_file_is_named(file, log, world, message):
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ({"robot": 3}, "robot must be None"),
+        ({"robot": 3}, "robot needs a UTIAS folder, but .*log.txt is none"),
         ({"noise_from_file": True}, "noise_from_file needs a graph"),
-        ({"truth": "true.txt"}, "truth must be None"),
+        ({"truth": "true.txt"}, "truth needs a graph, .*, but .*log.txt is none"),
     ],
 )
 def test_an_option_of_another_format_is_refused(file, option, message):

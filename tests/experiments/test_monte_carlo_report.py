@@ -14,6 +14,7 @@ from rich.console import Console
 from scipy.stats import chi2
 
 from slamgym import experiments
+from slamgym.evaluation import diagnose
 from slamgym.evaluation.consistency_report import evaluate_consistency
 from slamgym.evaluation.hypothesis_tests import equivalence_test, family_band
 from slamgym.experiments import nees_figure
@@ -293,6 +294,15 @@ def test_few_runs_are_noted_once_for_all_estimators_and_warned_of_in_each():
     ]
     entry = summary["estimators"]["invariant"]
     assert any("Only 8 runs" in line for line in entry["warnings"])
+
+
+def test_a_single_run_is_called_a_run():
+    (note,) = summarise_monte_carlo(typical().isel(run=[0]))["notes"]
+    assert note.startswith("Only 1 run: at least 20 are needed")
+    failed = with_failures(typical(), [("ekf", run, 1, "a") for run in range(39)])
+    assert "ekf: only 1 run succeeded; at" in summarise_monte_carlo(failed)["notes"][1]
+    one = diagnose(None, np.ones((1, 5)), np.ones((1, 5)))
+    assert one.sentence.startswith("cannot tell: 1 run succeeded")
 
 
 def test_a_flagged_run_counts_as_failed_even_if_its_numbers_are_finite():

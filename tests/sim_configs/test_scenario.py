@@ -49,12 +49,11 @@ def mistake_of(**changes):
     [
         ({"sensor": {"max_rage": 3.0}},
          "unknown key 'max_rage' in sensor; did you mean 'max_range'?"),
-        ({"stesp": 3}, "unexpected keyword argument 'stesp': "
-         "unknown key 'stesp' in the scenario; did you mean 'steps'?"),
+        ({"stesp": 3}, "unknown key 'stesp' in the scenario; did you mean 'steps'? "
+         "(unexpected keyword argument 'stesp')"),
         ({"landmarks": {"layout": "ring", "raduis": 3.0, "count": 3}},
          "unknown key 'raduis' in landmarks; did you mean 'radius'?"),
-        ({"zzz": 3}, "unexpected keyword argument 'zzz': "
-         "unknown key 'zzz' in the scenario; known are "),
+        ({"zzz": 3}, "unknown key 'zzz' in the scenario; known are "),
         ({"sensor": {"fov": 1}},
          "unknown key 'fov' in sensor; known are field_of_view, dropout, "),
     ],

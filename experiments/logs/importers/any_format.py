@@ -66,8 +66,8 @@ def read_log(
     OSError
         If a file cannot be opened.
     ValueError
-        If ``robot`` is given for a format of one robot, or ``truth`` or
-        ``noise_from_file`` for a log that is no graph.
+        If ``robot`` is given for a log that is no UTIAS folder, or ``truth`` or
+        ``noise_from_file`` for one that is no graph.
     """
     source = Path(path)
     if source.is_dir():
@@ -75,12 +75,14 @@ def read_log(
     else:
         path = log_lines.ReadFile(path)
         kind = _format_of(log_lines.read_lines(path)[0])
-    if robot is not None and kind != "utias":
-        raise ValueError(f"robot must be None for a log in one file, got {robot}")
-    if truth is not None and kind != "isam":
-        raise ValueError(f"truth must be None for a log that is no graph, got {truth}")
-    if noise_from_file and kind != "isam":
-        raise ValueError("noise_from_file needs a graph, iSAM or g2o text")
+    graph_text = "a graph, iSAM or g2o text"
+    for name, is_given, needed, what in (
+        ("robot", robot is not None, "utias", "a UTIAS folder"),
+        ("truth", truth is not None, "isam", graph_text),
+        ("noise_from_file", noise_from_file, "isam", graph_text),
+    ):
+        if is_given and kind != needed:
+            raise ValueError(f"{name} needs {what}, but {source} is none")
     if kind == "utias":
         log = utias.read_utias(source, robot=robot)
     elif kind == "isam":
