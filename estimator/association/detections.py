@@ -201,7 +201,7 @@ class LostEvidence(NamedTuple):
         >>> evidence.unknown > LOST_SCORE
         True
         """
-        variance = min(float(variance), UNIFORM)
+        variance = min(max(float(variance), 0.0), UNIFORM)  # rounded, it may be < 0
         is_unknown = has_map and variance - self.surest > UNKNOWN
         unknown = self.unknown + MOST_OF_SCAN / 2 if is_unknown else 0.0
         largest, surest = max(self.largest, unknown), min(self.surest, variance)

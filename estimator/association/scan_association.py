@@ -242,7 +242,7 @@ class Candidates(NamedTuple):
         ):
             if not np.all(is_so):
                 raise ValueError(f"state['tentative.{name}'] must be {wanted}")
-        tentative = TentativeLandmarks(*(saved[key] for key in TENTATIVE))
+        tentative = TentativeLandmarks(**{key: saved[key] for key in TENTATIVE})
         counts = int(saved["next_id"]), int(saved["scan"])
         new = UnexplainedDensity(*density.tolist())._replace(cells=saved["unexplained"])
         detections = Detections(saved["detected"], missed, shown, lost, saved["path"])

@@ -53,6 +53,9 @@ BEYOND = 4.0
 #: Up to this σ of the heading, the frame remains that of an earlier scan [rad].
 STRAIGHT = 0.05
 
+#: Least variance of a reading, relative to the terms of H P Hᵀ: S⁻¹ must exist.
+ROUNDING = 1e-12
+
 #: Least prior probability of being a landmark: the robot may enter a new region.
 LEAST_SHARE = 0.01
 
@@ -120,7 +123,7 @@ class TentativeLandmarks(NamedTuple):
         """
         k, landmarks = len(slots), self.view().landmarks[slots]
         expected, by_pose, by_place = predict_measurement(self.mean[:3], landmarks)
-        nu, variances = readings - expected, noise.variances(readings[:, 1])
+        nu = readings - expected
         nu[:, 0] = wrap_angle(nu[:, 0])
         H = np.zeros((k, 2, len(self.mean)))
         H[:, :, :3] = by_pose
@@ -128,19 +131,19 @@ class TentativeLandmarks(NamedTuple):
         np.put_along_axis(H, np.repeat(columns, 2, axis=1), by_place, axis=2)
         slopes = H.reshape(2 * k, -1)
         rows = slopes @ self.covariance
+        floor = ROUNDING * (slopes**2 @ self.covariance.diagonal()).reshape(k, 2)
+        variances = np.maximum(noise.variances(readings[:, 1]), floor)
         S = rows @ slopes.T + np.diag(variances.ravel())
-        information: Array = np.asarray(np.linalg.inv(S))
-        own = information.reshape(k, 2, k, 2)[range(k), :, range(k)]
-        C, white = np.linalg.inv(own), (information @ nu.ravel()).reshape(k, 2)
-        volume = np.maximum(
-            np.linalg.det(C), variances.prod(axis=1)
-        )  # but for rounding
-        unlikelihood = np.einsum("ki,kij,kj->k", white, C, white) + np.log(volume)
+        root = np.linalg.inv(np.linalg.cholesky(S))  # Λ = rootᵀ root
+        A, white = root @ rows, root @ nu.ravel()
+        own = (root.T @ root).reshape(k, 2, k, 2)[range(k), :, range(k)]
+        fit = (root.T @ white).reshape(k, 2, 1)
+        unlikelihood = (fit.mT @ np.linalg.solve(own, fit)).ravel()
+        unlikelihood -= np.log(np.linalg.det(own))
         odds, seen = self.odds.copy(), self.seen.copy()
         odds[slots] -= unlikelihood / 2 + np.log(2 * np.pi * density)
         seen[slots] |= 1
-        mean = self.mean + white.ravel() @ rows
-        P = as_covariance(self.covariance - rows.T @ information @ rows)
+        mean, P = self.mean + white @ A, as_covariance(self.covariance - A.T @ A)
         return TentativeLandmarks(mean, P, seen, self.labels, odds)
 
     def with_new(
@@ -310,11 +313,11 @@ def _count_readings(
     return farthest, known
 
 
-#: What a saved state holds about them, in the order of the fields.
+#: What a saved state holds about them.
 TENTATIVE: saved_states.Table = {
-    "mean": (saved_states.NUMBERS, "n"),
-    "covariance": (saved_states.NUMBERS, "n", "n"),
     "seen": (saved_states.COUNTS._replace(dtype=np.uint64), "t"),
+    "mean": (saved_states.NUMBERS, "3+2t"),
+    "covariance": (saved_states.NUMBERS, "3+2t", "3+2t"),
     "labels": (saved_states.WHOLE, "t"),
     "odds": (saved_states.NUMBERS, "t"),
 }

@@ -368,8 +368,8 @@ class HypothesisSlam(ManagedFilter):
         name = {"estimator": type(self).__name__}
         table = {"costs": (saved_states.NUMBERS, -1)}
         costs = saved_states.read(state, table, of=name)["costs"].tolist()
-        if not costs or min(costs) < 0:
-            raise ValueError(f"state['costs'] must be numbers >= 0, got {costs}")
+        if not costs or costs[0] < 0 or costs != sorted(costs):
+            raise ValueError(f"state['costs'] must be >= 0 and ascend, got {costs}")
         with undone_on_error(self.bookmark()):
             loaded = [Hypothesis(cost, self._fresh()) for cost in costs]
             for k, hypothesis in enumerate(loaded):

@@ -38,6 +38,7 @@ from slamgym.estimator.kernels.kalman_gain import (
 )
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
 from slamgym.estimator.models.motions import predict_pose
+from slamgym.estimator.support.saved_states import is_semidefinite
 from slamgym.evaluation import score_association
 from slamgym.sim_configs import action_sequence, load_scenario
 
@@ -204,6 +205,20 @@ def test_sightings_correct_tentative_landmarks_like_any_filter():
         other = multivariate_normal(cov=S[np.ix_(rows, rows)])
         odds = 0.25 / 0.03 * both / other.pdf(report.innovation.ravel()[rows])
         np.testing.assert_allclose(seen.odds[k], np.log(odds), rtol=1e-9)
+
+
+@pytest.mark.parametrize("std", [(0.0, 0.1), (0.05, 0.0), (0.05, 1e-9)])
+@pytest.mark.parametrize("distance", [6.0, 1e9])
+def test_tentative_landmarks_stay_sound_without_noise(std, distance):
+    noise, slots = Noise(*std), np.arange(3)
+    scan = np.array([(0.7, distance), (-0.2, 3.0), (2.0, 4.0)])
+    held = TentativeLandmarks().with_new(scan, noise, slots, share=0.2)
+    for _ in range(3):
+        scan[:, 0] -= 0.2
+        held = held.moved((0.0, 0.0, 0.2), np.array([0.0, 0.0, 0.04]))
+        held = held.with_sightings(slots, scan, noise, np.full(3, 0.03)).after_scan(8)
+        assert np.isfinite(held.odds).all()
+        assert is_semidefinite(held.covariance)
 
 
 def test_sightings_count_as_long_as_they_are_recent():

@@ -305,6 +305,14 @@ def test_a_state_that_cannot_be_loaded_leaves_everything_as_it_was(
     assert digest(slam) == before
 
 
+@pytest.mark.parametrize("costs", [[], [-1.0], [2.0, 0.0]])
+def test_saved_costs_begin_with_the_least(costs):
+    slam = make(load_scenario("loop"), association="hypotheses")
+    saved = slam.state_dict()
+    with pytest.raises(ValueError, match=r"costs'\] must be >= 0 and ascend, got"):
+        slam.load_state_dict(saved | {"costs": np.array(costs)})
+
+
 def test_loading_again_and_again_makes_no_more_filters(slippery_drive):
     world, scans = slippery_drive
     slam, _ = several_hypotheses(scans, world)

@@ -242,6 +242,16 @@ def test_a_saved_tentative_landmark_of_negative_variance_is_refused():
         slam.load_state_dict(state | {key: -state[key]})
 
 
+@pytest.mark.parametrize("keys", [("mean", "covariance"), ("seen", "labels", "odds")])
+def test_saved_tentative_landmarks_of_another_number_are_refused(keys):
+    slam, other = make(management={}), make(management={})
+    slam.update(polar([(3, 4), (4, -2)]))
+    other.update(polar([(3, 4)]))
+    parts = {key: other.state_dict()[key] for key in (f"tentative.{k}" for k in keys)}
+    with pytest.raises(ValueError, match="must have shape"):
+        slam.load_state_dict(slam.state_dict() | parts)
+
+
 def test_identities_need_confirmation_where_they_are_not_trusted():
     slam = make(management={"confirm": (2, 3), "trust_ids": False})
     scan = polar([(5, 1), (4, -2)])

@@ -524,6 +524,10 @@ def test_a_heading_that_is_unknown_from_the_start_is_no_evidence(std):
     assert with_headings([std, std, std + 1, std + 1, std + 1]).largest == 0
 
 
+def test_a_heading_whose_variance_is_rounded_below_0_is_certain():
+    assert LostEvidence().with_heading(-1e-17).surest == 0
+
+
 def test_a_heading_is_no_evidence_before_there_is_a_map():
     assert with_headings([0.1, 2.0, 2.0, 2.0, 2.0], has_map=False).largest == 0
 
