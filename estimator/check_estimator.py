@@ -96,7 +96,7 @@ def check_estimator(factory: Factory | str) -> tuple[Finding, ...]:
     ----------
     factory : callable or str
         Makes the estimator from the keywords ``motion_std``, ``measurement_std``,
-        ``initial_pose``, ``initial_pose_std``; usually a class. Or a name that
+        ``initial_pose``, ``initial_pose_std``; usually a class. A str is a name that
         `make_estimator` accepts.
 
     Returns

@@ -17,6 +17,7 @@ from ..arrays import Array, BoolArray, IntArray
 from ..estimator.models.rigid_motion import ErrorFrame
 from ..estimator.support import argument_checks
 from . import hypothesis_tests as tests
+from .diagnosis import runs_text
 
 #: Number of runs below which the report warns that it finds large errors only.
 FEW_RUNS = 20
@@ -282,4 +283,4 @@ def _outcome(accepted: bool) -> str:
 def few_runs(runs: int) -> str:
     """Warn of a study with fewer than FEW_RUNS runs."""
     needed = f"at least {FEW_RUNS} are needed to find more than large errors"
-    return f"Only {runs} run{'s' * (runs != 1)}: {needed}."
+    return f"Only {runs_text(runs)}: {needed}."

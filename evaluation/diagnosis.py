@@ -152,7 +152,7 @@ def diagnose(
     sums = None if noise is None else _checked_sums(noise, len(pose))
     runs = len(pose)
     if runs < FEWEST_RUNS:
-        good = f"{runs} run{'s' * (runs != 1)} succeeded"
+        good = f"{runs_text(runs)} succeeded"
         text = f"cannot tell: {good}, and {FEWEST_RUNS} are needed."
         return Diagnosis(CANNOT_TELL, 1.0, text)
     errors = errors_of(pose, heading)
@@ -279,6 +279,11 @@ def _of_the_association(before: str, blame: Blame, errors: Errors) -> Diagnosis:
         "err no more than others."
     )
     return Diagnosis(CANNOT_TELL, errors.p_value, sentence)
+
+
+def runs_text(runs: int) -> str:
+    """Write a number of runs."""
+    return f"{runs} run{'s' * (runs != 1)}"
 
 
 def p_text(p_value: float) -> str:

@@ -100,10 +100,10 @@ def judge(
     Returns
     -------
     xarray.Dataset
-        As of ``monte_carlo``, without NIS and the NEES of whole states. Runs are in the
-        order of their seeds or names; where these are no seeds, ``run`` holds the names
-        of the files. A drive without usable estimates is a failed run. The attribute
-        ``mistakes`` names conventions that files break.
+        As ``monte_carlo`` returns it, without NIS and the NEES of whole states. Runs
+        are in the order of their seeds or names. If the files have no seeds, ``run``
+        holds their names. A drive without usable estimates is a failed run. The
+        attribute ``mistakes`` names conventions that files break.
 
     Raises
     ------

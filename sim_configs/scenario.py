@@ -393,7 +393,7 @@ class Scenario(Part):
 
     @property
     def models(self) -> dict[str, Any]:
-        """Options of `make_estimator` beside the two std, where they are not defaults.
+        """Options of `make_estimator`, except the two std, that are not its defaults.
 
         Examples
         --------

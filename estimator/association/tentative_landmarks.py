@@ -160,7 +160,7 @@ class TentativeLandmarks(NamedTuple):
         return TentativeLandmarks(map_.mean, map_.covariance, *rest)
 
     def after_scan(self, scans: int) -> "TentativeLandmarks":
-        """Return those seen in the last ``scans`` − 1 scans, in a frame close by."""
+        """Return those seen in the last ``scans`` − 1 scans, in a recent frame."""
         seen = (self.seen << 1) & ((1 << scans) - 1)
         left = self._replace(seen=seen).chosen(seen > 0)
         if not (t := len(left.seen)):

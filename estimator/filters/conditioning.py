@@ -118,7 +118,7 @@ class ObservesPoses:
 
 
 class PoseReport(UpdateReport):
-    """The results of a reading of the pose, which do not lie in the filter's memory."""
+    """The results of a reading of the pose, stored outside the filter's memory."""
 
     is_detached = False
 

@@ -95,7 +95,7 @@ class GaussianMap:
     ) -> None:
         parts = parts or parts_of(block)
 
-        def newest() -> Any:  # `last`, until the next scan
+        def newest() -> Any:  # `last`, and None after the next scan
             return None if parts.numbers[SCANNED] else last
 
         vars(self).update(block=block, parts=parts, _slots={}, _last=newest)
@@ -202,7 +202,7 @@ class GaussianMap:
             most = 8 + 2 * readings
         capacity = self.capacity_for(fitting) // 8 * 8  # it is rounded up
         capacity = max(capacity, self.capacity_for(landmarks))
-        return new_block(capacity, most, self.parts.values[:NIS])  # without a NIS
+        return new_block(capacity, most, self.parts.values[:NIS])  # no NIS yet
 
     def hold(
         self,
@@ -249,7 +249,7 @@ class GaussianMap:
 
     def take_in(self, update: UpdateKernel, readings: Array, ids: IntArray) -> int:
         """Update the map with a scan, as `update_map`; return the status."""
-        if (last := self._last()) is not None:  # `_detach_report`, without its call
+        if (last := self._last()) is not None:  # `_detach_report`, inlined
             last.detach()
         status = update(self.block, readings, ids)
         if status == NO_ROOM:
@@ -283,7 +283,7 @@ class GaussianMap:
         self.keep_without(self.used, ids)
 
     def bookmark(self) -> Undo:
-        """Return what takes back later changes, except those made by kernels."""
+        """Return a function that undoes later changes, except those of kernels."""
         return partial(vars(self).update, vars(self).copy())
 
     @property

@@ -97,7 +97,7 @@ def lost(view: MapView, rules: Constellations | None) -> BoolArray:
 def without_lost(view: MapView, rules: Constellations | None, within: float) -> MapView:
     """Return a view without lost landmarks, and without those beyond a distance [m].
 
-    Where none is lost, it is the view as it is.
+    If no landmark is lost, the view is returned unchanged.
     """
     is_lost = lost(view, rules)
     if rules is None or not is_lost.any():
@@ -206,7 +206,7 @@ def places_of_scan(
     rules: Constellations,
     min_range: float = 0.0,
 ) -> list[tuple[Array, IntArray]]:
-    """Return where a robot may be that knows no landmark accurately.
+    """Return where a robot may be if it knows no landmark accurately.
 
     Parameters
     ----------

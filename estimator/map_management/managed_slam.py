@@ -55,7 +55,7 @@ from .recent_scans import FedScans, RecentScans
 
 
 class ManagedFilter:
-    """What a managed filter shows; of several hypotheses, the most probable one."""
+    """The results of a managed filter: those of its most probable hypothesis."""
 
     _policy: LandmarkPolicy
 

@@ -92,6 +92,8 @@ def key_figures(summary: dict[str, Any]) -> Table:
     """Lay out the few numbers that describe the quality of a run."""
     counts, size = summary["readings"], f"{len(summary['landmarks'])} landmarks"
     used = f"{counts['associated']} of known landmarks, {counts['added']} of new ones"
+    if not any(counts.values()):
+        used = "the filter reports none"
     rows = [
         ("steps", f"{summary['steps']}, with {summary['scans']} scans"),
         ("readings", _and_counts(used, counts, _FATES)),

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from ...arrays import AnyArray, Array
+from ...evaluation.diagnosis import runs_text
 from ...evaluation.hypothesis_tests import (
     autocorrelation,
     average_band,
@@ -105,7 +106,8 @@ def report_figures(
 
 
 def _title(summary: dict[str, Any]) -> str:
-    return f"{summary['scenario']}, {summary['runs']} runs of {summary['steps']} steps"
+    runs = runs_text(summary["runs"])
+    return f"{summary['scenario']}, {runs} of {summary['steps']} steps"
 
 
 def _shown(dataset: xr.Dataset, summary: dict[str, Any]) -> Shown:

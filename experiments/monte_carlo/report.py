@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ...evaluation.consistency_report import FEW_AVERAGES
-from ...evaluation.diagnosis import p_text
+from ...evaluation.diagnosis import p_text, runs_text
 from ...sim_configs.scenario_files import replace_when_written
 from ..figures import style
 from ..jobs import replace_own
@@ -201,8 +201,8 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
     note = "Averages over runs and steps; heading and RMSE are root mean squares."
     table = Table(
         title=Text(
-            f"{summary['scenario']}: {summary['runs']} runs of {summary['steps']} "
-            f"steps, seed {summary['seed']}"
+            f"{summary['scenario']}: {runs_text(summary['runs'])} of "
+            f"{summary['steps']} steps, seed {summary['seed']}"
         ),
         caption=Text(f"{key}\n{note}{_no_bound(summary)}{_bad_run(summary)}".strip()),
         caption_justify="left",
@@ -228,8 +228,8 @@ def _no_bound(summary: dict[str, Any]) -> str:
         return ""
     return (
         " An efficiency is – where no bound is known: for sensors other than "
-        "bearing_range and position, for the poses of a smoother, and if no run "
-        "succeeded."
+        "bearing_range and position, for the poses of an estimator without NIS, such "
+        "as a smoother, and if no run succeeded."
     )
 
 

@@ -26,6 +26,7 @@ import numpy as np
 from ... import __version__
 from ...arrays import Array
 from ...estimator.models.sensors import find_sensor
+from ...evaluation.diagnosis import runs_text
 from ...evaluation.noise_findings import CHANNELS, MOMENTS
 from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import replace_when_written, scenario_text
@@ -144,8 +145,8 @@ def load_results(path: str | Path) -> xr.Dataset:
         results = xr.open_dataset(file, engine="netcdf4")
     except (OSError, KeyError, ValueError) as error:
         raise ValueError(
-            f"{file} is truncated, or holds no results: {error}; if a folder blocks "
-            "lies beside it, the same command makes the file again from it"
+            f"{file} is truncated, or holds no results: {error}; if the folder "
+            "blocks is beside it, repeat the command: it makes the file again"
         ) from error
     lacking = sorted(set(run_measures.VARIABLES) - set(results.variables))
     if lacking:
@@ -175,7 +176,7 @@ def attributes(job: Job, runs: range, command: str) -> dict[str, Any]:
     """Return the origin of results: all that is needed to reproduce them."""
     identity = job.identity()
     return {
-        "title": f"Monte Carlo of {job.scenario.name}, {len(runs)} runs",
+        "title": f"Monte Carlo of {job.scenario.name}, {runs_text(len(runs))}",
         "scenario_name": job.scenario.name,
         "scenario": identity["scenario"],
         "assumed": identity["assumed"],

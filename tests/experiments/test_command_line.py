@@ -396,6 +396,7 @@ def test_a_filter_of_the_user_that_cannot_run_is_refused_with_all_that_it_lacks(
 def test_a_filter_of_the_user_without_reports_and_saving_runs(log, of_a_user):
     pose = answered("replay", log, "-e", f"{of_a_user},ekf")["others"][0]["pose"]
     assert answered("replay", log, "-e", of_a_user)["pose"] == pose
+    assert "the filter reports none" in slamgym("replay", log, "-e", of_a_user).stdout
     world = ("six_landmarks", "--steps", 3)
     summary = answered("monte-carlo", *world, "-e", of_a_user, "--runs", 2)
     message = refused("run", "hidden_identities", "-e", of_a_user)

@@ -299,6 +299,7 @@ def test_few_runs_are_noted_once_for_all_estimators_and_warned_of_in_each():
 def test_a_single_run_is_called_a_run():
     (note,) = summarise_monte_carlo(typical().isel(run=[0]))["notes"]
     assert note.startswith("Only 1 run: at least 20 are needed")
+    assert judge(None, 0, 1).reason.startswith("1 of 1 run succeeded:")
     failed = with_failures(typical(), [("ekf", run, 1, "a") for run in range(39)])
     assert "ekf: only 1 run succeeded; at" in summarise_monte_carlo(failed)["notes"][1]
     one = diagnose(None, np.ones((1, 5)), np.ones((1, 5)))
