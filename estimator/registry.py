@@ -364,7 +364,8 @@ def read_label(label: str) -> FilterLabel:
     match = _LABEL.fullmatch(label.strip()) if isinstance(label, str) else None
     if match is None:
         raise ValueError(
-            f"an estimator must be like ekf or invariant[iterations=3], got '{label}'"
+            "an estimator must be like ekf or invariant[iterations=3] or module:Class, "
+            f"got '{label}'"
         )
     options = _BARE_WORD.sub(r'\1"\2"', match["options"] or "")
     try:

@@ -259,7 +259,7 @@ def _gaps(nees: Array, nis: Array, freedom: IntArray) -> tuple[int, BoolArray]:
     if (~failed).sum() < 2:
         raise ValueError(
             "nees must hold at least 2 runs that succeeded, "
-            f"got {failed.sum()} failed of {len(failed)}"
+            f"got {(~failed).sum()} of {len(failed)}"
         )
     return first, failed
 

@@ -103,7 +103,8 @@ def smooth(
     array([1.933, 0.   , 0.   ])
     """
     if not isinstance(drive, Drive):
-        raise TypeError(f"drive must be a Drive, got {drive!r}")
+        kind = type(drive).__name__
+        raise TypeError(f"drive must be a Drive, got {kind}; smooth_log smooths a log")
     argument_checks.whole("iterations", iterations, 1)
     argument_checks.above("tolerance", tolerance, 0.0)
     if associate:

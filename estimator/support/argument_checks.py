@@ -161,7 +161,8 @@ def identity_array(ids: LandmarkIds | None, count: int, estimator: object) -> In
         array = np.array(_as_signed(array, ids), dtype=np.int64)
     if len(array) != count:
         raise ValueError(
-            f"measurements has {count} rows but landmark_ids has {len(array)} entries"
+            f"landmark_ids must have one entry per row of measurements, {count}, got "
+            f"{len(array)}"
         )
     checked: IntArray = array
     return checked

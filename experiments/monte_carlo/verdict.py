@@ -426,7 +426,8 @@ def seeds_sentence(scores: EstimatorScores, frame: ErrorFrame, errors: Array) ->
     kind, names = "drives", scores.results["run"].values
     if names.dtype.kind == "i":
         kind, names = "seeds", names + int(scores.results.attrs["seed"])
-    more = f" of {len(rows)} runs" if len(rows) > _MOST_SEEDS else ""
+    others = len(rows) - _MOST_SEEDS
+    more = f" and {others} more" if others > 0 else ""
     named = ", ".join(map(str, names[rows[:_MOST_SEEDS]]))
     return f"failed, bad or diverged runs, the worst first: {kind} {named}{more}."
 

@@ -266,7 +266,7 @@ def test_a_covariance_that_only_rounding_keeps_positive_is_refused(landmarks):
         (lambda s: s.update(np.array([(0, 1j)]), [0]), "must be real numbers"),
         (lambda s: s.predict(np.array([1j, 0])), "odometry must be real numbers"),
         (lambda s: s.update([(0, 1, 2)], [0]), r"shape \(m, 2\).*got shape \(1, 3\)"),
-        (lambda s: s.update([(0, 1)], [0, 1]), "1 rows but landmark_ids has 2"),
+        (lambda s: s.update([(0, 1)], [0, 1]), "one entry per row .*, 1, got 2"),
         (lambda s: s.update([(0, 1), (1, 1)], [3, 3]), "must not repeat.*got 3 twice"),
         (lambda s: s.update([(0, 1)], [0.5]), "must be a list of int64"),
         (lambda s: s.update([(0, 1)], [[1]]), "must be a list of int64"),

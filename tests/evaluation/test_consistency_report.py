@@ -70,7 +70,7 @@ def test_a_start_known_for_certain_is_no_failure(scores):
 def test_runs_that_all_end_early_have_failed(scores):
     nees, nis, freedom = scores
     nees[:, -1] = np.nan
-    with pytest.raises(ValueError, match="got 100 failed of 100"):
+    with pytest.raises(ValueError, match="got 0 of 100"):
         report(nees, nis, freedom)
 
 

@@ -758,7 +758,7 @@ def test_the_example_of_gtsam_names_the_frame(tmp_path):
     [
         (judge, "estimates must be paths of files, got None"),
         (lambda _: judge({"mine": 3}), "estimates must be paths of files, got 3"),
-        (smooth, "drive must be a Drive, got None"),
+        (smooth, "drive must be a Drive, got NoneType; smooth_log"),
     ],
 )
 def test_what_is_no_path_and_no_drive_is_named(call, message):
