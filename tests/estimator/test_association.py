@@ -37,7 +37,6 @@ from slamgym.estimator.kernels.kalman_gain import (
     Rules,
 )
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
-from slamgym.estimator.models.motions import predict_pose
 from slamgym.estimator.support.saved_states import is_semidefinite
 from slamgym.evaluation import score_association
 from slamgym.sim_configs import action_sequence, load_scenario
@@ -162,26 +161,47 @@ def test_a_tentative_landmark_starts_where_it_was_read():
     np.testing.assert_allclose(one.covariance[3:, 3:], J @ Q @ J.T, rtol=1e-6)
 
 
+def moved_and_seen_again(motion_std):
+    """Two tentative landmarks, whose errors depend on those of the motion."""
+    both = tracked([(0.7, 6.0), (-0.2, 3.0)])
+    for _ in range(2):
+        both = both.moved((0.5, 0.0, 0.4), np.square(motion_std))
+    return both.with_sightings(*sighting(0, (-0.1, 5.4), 0.1))
+
+
 def test_tentative_landmarks_are_settled_in_the_frame_of_the_robot():
-    both, motion_std = tracked([(0.7, 6.0), (-0.2, 3.0)]), np.array([0.3, 0.2, 0.1])
-    moved = both.moved((1.5, 0.0, 0.4), motion_std**2)
+    def in_robot_frame(state):
+        c, s = np.cos(state[2]), np.sin(state[2])
+        return ((state[3:].reshape(-1, 2) - state[:2]) @ [[c, -s], [s, c]]).ravel()
 
-    def in_robot_frame(values):
-        q, slip = values[:4].reshape(2, 2), values[4:]
-        pose = predict_pose(np.zeros(3), np.array([1.5, 0.4]))
-        x, y, heading = pose.pose + pose.jacobian_noise @ slip
-        c, s = np.cos(heading), np.sin(heading)
-        return ((q - (x, y)) @ np.array([[c, -s], [s, c]])).ravel()
-
-    at = np.concatenate([both.places.ravel(), np.zeros(3)])
-    J, P = numeric_jacobian(in_robot_frame, at), np.diag([0.0] * 4 + [*motion_std**2])
-    P[:4, :4] = both.covariance[3:, 3:]
-    settled = moved.after_scan(8)
-    for found in (moved, settled):
-        np.testing.assert_allclose(found.places.ravel(), in_robot_frame(at), atol=1e-12)
-    np.testing.assert_allclose(settled.covariance[3:, 3:], J @ P @ J.T, rtol=1e-6)
+    both = moved_and_seen_again((0.3, 0.2, 0.1))
+    J, settled = numeric_jacobian(in_robot_frame, both.mean), both.after_scan(8)
+    for found in (both.places, settled.places, settled.mean[3:].reshape(-1, 2)):
+        np.testing.assert_allclose(found.ravel(), in_robot_frame(both.mean), atol=1e-12)
+    expected = J @ both.covariance @ J.T
+    np.testing.assert_allclose(settled.covariance[3:, 3:], expected, rtol=1e-6)
     np.testing.assert_array_equal(settled.mean[:3], 0.0)
     np.testing.assert_array_equal(settled.covariance[:3], 0.0)
+
+
+def test_tentative_landmarks_keep_their_frame_while_the_heading_is_certain():
+    both = moved_and_seen_again((0.3, 0.2, 0.02))
+    settled = both.after_scan(8)
+    np.testing.assert_array_equal(settled.mean, both.mean)
+    np.testing.assert_array_equal(settled.covariance, both.covariance)
+
+
+def test_a_tentative_landmark_that_is_dropped_leaves_the_others_as_they_are():
+    both = moved_and_seen_again((0.3, 0.2, 0.1))
+    one, kept = both.chosen(np.array([True, False])), np.ix_(range(5), range(5))
+    np.testing.assert_array_equal(one.mean, both.mean[:5])
+    np.testing.assert_array_equal(one.covariance, both.covariance[kept])
+
+
+@pytest.mark.parametrize(("share", "prior"), [(0.0, 0.01), (0.2, 0.2), (1.0, 0.5)])
+def test_a_new_reading_is_surely_neither_clutter_nor_a_landmark(share, prior):
+    new = TentativeLandmarks().with_new(np.ones((1, 2)), NOISE, np.zeros(1, int), share)
+    np.testing.assert_allclose(new.odds, np.log(prior / (1 - prior)))
 
 
 def test_sightings_correct_tentative_landmarks_like_any_filter():

@@ -17,6 +17,7 @@ from slamgym.estimator.filters.conditioning import separation
 from slamgym.estimator.map_management import policy as policies
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
 from slamgym.estimator.map_management.policy import FieldOfView, LandmarkPolicy
+from slamgym.estimator.models.motions import UNICYCLE, differential
 from slamgym.evaluation.nees import normalised_squared_error
 from slamgym.experiments.logs.ground_truth import true_landmarks_of
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
@@ -135,6 +136,25 @@ def test_a_landmark_enters_with_its_last_sighting_needed():
     assert third.confirmed_ids == third.added_ids == third.row_ids == (0, 1)
     assert slam.tentative_landmarks.shape == (0, 2)
     assert slam.update(scan).associated_ids == (0, 1)
+
+
+@pytest.mark.parametrize(("missed", "is_seen_enough"), [(1, True), (2, False)])
+def test_a_landmark_enters_after_sightings_in_recent_scans(missed, is_seen_enough):
+    slam, scan = make(management={"confirm": (2, 3), "density": 1e-4}), polar([(5, 1)])
+    slam.update(scan)
+    for _ in range(missed):
+        slam.update([])
+    assert bool(slam.update(scan).confirmed_ids) == is_seen_enough
+
+
+@pytest.mark.parametrize("motion", [UNICYCLE, differential(0.5)])
+def test_tentative_landmarks_remain_in_place_while_the_robot_moves(motion):
+    slam, points = make(management={}, motion=motion), [(5, 1), (4, -2)]
+    slam.update(polar(points))
+    slam.predict((0.5, 0.4), dt=4.0)
+    np.testing.assert_allclose(slam.tentative_landmarks, points, atol=1e-12)
+    doubt = slam.state_dict()["tentative.covariance"][:3, :3]
+    np.testing.assert_allclose(doubt, slam.belief().covariance, atol=1e-15)
 
 
 @pytest.mark.parametrize("association", ["nearest", "joint", "hypotheses"])
