@@ -344,6 +344,12 @@ class MapView(NamedTuple):
         """Positions, shape (n, 2) [m]."""
         return self.mean[3 : 3 + 2 * len(self.ids)].reshape(-1, 2)
 
+    def part(self, slots: Sequence[int]) -> MapView:
+        """Return a copy of the pose and some landmarks, by their places in the view."""
+        columns, ids = columns_of(slots), [self.ids[slot] for slot in slots]
+        P = self.covariance[np.ix_(columns, columns)]
+        return MapView(self.mean[columns], P, ids, self.mapped)
+
     @property
     def landmark_covariances(self) -> Array:
         """Marginal covariance of each landmark, shape (n, 2, 2) [m²]."""

@@ -300,10 +300,8 @@ class Detections(NamedTuple):
         """
         cost = 0.0
         for i in [i for i in first_scans if i in view.ids]:
-            c, chance = 3 + 2 * view.ids.index(i), 1.0
-            then = MapView(np.zeros(5), np.zeros((5, 5)), (i,))
-            then.mean[3:] = view.mean[c : c + 2]
-            then.covariance[3:, 3:] = view.covariance[c : c + 2, c : c + 2]
+            then, chance = view.part([view.ids.index(i)]), 1.0
+            then.covariance[3:, :3] = then.covariance[:3, 3:] = 0.0
             path = self.path[self.path[:, 0] < first_scans[i]]
             gaps = np.hypot(*(path[:, 1:3] - then.mean[3:]).T)
             spread = path[:, 4] + path[:, 8] + np.trace(then.covariance)

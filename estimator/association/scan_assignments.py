@@ -299,24 +299,11 @@ class Noise(NamedTuple):
         return np.array(bearing_range_std(self, ranges)).T ** 2
 
 
-def located(pose: Array, readings: Array, noise: Noise) -> tuple[Array, Array, Array]:
-    """Locate the landmarks of readings (m, 2) from a pose (3,).
-
-    Returns
-    -------
-    tuple of ndarray, shapes (m, 2), (m, 2, 3) and (m, 2, 2)
-        Positions, their derivatives by the pose, and covariances due to the noise.
-    """
-    places, to_pose, J = locate_landmark(pose, readings)
-    variances = noise.variances(readings[:, 1])
-    return places, to_pose, J * variances[:, None] @ J.mT
-
-
 def with_readings(view: MapView, readings: Array, noise: Noise) -> MapView:
     """Return a map, without room behind it, with a new landmark for each reading."""
-    places, to_pose, spread = located(view.mean[:3], readings, noise)
-    n, m = len(view.mean), len(readings)
-    J = to_pose.reshape(2 * m, 3)
+    places, to_pose, to_reading = locate_landmark(view.mean[:3], readings)
+    n, m, variances = len(view.mean), len(readings), noise.variances(readings[:, 1])
+    spread, J = to_reading * variances[:, None] @ to_reading.mT, to_pose.reshape(-1, 3)
     P = np.empty((n + 2 * m, n + 2 * m))
     P[:n, :n] = view.covariance
     P[n:, :n] = J @ view.covariance[:3]

@@ -83,8 +83,8 @@ class ScanAssociation:
         new = [row for row, i in enumerate(self.row_ids) if i is None]
         new = [row for row in new if not 0 <= self.labels[row] < known]
         density = self._density.after(self._readings, new, len(self.confirmed))
-        heading = view.covariance[2, 2], len(view.mapped) > 0
-        lost = self._detections.lost.with_heading(*heading)
+        turn = view.covariance[2, 2]
+        lost = self._detections.lost.with_heading(turn, len(view.mapped) > 0)
         if self._is_assigned:
             strange = sum([label >= known for label in self.labels])
             others = len(self.labels) - len(new)
@@ -141,33 +141,27 @@ class ScanAssociation:
         density = self._density.at(readings[rows], self._policy.density)
         view = tentative.view()
         found = assign_scan(self._policy, view, readings[rows], noise, density, most=1)
-        slots = found.slots[0]
-        pairs = list(zip(rows.tolist(), slots.tolist(), strict=True))
-        for row, slot in pairs:
-            if slot >= 0:
-                self.labels[row] = int(tentative.labels[slot])
-        again = slots >= 0
-        sightings = slots[again], readings[rows[again]], noise, density[again]
+        slots, needed = found.slots[0], self._policy.confirm[0]
+        again, fresh = slots >= 0, (slots < 0) & (needed > 1)
         if again.any():
+            sightings = slots[again], readings[rows[again]], noise, density[again]
             tentative = tentative.with_sightings(*sightings)
         chance = self._detections.chance_to_miss(view, self._density.longest)
         tentative = tentative.with_misses(chance)
-        needed = self._policy.confirm[0]
         enough = (tentative.sightings >= needed) & (tentative.odds > ENTRY_ODDS)
-        confirmed = set(np.flatnonzero(enough).tolist())
-        if needed == 1:
-            confirmed.add(NEW)
-        for row, slot in pairs:
-            if max(slot, NEW) in confirmed:
-                self._confirm(row, self._next_id, self.labels[row])
+        # Rows of no tentative landmark take the last entry.
+        labels = np.append(tentative.labels, NO_LABEL)[np.maximum(slots, -1)]
+        labels[fresh] = (self.scan << LABEL_BITS) + rows[fresh]
+        enters = np.append(enough, needed == 1)[np.maximum(slots, -1)]
+        outcomes = rows.tolist(), labels.tolist(), enters.tolist()
+        for row, label, is_confirmed in zip(*outcomes, strict=True):
+            self.labels[row] = label
+            if is_confirmed:
+                self._confirm(row, self._next_id, label)
             else:
                 self.tentative_rows.append(row)
-        fresh = rows[(slots < 0) & (needed > 1)]
-        labels = (self.scan << LABEL_BITS) + fresh
-        for row, label in zip(fresh.tolist(), labels.tolist(), strict=True):
-            self.labels[row] = label
         self._tentative = tentative.chosen(~enough).with_new(
-            readings[fresh], noise, labels, self._density.landmark_share
+            readings[rows[fresh]], noise, labels[fresh], self._density.landmark_share
         )
 
     def _has_waited(self, landmark_id: int) -> bool:

@@ -163,16 +163,16 @@ class TentativeLandmarks(NamedTuple):
         """Return those seen in the last ``scans`` − 1 scans, in a recent frame."""
         seen = (self.seen << 1) & ((1 << scans) - 1)
         left = self._replace(seen=seen).chosen(seen > 0)
-        if not (t := len(left.seen)):
+        if not len(left.seen):
             return TentativeLandmarks()
-        if left.covariance[2, 2] <= STRAIGHT**2:
-            return left
         places, P, back = left.places, left.covariance, rotation(-left.mean[2])
+        if P[2, 2] <= STRAIGHT**2:
+            return left
         lever = places[:, ::-1] * (1.0, -1.0)
-        by_pose = np.hstack([np.tile(-back, (t, 1)), lever.reshape(-1, 1)])
+        by_pose = np.hstack([np.tile(-back, (len(places), 1)), lever.reshape(-1, 1)])
         for _ in range(2):  # T P, then T (T P)ᵀ
-            own = back @ P[3:].reshape(t, 2, -1)
-            P = (by_pose @ P[:3] + own.reshape(2 * t, -1)).T
+            own = back @ P[3:].reshape(-1, 2, P.shape[1])
+            P = (by_pose @ P[:3] + own.reshape(-1, P.shape[1])).T
         mean, P = np.append(np.zeros(3), places), np.pad(as_covariance(P), (3, 0))
         return left._replace(mean=mean, covariance=P)
 
@@ -180,10 +180,9 @@ class TentativeLandmarks(NamedTuple):
         """Return some of them."""
         if which.all():
             return self
-        columns = np.append([True, True, True], np.repeat(which, 2))
-        P = self.covariance[np.ix_(columns, columns)]
-        rest = self.labels[which], self.odds[which]
-        return TentativeLandmarks(self.mean[columns], P, self.seen[which], *rest)
+        map_ = self.view().part(np.flatnonzero(which).tolist())
+        rest = self.seen[which], self.labels[which], self.odds[which]
+        return TentativeLandmarks(map_.mean, map_.covariance, *rest)
 
 
 class UnexplainedDensity(NamedTuple):

@@ -104,7 +104,7 @@ def without_lost(view: MapView, rules: Constellations | None, within: float) -> 
         return view
     away = np.hypot(*(view.landmarks - view.mean[:2]).T)
     is_near = away <= within + NEAR_STDS * rules.lost_std
-    return _part(view, np.flatnonzero(~is_lost & is_near))
+    return view.part(np.flatnonzero(~is_lost & is_near).tolist())
 
 
 def same_landmarks(
@@ -242,7 +242,7 @@ def places_of_scan(
     feasible = gaps <= min(OFFSET_GATE, compared.max(initial=0.0))
     partners, used = feasible.sum(axis=1), np.flatnonzero(feasible.any(axis=0))
     rows = np.argsort(partners, kind="stable")[(partners == 0).sum() :]
-    both = with_readings(_part(view, used), readings[rows], noise)
+    both = with_readings(view.part(used.tolist()), readings[rows], noise)
     known = np.arange(len(used))
     places = _two_places(both, len(used) + np.arange(len(rows)), known)
     feasible = feasible[np.ix_(rows, used)]
@@ -353,11 +353,3 @@ def _invariant(view: MapView, slots: IntArray) -> Array:
     cross = np.outer(lever, P[2, columns])
     block = P[np.ix_(columns, columns)]
     return np.asarray(block - cross - cross.T + P[2, 2] * np.outer(lever, lever))
-
-
-def _part(view: MapView, slots: IntArray) -> MapView:
-    """Return a view of some landmarks only."""
-    columns = np.append([0, 1, 2], 3 + 2 * slots[:, None] + [0, 1])
-    ids = [view.ids[slot] for slot in slots.tolist()]
-    P = view.covariance[np.ix_(columns, columns)]
-    return MapView(view.mean[columns], P, ids, view.mapped)

@@ -126,12 +126,12 @@ class ManagedSlam(ManagedFilter):
     ----------
     estimator : callable
         Makes the filter, from the keywords below; a class will do.
-    motion_std, measurement_std, initial_pose, initial_pose_std
+    motion_std, measurement_std
         As every filter takes them.
     management : LandmarkPolicy, mapping or True
         The policy, its fields, or True for the default one.
     **options
-        Those of the filter.
+        Those of the filter, ``initial_pose`` and ``initial_pose_std`` among them.
 
     Raises
     ------
@@ -163,18 +163,11 @@ class ManagedSlam(ManagedFilter):
         measurement_std: ArrayLike,
         *,
         management: LandmarkPolicy | Mapping[str, Any] | bool = True,
-        initial_pose: ArrayLike = (0.0, 0.0, 0.0),
-        initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
         **options: Any,
     ) -> None:
         self._policy = as_policy(management)
-        self._filter = estimator(
-            motion_std=motion_std,
-            measurement_std=measurement_std,
-            initial_pose=initial_pose,
-            initial_pose_std=initial_pose_std,
-            **options,
-        )
+        noise = {"motion_std": motion_std, "measurement_std": measurement_std}
+        self._filter = estimator(**noise, **options)
         self._sensor = Sensor.checked(measurement_std, options)
         motion = options.get("motion", UNICYCLE)
         at_rest = options.get("noise_at_rest", True)
