@@ -205,8 +205,8 @@ class ManagedSlam(ManagedFilter):
         if type(dt) is not float or dt != 1.0:
             argument_checks.duration(dt)
         candidates, noise = self.candidates, self._motion_noise
+        displacement = noise.motion.moved(reading)
         if len(candidates.tentative.seen):
-            displacement = noise.motion.moved(reading)
             variance = noise.over(displacement, dt)
             moved = candidates.tentative.moved(displacement, variance)
             candidates = candidates._replace(tentative=moved)
