@@ -43,7 +43,6 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
-
 Result = TypeVar("Result")
 Answer = TypeVar("Answer")
 
@@ -371,15 +370,10 @@ def describe_map(landmarks: int, pose: Array, pose_covariance: Array) -> str:
     return f"{landmarks} {noun}, pose ({x} m, {y} m, {heading} rad)"
 
 
-_PASSED_ON = (
-    *("observe_truth", "local_view", "join", "smoothed", "memory_for"),
-    "belief_limit",
-)
-
-
 def optional_members(estimator: SlamEstimator) -> dict[str, Any]:
     """Return what an estimator offers that a wrapper passes on unchanged, by name."""
-    offered = (name for name in _PASSED_ON if hasattr(estimator, name))
+    large = "local_view", "join", "smoothed", "memory_for", "belief_limit"
+    offered = (name for name in ("observe_truth", *large) if hasattr(estimator, name))
     return {name: getattr(estimator, name) for name in offered}
 
 
