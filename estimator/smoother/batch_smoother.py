@@ -103,8 +103,10 @@ def smooth(
     array([1.933, 0.   , 0.   ])
     """
     if not isinstance(drive, Drive):
-        kind = type(drive).__name__
-        raise TypeError(f"drive must be a Drive, got {kind}; smooth_log smooths a log")
+        raise TypeError(
+            f"drive must be a Drive, got {type(drive).__name__}; smooth_log smooths "
+            "a log"
+        )
     argument_checks.whole("iterations", iterations, 1)
     argument_checks.above("tolerance", tolerance, 0.0)
     if associate:
