@@ -144,7 +144,8 @@ class ConsistencyReport:
             f"most {near.error_rate:.0%}).",
             f"Per-run ratios, {frame}: mean {self.mean_ratio:.3f}, median "
             f"{self.median_ratio:.3f}, {self.share_above_3:.1%} of the runs above 3.",
-            f"Runs that find covariances too small by a factor in 90 %: {needed}.",
+            "Runs needed to detect, in 90 % of cases, covariances that are too small "
+            f"by a factor: {needed}.",
         )
 
 

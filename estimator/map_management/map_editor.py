@@ -74,8 +74,9 @@ class MapEditor:
         if not can_save or not {*DENSE} <= set(slam.state_dict()):
             methods = "methods remove and merge" if merging else "method remove"
             raise TypeError(
-                f"{type(slam).__name__} cannot be managed: it needs the {methods}, "
-                f"or state_dict() and load_state_dict() with {', '.join(DENSE)}"
+                f"{type(slam).__name__} cannot be managed, as readings without "
+                f"identities require: it needs the {methods}, or state_dict() and "
+                f"load_state_dict() with {', '.join(DENSE)}"
             )
 
     def map_view(self, within: float | None = None) -> MapView:

@@ -264,7 +264,7 @@ def test_a_filter_whose_map_cannot_be_edited_is_refused():
         def state_dict(self):
             return {"blob": np.zeros(1)}
 
-    with pytest.raises(TypeError, match=r"Sealed cannot be managed:.* with mean"):
+    with pytest.raises(TypeError, match=r"Sealed cannot be managed, .* with mean"):
         MapEditor(Sealed(MOTION_STD, MEASUREMENT_STD))
 
 
