@@ -171,7 +171,7 @@ def significant(value: float | None) -> str:
 
 
 def comparison_table(columns: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Lay out errors and consistency of several estimates side by side.
+    """Lay out errors and consistency of several estimates, side by side if these fit.
 
     Parameters
     ----------
@@ -180,9 +180,7 @@ def comparison_table(columns: Mapping[str, Mapping[str, Any]]) -> Table:
     """
     from ..figures.style import headings_and_key
 
-    headings, key_of_headings = headings_and_key(list(columns))
-    caption = Text(key_of_headings) if key_of_headings else None
-    table = _table(["", *headings], caption=caption)
+    measures = {}
     for name, key, kind in (
         ("path error, raw [m RMS]", "ate", "raw"),
         ("path error, aligned [m RMS]", "ate", "aligned"),
@@ -192,8 +190,19 @@ def comparison_table(columns: Mapping[str, Mapping[str, Any]]) -> Table:
     ):
         found = [column[key] for column in columns.values()]
         if None not in found:
-            cells = (significant(numbers[kind]) for numbers in found)
+            measures[name] = [significant(numbers[kind]) for numbers in found]
+    _, are_long = headings_and_key(list(columns))
+    if not are_long:
+        table = _table(["", *columns])
+        for name, cells in measures.items():
             table.add_row(Text(name), *cells)
+        return table
+    table = _table(["", *measures])
+    table.columns[0].overflow = "fold"
+    for column in table.columns[1:]:
+        column.width = 8  # of 1.23e+04
+    for label, *cells in zip(columns, *measures.values(), strict=True):
+        table.add_row(Text(label), *cells)
     return table
 
 

@@ -6,12 +6,14 @@ import shlex
 import shutil
 import subprocess
 import sys
+from io import StringIO
 
 import numpy as np
 import pytest
 from commands import slamgym
 from matplotlib.figure import Figure
 from PIL import Image
+from rich.console import Console
 from typer.main import get_command
 from typer.testing import CliRunner
 
@@ -272,10 +274,11 @@ def test_a_random_controller_wanders_the_same_way_for_the_same_seed(without_pict
 def test_several_filters_share_a_page_and_a_table(log, without_pictures):
     names = "ekf,invariant[gate_probability=0.9]"
     text = printed("replay", log, "-e", names, "--out", "both")
-    assert "map error, raw [m RMS]" in text
     summary = json.loads((log.parent / "both/summary.json").read_text())
     assert summary["estimator"] == "ekf"
     (other,) = summary["others"]
+    for estimate in (summary, other):
+        assert f" {estimate['landmark_rmse']['raw']:.3g} " in text
     assert other["estimator"] == "invariant[gate_probability=0.9]"
     assert other["settings"]["options"]["gate_probability"] == 0.9
     page = (log.parent / "both/run.html").read_text()
@@ -940,6 +943,18 @@ def test_a_run_whose_association_failed_names_the_command_that_repairs_it(
     noise = "--measurement-std=0.0349,0.1", "--option=range_std_per_metre=0.001"
     shown = slamgym("replay", "a b/log.csv", *wrong[:2], *noise, "--out", "c").stdout
     assert f"slamgym smooth c/log.csv --associate {' '.join(noise)}\n" in shown
+
+
+def test_the_comparison_of_many_filters_cuts_no_number_at_80_columns():
+    error, nees = {"raw": 1234.5, "aligned": 0.00123}, {"per_degree": 71600.0}
+    row = {"ate": error, "landmark_rmse": error, "nees": nees}
+    labels = [f"filter_{k}[gate_probability=0.999,landmark_init=x]" for k in range(11)]
+    console = Console(width=80, file=StringIO())
+    console.print(tables.comparison_table(dict.fromkeys(labels, row)))
+    shown = console.file.getvalue()
+    assert "…" not in shown
+    assert shown.count("7.16e+04") == 11
+    assert shown.count("0.00123") == 22
 
 
 def test_skipped_readings_are_explained():
