@@ -141,6 +141,9 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
     return show_study(reporter, summary, place, *[more] * bool(share))
 
 
+_MOST_COLUMNS = 4  # of estimators, in a terminal of 80
+
+
 def show_study(
     reporter: Reporter, summary: dict[str, Any], place: Path, *more: str
 ) -> int:
@@ -154,7 +157,11 @@ def show_study(
         for label, entry in summary["estimators"].items()
         for sentence in (entry["sentence"], *diagnosis_lines(label, entry))
     ]
-    reporter.show(monte_carlo_table(summary), "", *map(Text, [*sentences, *more]), "")
+    entries = list(summary["estimators"].items())
+    for k in range(0, len(entries), _MOST_COLUMNS):
+        shown = {**summary, "estimators": dict(entries[k : k + _MOST_COLUMNS])}
+        reporter.show(monte_carlo_table(shown), "")
+    reporter.show(*map(Text, [*sentences, *more]), "")
     if summary["notes"]:
         reporter.show(*map(Text, summary["notes"]), "")
     reporter.show(written(str(place), summary["files"]))

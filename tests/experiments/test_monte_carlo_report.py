@@ -18,6 +18,8 @@ from slamgym.evaluation import diagnose
 from slamgym.evaluation.consistency_report import evaluate_consistency
 from slamgym.evaluation.hypothesis_tests import equivalence_test, family_band
 from slamgym.experiments import nees_figure
+from slamgym.experiments.command_line.monte_carlo import show_study
+from slamgym.experiments.command_line.program import Reporter
 from slamgym.experiments.monte_carlo import figures, monte_carlo
 from slamgym.experiments.monte_carlo.figures import report_figures, thinned
 from slamgym.experiments.monte_carlo.report import (
@@ -285,6 +287,17 @@ def test_seeds_of_failed_bad_and_diverged_runs_are_told_the_worst_first():
     assert told.endswith(": seeds 103, 107, 109, 108, 120 and 9 more.")
     honest = summarise_monte_carlo(typical())["estimators"]["invariant"]
     assert honest["seeds_sentence"] == ""
+
+
+def test_the_tables_of_many_filters_show_each_of_them_at_80_columns(capsys, tmp_path):
+    summary = summarise_monte_carlo(typical()) | {"files": []}
+    entry = summary["estimators"]["invariant"]
+    summary["estimators"] = {f"filter_{k}": entry for k in range(9)}
+    show_study(Reporter(as_json=False), summary, tmp_path)
+    shown = capsys.readouterr().out
+    rows = re.findall("^… at the end +1 (.*)", shown, re.MULTILINE)
+    ratio = next(m for m in measures(summary) if m.name == "… at the end")
+    assert " ".join(rows).split() == [ratio.of(entry)] * 9
 
 
 def test_few_runs_are_noted_once_for_all_estimators_and_warned_of_in_each():
