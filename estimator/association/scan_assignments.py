@@ -310,7 +310,7 @@ def with_readings(view: MapView, readings: Array, noise: Noise) -> MapView:
     P[:n, n:] = P[n:, :n].T
     own = P[n:, :3] @ J.T
     own.reshape(m, 2, m, 2)[range(m), :, range(m)] += spread
-    P[n:, n:] = own
+    P[n:, n:] = (own + own.T) / 2
     mean = np.append(view.mean, places)
     return MapView(mean, P, range(len(view.ids) + m))
 

@@ -220,12 +220,9 @@ class Candidates(NamedTuple):
         lost = LostEvidence(*saved["lost"].tolist())
         lost = lost._replace(first_new=int(lost.first_new))
         most_lost = max(lost.lasting, lost.unknown, lost.unexplained)
-        density, C = saved["density"], saved["covariance"]
-        likely = saved_states.is_semidefinite((C + C.T) / 2)
-        seen, expected, returned = saved["detected"]
+        density, (seen, expected, returned) = saved["density"], saved["detected"]
         is_share = (returned >= 0) & (returned <= seen) & (seen <= expected)
         for name, wanted, is_so in (
-            ("covariance", "positive semidefinite", likely),
             ("density", "> 0", density[:4].min() > 0),
             ("density", ">= 0", density[4] >= 0),
             ("unexplained", ">= 0", saved["unexplained"].min() >= 0),

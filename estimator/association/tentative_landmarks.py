@@ -316,7 +316,7 @@ def _count_readings(
 TENTATIVE: saved_states.Table = {
     "seen": (saved_states.COUNTS._replace(dtype=np.uint64), "t"),
     "mean": (saved_states.NUMBERS, "3+2t"),
-    "covariance": (saved_states.NUMBERS, "3+2t", "3+2t"),
+    "covariance": (saved_states.COVARIANCE, "3+2t", "3+2t"),
     "labels": (saved_states.WHOLE, "t"),
     "odds": (saved_states.NUMBERS, "t"),
 }

@@ -260,6 +260,8 @@ def test_a_saved_tentative_landmark_of_negative_variance_is_refused():
     state = slam.state_dict()
     with pytest.raises(ValueError, match=r"covariance'\] must be positive semidef"):
         slam.load_state_dict(state | {key: -state[key]})
+    with pytest.raises(ValueError, match=r"tentative.covariance'\] must be symmetric"):
+        slam.load_state_dict(state | {key: np.triu(state[key])})
 
 
 @pytest.mark.parametrize("keys", [("mean", "covariance"), ("seen", "labels", "odds")])
