@@ -80,12 +80,12 @@ LONG = (  # those that the next test ends in a filter are not among them
 
 @pytest.fixture(scope="module")
 def city_log(tmp_path_factory):
-    """Return a log that takes every command a minute or more."""
+    """Return a log, and a path beside it, that keep every command busy for long."""
     world = load_scenario("city").with_changes(steps=2000)
     log = Options().record(world, lambda *_: None)
     file = tmp_path_factory.mktemp("logs") / "city.csv"
     write_slamlog(log, file)
-    poses = (f"{t} 0 0 0 0 0 0 1 1 0 0 1 0 1\n" for t in range(400_000))
+    poses = (f"{t} 0 0 0 0 0 0 1 1 0 0 1 0 1\n" for t in range(1_500_000))
     file.with_name("path.tum").write_text("".join(poses))
     return file
 
