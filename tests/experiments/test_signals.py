@@ -81,7 +81,7 @@ LONG = (  # those that the next test ends in a filter are not among them
 @pytest.fixture(scope="module")
 def city_log(tmp_path_factory):
     """Return a log, and a path beside it, that keep every command busy for long."""
-    world = load_scenario("city").with_changes(steps=2000)
+    world = load_scenario("city").with_changes(steps=4000)
     log = Options().record(world, lambda *_: None)
     file = tmp_path_factory.mktemp("logs") / "city.csv"
     write_slamlog(log, file)
