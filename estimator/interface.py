@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
+from ..suggestions import counted
 from .models import rigid_motion
 from .models.bearing_range import wrap_angle
 from .support.undo import Undo, to_the_end, undo_all, undone_on_error
@@ -366,8 +367,7 @@ def describe_map(landmarks: int, pose: Array, pose_covariance: Array) -> str:
     """
     std = np.sqrt(pose_covariance.diagonal().clip(0.0))
     x, y, heading = (f"{p:.3f} ± {s:.3f}" for p, s in zip(pose, std, strict=True))
-    noun = "landmark" if landmarks == 1 else "landmarks"
-    return f"{landmarks} {noun}, pose ({x} m, {y} m, {heading} rad)"
+    return f"{counted(landmarks, 'landmark')}, pose ({x} m, {y} m, {heading} rad)"
 
 
 def optional_members(estimator: SlamEstimator) -> dict[str, Any]:

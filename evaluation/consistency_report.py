@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.models.rigid_motion import ErrorFrame
 from ..estimator.support import argument_checks
+from ..suggestions import counted
 from . import hypothesis_tests as tests
-from .diagnosis import runs_text
 
 #: Number of runs below which the report warns that it finds large errors only.
 FEW_RUNS = 20
@@ -284,4 +284,4 @@ def _outcome(accepted: bool) -> str:
 def few_runs(runs: int) -> str:
     """Warn of a study with fewer than FEW_RUNS runs."""
     needed = f"at least {FEW_RUNS} are needed to find more than large errors"
-    return f"Only {runs_text(runs)}: {needed}."
+    return f"Only {counted(runs, 'run')}: {needed}."

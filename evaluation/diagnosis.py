@@ -24,6 +24,7 @@ from scipy.special import bdtrc, chdtri, stdtr
 
 from ..arrays import Array, BoolArray
 from ..estimator.support import argument_checks
+from ..suggestions import counted
 from . import noise_findings
 from .hypothesis_tests import time_average_test
 
@@ -152,7 +153,7 @@ def diagnose(
     sums = None if noise is None else _checked_sums(noise, len(pose))
     runs = len(pose)
     if runs < FEWEST_RUNS:
-        good = f"{runs_text(runs)} succeeded"
+        good = f"{counted(runs, 'run')} succeeded"
         text = f"cannot tell: {good}, and {FEWEST_RUNS} are needed."
         return Diagnosis(CANNOT_TELL, 1.0, text)
     errors = errors_of(pose, heading)
@@ -279,11 +280,6 @@ def _of_the_association(before: str, blame: Blame, errors: Errors) -> Diagnosis:
         "err no more than others."
     )
     return Diagnosis(CANNOT_TELL, errors.p_value, sentence)
-
-
-def runs_text(runs: int) -> str:
-    """Write a number of runs."""
-    return f"{runs} run{'s' * (runs != 1)}"
 
 
 def p_text(p_value: float) -> str:

@@ -16,6 +16,7 @@ from ..arrays import Array
 from ..estimator.models import rigid_motion
 from ..estimator.models.bearing_range import wrap_angle
 from ..evaluation.nees import pose_nees
+from ..suggestions import counted
 
 #: Drives from which on covariances are read in other conventions.
 FEWEST_DRIVES = 5
@@ -297,7 +298,7 @@ def _pose_readings(
     yield "poses in the frame of the start", moved, covariances, turn
     for shift, (others, theirs) in shifted.items():
         late, count = "late" if shift > 0 else "early", abs(shift)
-        name = f"time stamps that are {count} step{'s' * (count > 1)} too {late}"
+        name = f"time stamps that are {counted(count, 'step')} too {late}"
         yield name, others, theirs, np.eye(3)
 
 

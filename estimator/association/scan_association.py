@@ -150,9 +150,10 @@ class ScanAssociation:
         tentative = tentative.with_misses(chance)
         enough = (tentative.sightings >= needed) & (tentative.odds > ENTRY_ODDS)
         # Rows of no tentative landmark take the last entry.
-        labels = np.append(tentative.labels, NO_LABEL)[np.maximum(slots, -1)]
+        entries = np.maximum(slots, -1)
+        labels = np.append(tentative.labels, NO_LABEL)[entries]
         labels[fresh] = (self.scan << LABEL_BITS) + rows[fresh]
-        enters = np.append(enough, needed == 1)[np.maximum(slots, -1)]
+        enters = np.append(enough, needed == 1)[entries]
         outcomes = rows.tolist(), labels.tolist(), enters.tolist()
         for row, label, is_confirmed in zip(*outcomes, strict=True):
             self.labels[row] = label

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ...suggestions import counted
 from .. import trajectories
 from .monte_carlo import connected
 from .options import REQUIRED, Options, ScenarioName, declared, refuse_broken, takes
@@ -103,7 +104,7 @@ def _message(manifest: "Manifest", place: Path, size: int) -> str:
     job, shards = manifest.job, len(manifest.shards)
     return (
         f"{place}: {job.episodes:,} episodes of {job.scenario.steps:,} steps as "
-        f"{job.format}, {size / 1e6:,.1f} MB in {shards} shard{'s' * (shards > 1)}\n"
+        f"{job.format}, {size / 1e6:,.1f} MB in {counted(shards, 'shard')}\n"
         "from slamgym import load_trajectories\n"
         f'for trajectory in load_trajectories("{place.as_posix()}"): ...'
     )

@@ -22,6 +22,7 @@ from ...envs.rendering import BlittedFigure, scene
 from ...estimator.models.rigid_motion import rotation
 from ...evaluation.trajectory_error import PositionAccuracy, poses_at
 from ...sim_configs.scenario_files import replace_when_written
+from ...suggestions import counted
 from ..logs.ground_truth import path_accuracy
 from ..runs.log_smoothing import SmoothedLog
 from ..runs.trace import RunTrace
@@ -179,12 +180,11 @@ def _title(trace: RunTrace, step: int, stride: int) -> tuple[str, str]:
     thinned = f"  ·  1 pose in {stride} drawn" if stride > 1 else ""
     radius = 3 * np.sqrt(np.linalg.eigvalsh(now.covariances)[:, -1])
     size = f", 3σ within {radius.max():.2g} m" if len(now.ids) else ""
-    many = "landmark" if len(now.ids) == 1 else "landmarks"
     name = style.short_name(trace.estimator)
     return (
         f"Map and poses after step {step} of {trace.last_step}",
         f"{name}  ·  t = {trace.t[step]:.4g} {trace.time_unit}  ·  "
-        f"{len(now.ids)} {many}{size}{thinned}",
+        f"{counted(len(now.ids), 'landmark')}{size}{thinned}",
     )
 
 

@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from ...arrays import AnyArray, Array
-from ...evaluation.diagnosis import runs_text
 from ...evaluation.hypothesis_tests import (
     autocorrelation,
     average_band,
@@ -18,6 +17,7 @@ from ...evaluation.hypothesis_tests import (
     family_band,
     normal_scores,
 )
+from ...suggestions import counted
 from ..figures.style import ALARM, BLUE, GREY, INK, ORANGE, TEAL, dress, new_figure
 from .summary import summarise_monte_carlo
 from .verdict import POSE_FREEDOM, EstimatorScores, labels_of, scores_of
@@ -106,7 +106,7 @@ def report_figures(
 
 
 def _title(summary: dict[str, Any]) -> str:
-    runs = runs_text(summary["runs"])
+    runs = counted(summary["runs"], "run")
     return f"{summary['scenario']}, {runs} of {summary['steps']} steps"
 
 
@@ -151,7 +151,7 @@ def nees_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
     axes.axhspan(*band, color=GREY, alpha=0.25, lw=0, label="95 % band")
     if times := grid_steps(summary):
         wide = np.array(family_band(runs, POSE_FREEDOM, times)) / POSE_FREEDOM
-        label = f"95 % band, {times} step{'s' * (times > 1)}"
+        label = f"95 % band, {counted(times, 'step')}"
         for end, name in zip(wide, (label, None), strict=True):
             axes.axhline(end, color=GREY, lw=0.8, label=name)
     extremes = [band]

@@ -20,8 +20,9 @@ from rich.table import Table
 from rich.text import Text
 
 from ...evaluation.consistency_report import FEW_AVERAGES
-from ...evaluation.diagnosis import p_text, runs_text
+from ...evaluation.diagnosis import p_text
 from ...sim_configs.scenario_files import replace_when_written
+from ...suggestions import counted
 from ..figures import style
 from ..jobs import replace_own
 from .figures import MOST_DOTS, PURPLE, SKY, grid_steps, report_figures
@@ -201,7 +202,7 @@ def monte_carlo_table(summary: dict[str, Any]) -> Table:
     note = "Averages over runs and steps; heading and RMSE are root mean squares."
     table = Table(
         title=Text(
-            f"{summary['scenario']}: {runs_text(summary['runs'])} of "
+            f"{summary['scenario']}: {counted(summary['runs'], 'run')} of "
             f"{summary['steps']} steps, seed {summary['seed']}"
         ),
         caption=Text(f"{key}\n{note}{_no_bound(summary)}{_bad_run(summary)}".strip()),

@@ -26,10 +26,10 @@ import numpy as np
 from ... import __version__
 from ...arrays import Array
 from ...estimator.models.sensors import find_sensor
-from ...evaluation.diagnosis import runs_text
 from ...evaluation.noise_findings import CHANNELS, MOMENTS
 from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import replace_when_written, scenario_text
+from ...suggestions import counted
 from .. import jobs
 from ..runs.filter_settings import EstimatorChoice
 from . import run_measures
@@ -176,7 +176,7 @@ def attributes(job: Job, runs: range, command: str) -> dict[str, Any]:
     """Return the origin of results: all that is needed to reproduce them."""
     identity = job.identity()
     return {
-        "title": f"Monte Carlo of {job.scenario.name}, {runs_text(len(runs))}",
+        "title": f"Monte Carlo of {job.scenario.name}, {counted(len(runs), 'run')}",
         "scenario_name": job.scenario.name,
         "scenario": identity["scenario"],
         "assumed": identity["assumed"],

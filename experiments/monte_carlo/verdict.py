@@ -35,9 +35,9 @@ from ...evaluation.diagnosis import (
     diagnose,
     diverged_runs,
     p_text,
-    runs_text,
 )
 from ...evaluation.hypothesis_tests import EQUIVALENCE_MARGIN
+from ...suggestions import counted
 from ..runs.summary import MOST_REJECTED, NIS_RANGE, nis_suspicion
 from ..runs.trace import finite, quotient
 from .run_measures import KNOWN_IDS_ATE, KNOWN_IDS_NEES, PREFIX, SMALL_NOISE
@@ -90,14 +90,16 @@ def judge(report: ConsistencyReport | None, failed: int, runs: int) -> Verdict:
         Numbers of failed runs and of all runs.
     """
     if report is None:
-        good = f"{runs - failed} of {runs_text(runs)} succeeded"
+        good = f"{runs - failed} of {counted(runs, 'run')} succeeded"
         reason = f"{good}: too few to decide"
         return Verdict(NOT_SHOWN, reason)
     verdict = _verdict_on_successes(report)
     if not failed:
         return verdict
     word = verdict.word if verdict.word == NOT_CONSISTENT else NOT_SHOWN
-    others = f"{failed} of {runs_text(runs)} failed; of the others, {verdict.reason}"
+    others = (
+        f"{failed} of {counted(runs, 'run')} failed; of the others, {verdict.reason}"
+    )
     return Verdict(word, others)
 
 
@@ -305,7 +307,7 @@ def run_warnings(entries: Mapping[str, Mapping[str, Any]], runs: int) -> list[st
         return [*found, few_runs(runs)]
     for label, entry in entries.items():
         if (good := entry["good_runs"]) < FEW_RUNS:
-            some = f"only {runs_text(good)}" if good else "no run"
+            some = f"only {counted(good, 'run')}" if good else "no run"
             found.append(f"{label}: {some} succeeded; at least {FEW_RUNS} are needed.")
     return found
 
@@ -349,7 +351,7 @@ def _failed(label: str, entry: Mapping[str, Any], runs: int) -> str:
         others = sum(group["count"] for group in groups[_MOST_GROUPS:])
         named.append(f"{others} × other messages")
     failed = runs - entry["good_runs"]
-    return f"{label}: {failed} of {runs_text(runs)} failed: {'; '.join(named)}."
+    return f"{label}: {failed} of {counted(runs, 'run')} failed: {'; '.join(named)}."
 
 
 # --------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Find what a user names: import its path, or suggest the name that was meant."""
+"""Words of the user and for the user: import a path, suggest a name, count things."""
 
 from collections.abc import Iterable
 from difflib import SequenceMatcher
@@ -76,3 +76,14 @@ def imported(path: str, refusal: str, *, kind: bool = False) -> Any:
         raise ValueError(
             f"{refusal}{of_kind}{error}{hint if is_elsewhere else ''}"
         ) from error
+
+
+def counted(count: int, noun: str) -> str:
+    """Write how many there are of something.
+
+    Examples
+    --------
+    >>> counted(1, "run"), counted(2, "run")
+    ('1 run', '2 runs')
+    """
+    return f"{count} {noun}{'s' * (count != 1)}"
