@@ -187,11 +187,6 @@ def test_modules_are_imported_relatively_inside_the_package():
     assert [module for module in FILES if "slamgym" in libraries(module)] == []
 
 
-def test_modules_have_at_most_700_lines():
-    long = {m for m, file in FILES.items() if len(file.read_text().splitlines()) > 700}
-    assert not long
-
-
 def test_a_small_module_with_one_importer_is_part_of_it():
     importers = {
         module: [other for other, targets in graph().items() if module in targets]
