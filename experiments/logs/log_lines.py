@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
 import math
 import os
+import re
 import stat
 from os import PathLike
 from pathlib import Path
@@ -13,6 +15,8 @@ from ...sim_configs.scenario_files import replace_when_written
 
 MAX_ID_DIGITS = 18  # every such number fits int64
 MAX_SHOWN = 60  # characters of a wrong text that an error repeats
+_COMMENT = re.compile(r"#|%|//")
+_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 class LogError(ValueError):
@@ -102,11 +106,63 @@ def to_lines(text: str, file: str) -> list[LogLine]:
     >>> [line.number for line in to_lines("a\n\n  b\n", "notes.txt")]
     [1, 3]
     """
+    if "\n" not in text:
+        text = text.replace("\r", "\n")
     stripped = (line.strip() for line in text.split("\n"))
     lines = [LogLine(file, k, line) for k, line in enumerate(stripped, 1) if line]
     if not lines:
         raise LogLine(file, 1, "").error("rows", "an empty file")
     return lines
+
+
+def content_of(lines: list[LogLine]) -> list[LogLine]:
+    r"""Return lines without comments, and without a first row of column names.
+
+    A comment begins with ``#``, ``%`` or ``//``, and ends with its line.
+
+    Raises
+    ------
+    LogError
+        If no line is left.
+
+    Examples
+    --------
+    >>> lines = to_lines("# by hand\nt x y\n0 1 2  # start\n", "path.txt")
+    >>> [line.text for line in content_of(lines)]
+    ['0 1 2']
+    """
+    found = []
+    for line in lines:
+        text = line.text
+        if _COMMENT.search(text):
+            text = _COMMENT.split(text, maxsplit=1)[0].strip()
+        if text:
+            found.append(line._replace(text=text))
+    if not found:
+        raise lines[0].error("rows", "comments only")
+    is_header = not any(map(is_number, split_fields(found[0].text)))
+    return found[1:] if is_header and len(found) > 1 else found
+
+
+def split_fields(text: str) -> list[str]:
+    """Split a line at its commas, semicolons or tabs, or else at white space.
+
+    Examples
+    --------
+    >>> split_fields("1, 2,,3"), split_fields("1 2  3")
+    (['1', '2', '', '3'], ['1', '2', '3'])
+    """
+    separator = next((mark for mark in ",;\t" if mark in text), None)
+    return [field.strip() for field in text.split(separator)]
+
+
+def is_number(field: str) -> bool:
+    """Whether a field is a number, finite or not."""
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
 
 
 class ReadFile(PathLike[str]):
@@ -135,21 +191,22 @@ class ReadFile(PathLike[str]):
 
 
 def read_lines(path: str | PathLike[str]) -> list[LogLine]:
-    """Read the lines of a UTF-8 text file that are not blank.
+    """Read the lines of a text file in UTF-8, or marked UTF-16, that are not blank.
 
     Raises
     ------
     LogError
-        If the file is no UTF-8 text, empty, or a device.
+        If the file is no such text, empty, or a device.
     OSError
         If the file cannot be opened.
     """
     data = (path if isinstance(path, ReadFile) else ReadFile(path)).content
     try:
-        text = data.decode("utf-8-sig")
+        text = data.decode("utf-16" if data.startswith(_UTF_16) else "utf-8-sig")
     except UnicodeDecodeError as error:
         line = LogLine(str(path), data.count(b"\n", 0, error.start) + 1, "")
-        raise line.error("UTF-8 text", f"byte 0x{data[error.start]:02x}") from None
+        byte = f"byte 0x{data[error.start]:02x}: save the file as UTF-8"
+        raise line.error("UTF-8 text", byte) from None
     return to_lines(text, str(path))
 
 

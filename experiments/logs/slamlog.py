@@ -4,7 +4,8 @@ A `SlamLog` holds events, odometry rows and scans, and the truth if it is known;
 `read_slamlog` and `write_slamlog` read and write it. Every importer returns one.
 
 A CSV file with a header of ``# key: value`` lines, the first one
-``# format: slamlog 1``, and rows of five kinds, named by their first field::
+``# format: slamlog 1``, and rows of five kinds, named by their first field. Other
+lines that begin with ``#`` are comments::
 
     landmark,id,x,y                             true position
     odometry,t,d,alpha,dt                       drive and turn until t
@@ -213,11 +214,14 @@ class _SlamlogParser:
 
     def _take_header(self, line: LogLine) -> None:
         key, colon, _ = line.text[1:].partition(":")
-        if not colon or not key.strip():
-            raise line.error("# key: value", shown(line.text))
-        if key.strip() in self.header:
-            raise line.error("each key of the header once", f"{key.strip()} again")
-        self.header[key.strip()] = line
+        key = key.strip()
+        if not colon or not key:  # a comment
+            if key.partition(" ")[0] in KNOWN_KEYS:
+                raise line.error("# key: value", shown(line.text))
+            return
+        if key in self.header:
+            raise line.error("each key of the header once", f"{key} again")
+        self.header[key] = line
 
     def _take_landmark(self, line: LogLine, fields: list[str]) -> None:
         landmark_id = line.to_id(fields[0])
@@ -265,13 +269,29 @@ class _SlamlogParser:
 
 #: Keys of the header whose values must be numbers.
 _NOISES = {"motion_std", "measurement_std", "start_sigma", "range_std_per_metre"}
+#: Keys of the header that have a meaning.
+KNOWN_KEYS = _NOISES | {
+    *("format", "name", "motion", "start", "sensor", "bearing_std_metres"),
+    *("noise_at_rest", "groundtruth_offset", "identities"),
+}
+
+
+def format_line_of(lines: list[LogLine]) -> int | None:
+    """Return the place of the line of the format among the first comments, if any."""
+    for place, line in enumerate(lines):
+        if not line.text.startswith("#"):
+            return None
+        if "".join(line.text.split()) == "".join(FORMAT_LINE.split()):
+            return place
+    return None
 
 
 def _parse(lines: list[LogLine], default_name: str) -> SlamLog:
-    if "".join(lines[0].text.split()) != "".join(FORMAT_LINE.split()):
+    place = format_line_of(lines)
+    if place is None:
         raise lines[0].error(FORMAT_LINE, shown(lines[0].text))
     parser = _SlamlogParser()
-    for line in lines[1:]:
+    for line in (*lines[:place], *lines[place + 1 :]):
         parser.take(line)
     notes = {key: _value(line) for key, line in parser.header.items()}
     for key in _NOISES & notes.keys():

@@ -410,8 +410,7 @@ def refuse_other_formats(path: str | PathLike[str]) -> None:
         If the file is no slamlog 1.
     """
     is_file = Path(path).is_file()
-    first = "".join(read_lines(path)[0].text.split()) if is_file else ""
-    if first != "".join(slamlog.FORMAT_LINE.split()):
+    if not is_file or slamlog.format_line_of(read_lines(path)) is None:
         raise slamlog.LogError(
             f"{path}: only the header of a slamlog 1 holds a noise; slamgym replay "
             "writes one of any log, log.csv"

@@ -315,12 +315,9 @@ def test_g2o_words_mean_the_same(file):
     ("line", "message"),
     [
         ("EDGE2 1 5 1 0 0 1 0 0 1 0 1",
-         "expected odometry from pose 3, got from pose 1"),
+         "expected odometry between the consecutive poses 3 and 5, got no such edge"),
         ("EDGE2 3 3 1 0 0", "expected odometry to a new pose, got to pose 3"),
-        ("ODOMETRY 1 5 1 0 0 1 0 0 1 0 1",
-         "expected odometry from pose 3, got from pose 1"),
-        ("ODOMETRY 3 0 1 0 0 1 0 0 1 0 1",
-         "expected odometry to a new pose, got to pose 0"),
+        ("BR 3 7 1 2 3", r"expected BR i j bearing range \[σβ σr\]"),
         ("LANDMARK 9 4 1 0 1 0 1", "expected a pose of the odometry, got pose 9"),
         ("LANDMARK 3 4 1 0 1 0 1",
          "expected each landmark once per scan, got id 4 again"),
@@ -332,6 +329,121 @@ def test_g2o_words_mean_the_same(file):
 def test_wrong_isam_line_is_named(file, line, message):
     with pytest.raises(LogError, match=f"line 6: {message}"):
         read_log(file(ISAM + line + "\n"))
+
+
+def turning_graph(rng, poses=9):
+    """Return the lines of a drive with three landmarks, and of closures."""
+    edges, readings = [], []
+    for i in range(poses):
+        dx, dy, turn = rng.normal(size=3)
+        information = "100 0 0 100 0 900"
+        if i + 1 < poses:
+            edges.append(f"EDGE_SE2 {i} {i + 1} {dx} {dy} {turn} {information}")
+        if i > 2:
+            edges.append(f"EDGE_SE2 {i - 2} {i} {dy} {dx} {turn} {information}")
+        readings += [
+            f"EDGE_SE2_XY {i} {j} {rng.normal()} {rng.normal()} 9 0 9"
+            for j in (20, 21, 22)
+        ]
+    return [f"VERTEX_SE2 {i} 0 0 0" for i in range(poses)], edges, readings
+
+
+def test_a_shuffled_graph_is_the_same_drive_to_the_bit(file):
+    rng = np.random.default_rng(0)
+    lines = [line for part in turning_graph(rng) for line in part]
+    first = read_log(file("\n".join(lines)), noise_from_file=True)
+    assert first.header["left_out"] == "6 loop closures between poses"
+    for _ in range(5):
+        rng.shuffle(lines)
+        again = read_log(file("\n".join(lines)), noise_from_file=True)
+        assert again.header == first.header
+        assert_events_agree(again.events, first.events, tolerance=0)
+
+
+def test_loop_closures_may_lead_ahead_of_the_odometry(file):
+    _, edges, readings = turning_graph(np.random.default_rng(1))
+    drive = [edge for edge in edges if int(edge.split()[2]) == int(edge.split()[1]) + 1]
+    closures = [edge for edge in edges if edge not in drive]
+    ahead = read_log(file("\n".join([*closures, *drive, *readings])))
+    assert_events_agree(
+        ahead.events, read_log(file("\n".join([*drive, *readings]))).events, 0
+    )
+
+
+def test_a_reversed_edge_is_the_inverse_motion(file):
+    turned = rotated(-0.5) @ (-1, -0.25)
+    text = ISAM.replace("0 1 1 0 0.5", "0 1 1 0.25 0.5")
+    back = f"1 0 {turned[0]!r} {turned[1]!r} -0.5".replace("np.float64", "")
+    back = back.replace("(", "").replace(")", "")
+    reversed_edge = text.replace("0 1 1 0.25 0.5", back)
+    assert reversed_edge != text
+    log = read_log(file(text))
+    assert_events_agree(read_log(file(reversed_edge)).events, log.events, 1e-15)
+
+
+def test_of_two_edges_between_neighbours_the_odometry_leads_forward(file):
+    log = read_log(file("EDGE2 1 0 9 9 9\n" + ISAM.replace("ODOMETRY", "EDGE2")))
+    assert_events_agree(log.events, read_log(file(ISAM)).events, tolerance=0)
+    assert log.header["left_out"] == "1 loop closures between poses"
+
+
+def test_odometry_whose_ids_do_not_grow_is_followed_from_line_to_line(file):
+    falling = ISAM.replace("ODOMETRY 0 1", "ODOMETRY 9 1").replace("1 3 -2", "1 5 -2")
+    log = read_log(file(falling.replace("LANDMARK 3", "LANDMARK 5")))
+    assert_events_agree(log.events, read_log(file(ISAM)).events, tolerance=0)
+
+
+def test_bearings_and_ranges_of_gtsam_are_those_of_positions(file):
+    polar = ISAM.replace("LANDMARK 1 2 3 4 1.5 0 1.5", f"BR 1 2 {math.atan2(4, 3)} 5")
+    log = read_log(file(polar))
+    assert_events_agree(log.events, read_log(file(ISAM)).events, tolerance=0)
+
+
+def test_measured_poses_of_a_graph_are_left_out_and_counted(file):
+    log = read_log(file("PARAMS_SE2OFFSET 0 0 0 0\nEDGE_PRIOR_SE2 0 1 2 3\n" + ISAM))
+    assert_events_agree(log.events, read_log(file(ISAM)).events, tolerance=0)
+    assert log.header["left_out"] == "1 measured poses"
+
+
+COMMENTED = {
+    "course": "0.1 2 -0.3 4\n3 0.5\n0.2 3 -0.2 5\n",
+    "freiburg": FREIBURG,
+    "isam": ISAM,
+    "slamlog": "# format: slamlog 1\nodometry,1,3,0,1\nmeasurement,1,4,0.1,2\n",
+}
+
+
+@pytest.mark.parametrize("name", COMMENTED)
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: "# recorded by hand, in the hall\n\n" + text,
+        lambda text: text.replace("\n", "\n# later\n\n"),
+        lambda text: "\ufeff" + text.replace("\n", "\r\n"),
+        lambda text: text.replace("\n", "\r"),
+        lambda text: text.encode("utf-16"),
+    ],
+    ids=["top", "later", "windows", "old mac", "utf-16"],
+)
+def test_comments_blank_lines_and_line_ends_change_nothing(file, name, change):
+    log = read_log(file(COMMENTED[name]))
+    changed = change(COMMENTED[name])
+    path = file("")
+    path.write_bytes(changed if isinstance(changed, bytes) else changed.encode())
+    assert_events_agree(read_log(path).events, log.events, tolerance=0)
+
+
+@pytest.mark.parametrize("name", ["course", "freiburg", "isam"])
+def test_other_comments_and_a_row_of_names_change_nothing(file, name):
+    text = COMMENTED[name]
+    log = read_log(file("a b c d\n% later\n// and\n" + text.replace("\n", " # end\n")))
+    assert_events_agree(log.events, read_log(file(text)).events, tolerance=0)
+
+
+def test_comments_in_the_world_of_freiburg_change_nothing(file):
+    file("# the world\nid x y\n1 0 2  # first\n\n# and\n3 4 5\n", "world.dat")
+    log = read_log(file(FREIBURG))
+    assert log.landmarks.tolist() == [[0, 2], [4, 5]]
 
 
 def test_a_landmark_of_a_graph_that_no_edge_reads_is_named(tmp_path):
@@ -416,6 +528,9 @@ NOISE_OF_INFORMATION = [
     # TORO: information in another order, for a turn of the drive by 90°
     TORO,
     TORO.replace(" ", "\t"),
+    # the same drive as a reversed edge, in the frame of its own second pose
+    "EDGE_SE2 1 0 0 1 -1.5707963267948966 2500 0 0 400 0 10000\n"
+    f"BR 1 2 {math.atan2(4, 3)} 5 0.02 0.1\n",
     # g2o: information in the frame of the second pose
     f"EDGE_SE2 0 1 1 0 {math.pi / 2} 400 0 0 2500 0 10000\n"
     "EDGE_SE2_XY 1 2 3 4 100 0 100\n",

@@ -197,7 +197,7 @@ def test_every_float_survives_the_round_trip(tmp_path_factory, numbers, dt):
          "expected t >= 1.0, the ground truth before, got 0.5"),
         ("groundtruth,1,,2,3", "expected a finite number, got ''"),
         ("odometer,1,3,0,1", "expected a row of landmark, odometry, measurement"),
-        ("# a note", "expected # key: value, got '# a note'"),
+        ("# motion_std .1,.1,0", "expected # key: value, got '# motion_std .1,.1,0'"),
         ("# unit: m", "expected each key of the header once, got unit again"),
         ("# motion: arc", "expected turn-last, midpoint or a drive, got 'arc'"),
         ("# motion_std: 0.1,oops,0", "expected a finite number, got 'oops'"),

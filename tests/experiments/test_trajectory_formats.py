@@ -272,10 +272,11 @@ def turning(seed):
     return drives("loop", "open_loop", seeds=(seed,), **TURNING)[0]
 
 
-def test_our_own_importer_reads_the_graph(tmp_path):
+@pytest.mark.parametrize("end", ["", "_gtsam"])
+def test_our_own_importer_reads_the_graph(tmp_path, end):
     drive = turning(0)
     fmt("g2o").write([drive], tmp_path / "shard")
-    log = read_log(tmp_path / "shard" / "seed_00000000.g2o")
+    log = read_log(tmp_path / "shard" / f"seed_00000000{end}.g2o")
     moves = [e for e in log.events if isinstance(e, OdometryRow) and e.dt == 1.0]
     assert [move.d for move in moves] == drive.odometry[:, 0].tolist()
     assert [move.alpha for move in moves] == drive.odometry[:, 1].tolist()
@@ -297,10 +298,11 @@ def test_our_own_importer_reads_the_truth_of_the_graph(tmp_path):
     np.testing.assert_array_equal(log.start, drive.poses[0])
 
 
-def test_our_own_importer_reads_the_noise_of_the_graph(tmp_path):
+@pytest.mark.parametrize("end", ["", "_gtsam"])
+def test_our_own_importer_reads_the_noise_of_the_graph(tmp_path, end):
     drive = turning(0)
     fmt("g2o").write([drive], tmp_path / "shard")
-    graph = tmp_path / "shard" / "seed_00000000.g2o"
+    graph = tmp_path / "shard" / f"seed_00000000{end}.g2o"
     header = read_log(graph, noise_from_file=True).header
     world = drive.scenario
     for text, std in (

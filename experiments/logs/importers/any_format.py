@@ -74,7 +74,7 @@ def read_log(
         kind = "victoria" if (source / victoria_park.DRIVE).is_file() else "utias"
     else:
         path = log_lines.ReadFile(path)
-        kind = _format_of(log_lines.read_lines(path)[0])
+        kind = _format_of(log_lines.read_lines(path))
     graph_text = "a graph, iSAM or g2o text"
     for name, is_given, needed, what in (
         ("robot", robot is not None, "utias", "a UTIAS folder"),
@@ -100,14 +100,17 @@ def read_log(
     )
 
 
-def _format_of(line: log_lines.LogLine) -> str:
-    """Detect the format from the first line of a file."""
+def _format_of(lines: list[log_lines.LogLine]) -> str:
+    """Detect the format from the first line of a file that is no comment."""
+    if slamlog.format_line_of(lines) is not None:
+        return "slamlog"
+    line = log_lines.content_of(lines)[0]
     tag, *fields = line.text.split()
-    if line.text.startswith("#") or "," in line.text:
+    if "," in line.text:
         return "slamlog"
     if (tag, len(fields)) == ("ODOMETRY", 3) or tag == "SENSOR":
         return "freiburg"
-    if tag in graph.GRAPH_TAGS:
+    if tag in graph.GRAPH_TAGS or tag.startswith(graph.PREFIXES):
         return "isam"
     try:
         np.array([tag, *fields], dtype=np.float64)

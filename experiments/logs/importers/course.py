@@ -16,7 +16,7 @@ import numpy as np
 
 from ....arrays import Array, IntArray
 from .. import slamlog
-from ..log_lines import read_lines, shown
+from ..log_lines import content_of, read_lines, shown
 
 #: Ground truth that the homework prints for the six landmarks of its log [m].
 PUBLISHED_LANDMARKS = np.array([[3, 6], [3, 12], [7, 8], [7, 14], [11, 6], [11, 12.0]])
@@ -48,7 +48,7 @@ def read_course(path: str | PathLike[str]) -> slamlog.SlamLog:
     OSError
         If the file cannot be opened.
     """
-    lines = read_lines(path)
+    lines = content_of(read_lines(path))
     count = len(lines[0].text.split())
     if count % 2:
         raise lines[0].error("pairs of bearing and range", f"{count} numbers")
@@ -133,7 +133,7 @@ def read_freiburg(path: str | PathLike[str]) -> slamlog.SlamLog:
         If the file cannot be opened.
     """
     recorder, step = slamlog.EventRecorder(), 0
-    for line in read_lines(path):
+    for line in content_of(read_lines(path)):
         kind, *fields = line.text.split()
         if kind not in ROW_FORMS:
             raise line.error(" or ".join(ROW_FORMS.values()), shown(line.text))
@@ -171,7 +171,7 @@ def read_world(path: str | PathLike[str]) -> tuple[IntArray, Array]:
         If the file cannot be opened.
     """
     positions: dict[int, tuple[float, float]] = {}
-    for line in read_lines(path):
+    for line in content_of(read_lines(path)):
         fields = line.text.split()
         line.check_count(fields, (3,), "id x y")
         landmark_id = line.to_id(fields[0])

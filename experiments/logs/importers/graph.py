@@ -2,9 +2,10 @@
 
 Lines ``ODOMETRY i j dx dy dθ …`` or ``EDGE2`` (pose j in the frame of pose i) and
 ``LANDMARK i j x y …`` (landmark j in the frame of pose i), or ``EDGE_SE2`` and
-``EDGE_SE2_XY``. The information matrices at the ends of the lines are ignored unless
-asked for, and so are the estimates in ``VERTEX`` and ``FIX`` lines. `sort_lines` sorts
-the lines of a file by kind.
+``EDGE_SE2_XY``, or GTSAM's ``BR i j bearing range …``. The lines may have any order.
+The information at their ends is ignored unless asked for, and so are the estimates in
+``VERTEX`` lines, and ``FIX`` and ``PARAMS`` lines. `sort_lines` sorts the lines of a
+file by kind.
 """
 
 from __future__ import annotations
@@ -12,21 +13,27 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from os import PathLike
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from ....arrays import Array
 from .. import slamlog
-from ..log_lines import LogLine, read_lines, shown
+from ..log_lines import LogLine, content_of, read_lines, shown
 
 EDGE_TAGS = ("EDGE_SE2", "EDGE2")
 ODOMETRY_TAGS = ("ODOMETRY", *EDGE_TAGS)
-LANDMARK_TAGS = ("LANDMARK", "EDGE_SE2_XY")
+LANDMARK_TAGS = ("LANDMARK", "EDGE_SE2_XY", "BR")
 POSE_TAGS = ("VERTEX2", "VERTEX_SE2")
 VERTEX_TAGS = (*POSE_TAGS, "VERTEX_XY")
 GRAPH_TAGS = (*ODOMETRY_TAGS, *LANDMARK_TAGS, *VERTEX_TAGS, "FIX")
+#: Of g2o: frames of sensors, and measured poses.
+UNUSED = ("PARAMS_", "EDGE_PRIOR_")
+#: By which a line of any graph begins, planar or not.
+PREFIXES = ("EDGE", "VERTEX", "PARAMS_")
 
 
 @dataclass
@@ -43,12 +50,15 @@ class Graph:
         Landmarks in the frame of a pose, by the id of that pose.
     vertices : list of LogLine
         Values of poses and landmarks: estimates, or the truth.
+    priors : int
+        Number of measured poses, which are not read.
     """
 
     lines: list[LogLine]
     edges: list[LogLine] = field(default_factory=list)
     readings: dict[int, list[LogLine]] = field(default_factory=dict)
     vertices: list[LogLine] = field(default_factory=list)
+    priors: int = 0
 
 
 def sort_lines(lines: list[LogLine]) -> Graph:
@@ -66,28 +76,46 @@ def sort_lines(lines: list[LogLine]) -> Graph:
             line.check_count(fields, (5, 11), f"{tag} i j dx dy dθ [6 of information]")
             graph.edges.append(line)
         elif tag in LANDMARK_TAGS:
-            line.check_count(fields, (4, 7), f"{tag} i j x y [3 of information]")
+            is_polar = tag == "BR"
+            form = "bearing range [σβ σr]" if is_polar else "x y [3 of information]"
+            line.check_count(fields, (4, 6 if is_polar else 7), f"{tag} i j {form}")
             graph.readings.setdefault(id_at(line, 1), []).append(line)
         elif tag in VERTEX_TAGS:
             graph.vertices.append(line)
+        elif tag.startswith(UNUSED):
+            graph.priors += tag.startswith("EDGE")
         elif tag != "FIX":
-            raise line.error(" or ".join(GRAPH_TAGS), shown(line.text))
+            planar = " of a planar graph" if "SE3" in tag else ""
+            raise line.error(" or ".join(GRAPH_TAGS) + planar, shown(line.text))
     return graph
 
 
-def chain_of(graph: Graph) -> tuple[list[LogLine], dict[int, int], int]:
-    """Follow the odometry of a graph from pose to pose, in the order of the file.
+class Increment(NamedTuple):
+    """The motion of one step, and the line that it comes from."""
+
+    #: The edge, in either direction.
+    line: LogLine
+    #: The new pose (dx, dy, dθ) in the frame of the old one [m, m, rad].
+    motion: tuple[float, float, float]
+
+
+def chain_of(graph: Graph) -> tuple[list[Increment], dict[int, int], int]:
+    """Follow the odometry of a graph from pose to pose.
+
+    Odometry is the edge between two poses whose ids are next to each other, in either
+    direction, wherever it stands. Of several such edges it is an ``ODOMETRY`` line, or
+    one that leads forward. If the ids do not grow along the drive, every edge must
+    begin at the end of the edge before it.
 
     Returns
     -------
-    chain : list of LogLine
-        One edge per step.
+    chain : list of Increment
+        One per step.
     steps : dict of int to int
         The step after which the robot is at a pose, by the id of the pose; 0 for the
         first pose.
     closures : int
-        Number of other edges between poses of the chain: loop closures, which are in
-        ``EDGE`` lines.
+        Number of other edges between poses of the chain: loop closures.
 
     Raises
     ------
@@ -96,22 +124,52 @@ def chain_of(graph: Graph) -> tuple[list[LogLine], dict[int, int], int]:
     """
     if not graph.edges:
         raise graph.lines[-1].error("odometry", "the end of the file")
-    pose = id_at(graph.edges[0], 1)
-    chain: list[LogLine] = []
-    steps, closures = {pose: 0}, 0
+    between: dict[tuple[int, int], LogLine] = {}
     for line in graph.edges:
-        start, end = id_at(line, 1), id_at(line, 2)
-        is_edge = line.text.split()[0] in EDGE_TAGS
-        if is_edge and start != end and {start, end} <= steps.keys():
-            closures += 1
-            continue
-        if start != pose:
-            raise line.error(f"odometry from pose {pose}", f"from pose {start}")
-        if end in steps:
-            raise line.error("odometry to a new pose", f"to pose {end} again")
-        chain.append(line)
-        pose, steps[end] = end, len(chain)
-    return chain, steps, closures
+        i, j = id_at(line, 1), id_at(line, 2)
+        if i == j:
+            raise line.error("odometry to a new pose", f"to pose {j} again")
+        pair = (min(i, j), max(i, j))
+        between[pair] = min(line, between.get(pair, line), key=_rank)
+    poses = sorted({pose for pair in between for pose in pair})
+    pairs = list(pairwise(poses))
+    if not between.keys() >= set(pairs):
+        starts, ends = (
+            [id_at(line, place) for line in graph.edges] for place in (1, 2)
+        )
+        poses = [starts[0], *ends]
+        if starts[1:] != ends[:-1] or len(set(poses)) < len(poses):
+            raise _gap(graph, next(pair for pair in pairs if pair not in between))
+        pairs = list(pairwise(poses))
+    chain = [_increment(between[min(pair), max(pair)], start=pair[0]) for pair in pairs]
+    steps = {pose: step for step, pose in enumerate(poses)}
+    return chain, steps, len(graph.edges) - len(chain)
+
+
+def _rank(line: LogLine) -> tuple[object, ...]:
+    """Order the edges between two poses: the first one is the odometry."""
+    tag, start, end, *numbers = line.text.split()
+    return tag != "ODOMETRY", int(start) > int(end), -len(numbers), numbers
+
+
+def _gap(graph: Graph, pair: tuple[int, int]) -> slamlog.LogError:
+    """Return the error that no edge leads from one pose to the next."""
+    at_end = (
+        line for line in graph.edges if pair[1] in (id_at(line, 1), id_at(line, 2))
+    )
+    return next(at_end).error(
+        f"odometry between the consecutive poses {pair[0]} and {pair[1]}",
+        "no such edge in the file",
+    )
+
+
+def _increment(line: LogLine, *, start: int) -> Increment:
+    """Return the motion of an edge from its pose ``start`` to the other one."""
+    dx, dy, turn = reals_at(line, 3, 6)
+    if id_at(line, 1) == start:
+        return Increment(line, (dx, dy, turn))
+    cos, sin = math.cos(turn), math.sin(turn)
+    return Increment(line, (-cos * dx - sin * dy, sin * dx - cos * dy, -turn))
 
 
 def unread_landmarks(graph: Graph) -> list[int]:
@@ -141,12 +199,13 @@ def reals_at(line: LogLine, first: int, end: int | None = None) -> list[float]:
 # a unit vector u. For odometry u is along and across the drive, and in the turn; for a
 # reading it is along and across the line of sight. Correlations are ignored.
 #
-# Three conventions are in use:
+# Four conventions are in use:
 #
 # * iSAM's ``ODOMETRY``, ``EDGE2`` and ``LANDMARK`` lines hold the upper triangular R of
 #   Ω = Rᵀ R by rows, in the frame of pose i.
 # * g2o's ``EDGE_SE2`` and ``EDGE_SE2_XY`` lines hold the upper triangle of Ω by rows;
 #   that of an ``EDGE_SE2`` is in the frame of pose j.
+# * GTSAM's ``BR`` lines hold the standard deviations of bearing and range.
 # * A file with ``VERTEX2`` lines is TORO's, whose ``EDGE2`` lines hold Ω in the order
 #   xx, xy, yy, θθ, xθ, yθ.
 
@@ -158,7 +217,7 @@ _ROWS = {2: (0, 1, 1, 2), 3: (0, 1, 2, 1, 3, 4, 2, 4, 5)}
 _TORO_ROWS = (0, 1, 4, 1, 2, 5, 4, 5, 3)
 
 
-def noise_header(graph: Graph, chain: Sequence[LogLine]) -> dict[str, str]:
+def noise_header(graph: Graph, chain: Sequence[Increment]) -> dict[str, str]:
     """Return the noise of a graph as entries of a log's header.
 
     Each standard deviation is the median over the lines. Readings have the bearing
@@ -178,7 +237,7 @@ def noise_header(graph: Graph, chain: Sequence[LogLine]) -> dict[str, str]:
         If a line has no information, or a singular or indefinite one.
     """
     is_toro = any(line.text.split()[0] == "VERTEX2" for line in graph.vertices)
-    motion = np.array([_motion_std(line, is_toro=is_toro) for line in chain])
+    motion = np.array([_motion_std(each.line, is_toro=is_toro) for each in chain])
     header = {"motion_std": slamlog.numbers(*np.median(motion, axis=0))}
     are_alike = _alike(motion)
     lines = [line for at_pose in graph.readings.values() for line in at_pose]
@@ -202,7 +261,10 @@ def _sensor_noise(lines: Sequence[LogLine]) -> tuple[dict[str, str], Array]:
 
 
 def _motion_std(line: LogLine, *, is_toro: bool) -> Array:
-    """Return (σx, σy, σα) along the drive, across, and of the turn."""
+    """Return (σx, σy, σα) along the drive, across, and of the turn.
+
+    They do not depend on the direction of the edge.
+    """
     dx, dy, turn = reals_at(line, 3, 6)
     angle = math.atan(dy / dx) if dx else math.copysign(math.pi / 2, dy) * (dy != 0)
     tag = line.text.split()[0]
@@ -215,10 +277,17 @@ def _motion_std(line: LogLine, *, is_toro: bool) -> Array:
 
 def _reading_std(line: LogLine) -> Array:
     """Return the standard deviations of the bearing, across, and of the range."""
-    x, y = reals_at(line, 3, 5)
-    distance = math.hypot(x, y)
+    _, distance = polar_at(line)
     if not distance:
         raise line.error("a landmark away from its pose", "distance 0")
+    if line.text.startswith("BR"):
+        stds = reals_at(line, 5)
+        if not (stds and min(stds) > 0):
+            raise line.error(
+                "standard deviations > 0 at the end of the line", line.text
+            )
+        return np.array([stds[0], distance * stds[0], stds[1]])
+    x, y = reals_at(line, 3, 5)
     cos, sin = x / distance, y / distance
     kind = ISAM if line.text.split()[0] == "LANDMARK" else G2O
     across, along = _stds(line, 5, kind, np.array([(-sin, cos), (cos, sin)]))
@@ -291,7 +360,7 @@ def with_truth(
     OSError
         If it cannot be opened.
     """
-    graph = sort_lines(read_lines(path))
+    graph = sort_lines(content_of(read_lines(path)))
     poses, places = _values(graph)
     if not poses:
         poses = _composed(graph)
@@ -334,8 +403,7 @@ def _composed(graph: Graph) -> dict[int, Point]:
     """Return the poses that exact odometry leads to, by id."""
     chain, steps, _ = chain_of(graph)
     poses: list[Point] = [(0.0, 0.0, 0.0)]
-    for line in chain:
-        dx, dy, turn = reals_at(line, 3, 6)
+    for _, (dx, dy, turn) in chain:
         poses.append((*_to_world(poses[-1], dx, dy), poses[-1][2] + turn))
     return {i: poses[step] for i, step in steps.items()}
 
@@ -347,7 +415,12 @@ def _seen_places(graph: Graph, poses: Mapping[int, Point]) -> dict[int, Point]:
         for line in lines:
             if pose not in poses:
                 raise line.error("a pose of the odometry", f"pose {pose}")
-            place = _to_world(poses[pose], *reals_at(line, 3, 5))
+            first, second = reals_at(line, 3, 5)
+            if line.text.startswith("BR"):
+                bearing, distance = first, second
+                first = distance * math.cos(bearing)
+                second = distance * math.sin(bearing)
+            place = _to_world(poses[pose], first, second)
             places.setdefault(id_at(line, 2), place)
     return places
 
@@ -364,16 +437,18 @@ def read_isam(
     truth: str | PathLike[str] | None = None,
     noise_from_file: bool = False,
 ) -> slamlog.SlamLog:
-    """Read a graph whose odometry lines form one chain of poses.
+    """Read a graph whose odometry forms one chain of poses.
 
     Poses and landmarks share one sequence of ids in many files: landmarks keep theirs,
     while poses are renumbered, so that pose k has t = k. An increment (dx, dy, dθ)
     becomes two turn-last rows, (0, φ) with dt = 0 and (d, dθ - φ) with dt = 1, where
     d (cos φ, sin φ) = (dx, dy) and φ in [-π/2, π/2]; d < 0 means driving backwards.
 
-    Loop closures, edges between two poses that were both visited before, are left out
-    and counted in the header (``left_out``): a filter has no use for them. Landmarks
-    that have a vertex, but no edge, are named there too.
+    The order of the lines has no meaning: see :func:`.graph.chain_of` for the odometry,
+    and a scan is in the order of its landmarks' ids. Loop closures, the other edges
+    between poses, are left out and counted in the header (``left_out``): a filter has
+    no use for them. So are measured poses. Landmarks that have a vertex, but no edge,
+    are named there too.
 
     Parameters
     ----------
@@ -401,16 +476,18 @@ def read_isam(
     OSError
         If a file cannot be opened.
     """
-    graph = sort_lines(read_lines(path))
-    chain, steps, closures = chain_of(graph)
-    header = {"source": "iSAM or g2o text", "truth": "none"}
-    if closures and not graph.readings:
+    graph = sort_lines(content_of(read_lines(path)))
+    poses = {id_at(line, place) for line in graph.edges for place in (1, 2)}
+    if len(graph.edges) >= max(len(poses), 1) and not graph.readings:
         raise graph.lines[-1].error(
-            "readings of landmarks, as a filter has no use for loop closures "
-            "between poses",
+            "readings of landmarks, as a filter has no use for loop closures between "
+            f"poses: {', '.join(LANDMARK_TAGS)} lines",
             "the end of the file",
         )
+    chain, steps, closures = chain_of(graph)
+    header = {"source": "iSAM or g2o text", "truth": "none"}
     left_out = [f"{closures} loop closures between poses"] * bool(closures)
+    left_out += [f"{graph.priors} measured poses"] * bool(graph.priors)
     left_out += [f"landmark {i}, which no edge reads" for i in unread_landmarks(graph)]
     if left_out:
         header["left_out"] = "; ".join(left_out)
@@ -423,7 +500,7 @@ def read_isam(
 
 
 def _events(
-    graph: Graph, chain: list[LogLine], steps: dict[int, int]
+    graph: Graph, chain: list[Increment], steps: dict[int, int]
 ) -> tuple[slamlog.Event, ...]:
     """Follow the chain of poses, and record the readings of each pose."""
     for pose in graph.readings.keys() - steps.keys():
@@ -432,16 +509,25 @@ def _events(
     for pose, step in steps.items():
         if step:
             _take_increment(recorder, chain[step - 1], step)
-        for line in graph.readings.get(pose, []):
-            x, y = reals_at(line, 3, 5)
-            polar = slamlog.wrap_bearing(math.atan2(y, x)), math.hypot(x, y)
-            reading = slamlog.Reading(float(step), id_at(line, 2), *polar)
+        for line in sorted(graph.readings.get(pose, []), key=lambda at: id_at(at, 2)):
+            reading = slamlog.Reading(float(step), id_at(line, 2), *polar_at(line))
             recorder.add_reading(line, reading)
     return recorder.finish()
 
 
-def _take_increment(recorder: slamlog.EventRecorder, line: LogLine, step: int) -> None:
-    dx, dy, turn = reals_at(line, 3, 6)
+def polar_at(line: LogLine) -> tuple[float, float]:
+    """Return bearing and range of the landmark in a line [rad, m]."""
+    first, second = reals_at(line, 3, 5)
+    if line.text.startswith("BR"):
+        return slamlog.wrap_bearing(first), second
+    bearing = slamlog.wrap_bearing(math.atan2(second, first))
+    return bearing, math.hypot(first, second)
+
+
+def _take_increment(
+    recorder: slamlog.EventRecorder, increment: Increment, step: int
+) -> None:
+    line, (dx, dy, turn) = increment
     sign = -1.0 if dx < 0 else 1.0
     direction = math.atan2(sign * dy, abs(dx))
     distance = sign * math.hypot(dx, dy)

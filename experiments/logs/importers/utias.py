@@ -232,12 +232,9 @@ def _timed_lines(path: Path, form: str) -> list[log_lines.LogLine]:
 
 def _lines(path: Path, form: str) -> list[log_lines.LogLine]:
     """Read all lines except comments; refuse other numbers of fields than `form`."""
-    read = log_lines.read_lines(there(path))
-    lines = [line for line in read if not line.text.startswith("#")]
+    lines = log_lines.content_of(log_lines.read_lines(there(path)))
     for line in lines:
         line.check_count(line.text.split(), (len(form.split()),), form)
-    if not lines:
-        raise slamlog.LogError(f"{path}: expected rows {form}, got comments only")
     return lines
 
 
