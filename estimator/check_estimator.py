@@ -23,7 +23,7 @@ from .models.bearing_range import predict_measurement, wrap_angle
 from .models.motions import predict_pose
 from .registry import find_estimator, read_label
 
-__all__ = ["EstimatorContractError", "Finding", "check_estimator"]
+__all__ = ["EstimatorContractError", "Finding", "check_estimator", "find_breaches"]
 __dir__ = __all__.copy
 
 Factory = Callable[..., Any]
@@ -120,13 +120,7 @@ def check_estimator(factory: Factory | str) -> tuple[Finding, ...]:
     >>> check_estimator(EkfSlam)
     ()
     """
-    if isinstance(factory, str):
-        name, options = read_label(factory)
-        factory = partial(find_estimator(name), **options)
-    if not callable(factory):
-        raise TypeError(
-            f"factory must be callable, such as an estimator's class, got {factory!r}"
-        )
+    factory = _callable(factory)
     findings = find_breaches(factory)
     if any(finding.level != "recommended" for finding in findings):
         raise EstimatorContractError(listed(factory, findings), findings)
@@ -134,9 +128,22 @@ def check_estimator(factory: Factory | str) -> tuple[Finding, ...]:
 
 
 def find_breaches(
-    factory: Factory, levels: Sequence[Level] = ("required", "correct", "recommended")
+    factory: Factory | str,
+    levels: Sequence[Level] = ("required", "correct", "recommended"),
 ) -> tuple[Finding, ...]:
-    """Return the findings of all checks of some levels, each cause once."""
+    """Return what `check_estimator` finds at some levels, and raise nothing for it.
+
+    Examples
+    --------
+    >>> from slamgym.estimator import EkfSlam
+    >>> class AddsNoNoise(EkfSlam):
+    ...     def predict(self, odometry, dt=1.0):
+    ...         super().predict(odometry, 0.0)
+    >>> finding = find_breaches(AddsNoNoise, ["correct"])[0]
+    >>> finding.message.partition(": covariance")[0]
+    'predict(): the motion noise is missing'
+    """
+    factory = _callable(factory)
     found: dict[object, Finding] = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # nan that a check looks for
@@ -146,6 +153,18 @@ def find_breaches(
                     cause = getattr(result, "cause", result)
                     found.setdefault(cause, Finding(level, str(result)))
     return tuple(found.values())
+
+
+def _callable(factory: Factory | str) -> Factory:
+    """Return the factory of a name, or what is given if it is one."""
+    if isinstance(factory, str):
+        name, options = read_label(factory)
+        return partial(find_estimator(name), **options)
+    if not callable(factory):
+        raise TypeError(
+            f"factory must be callable, such as an estimator's class, got {factory!r}"
+        )
+    return factory
 
 
 def listed(factory: Factory, findings: Sequence[Finding]) -> str:
