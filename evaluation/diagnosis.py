@@ -11,6 +11,10 @@ The tests answer three questions in this order.
    what it was, and the filter knows this (`excess_of`)?  An excess that vanishes is of
    the linearisation.  One that stays is of a wrong Jacobian or covariance: both
    scale with the noise.  One that grows is of a wrong model, whose errors do not.
+   With a hundredth of the noise, nearly every filter is linear, and decides.
+
+A cause is named only if it explains what the errors show: its sign and its size must
+agree with them, and an interval must show that an excess vanishes.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ from typing import NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import bdtrc, chdtri, stdtr
+from scipy.special import bdtrc, chdtri, stdtr, stdtrit
 
 from ..arrays import Array, BoolArray
 from ..estimator.support import argument_checks
@@ -87,6 +91,9 @@ class SmallNoise(NamedTuple):
     heading_nees: ArrayLike
     #: Of all noises, and of the deviations of the first pose.
     factor: float = 0.1
+    #: The same runs with more noise than this but less than in the world, if they were
+    #: repeated before.
+    larger: SmallNoise | None = None
 
 
 def diagnose(
@@ -159,9 +166,12 @@ def diagnose(
     errors = errors_of(pose, heading)
     findings = noise_findings.significant_findings
     guilty = [] if sums is None else findings(sums, NOISE_RATE)
-    if guilty:
-        return _of_the_noise(guilty, errors)
-    before = "" if sums is None else "the noise is as assumed, but "
+    agreeing = [f for f in guilty if _explains(f, errors)]
+    most = max((f.at_most for f in agreeing), default=1.0)
+    if agreeing and not _exceeds(pose, heading, _SLACK * most):
+        return _of_the_noise(agreeing, guilty, errors)
+    others = tuple(dict.fromkeys(f.cause for f in guilty))
+    before = "" if sums is None else _before(agreeing or guilty, errors)
     blame = _blamed(pose, nees, mistakes, known_nees)
     knowledge = np.asarray(
         [] if heading_knowledge is None else heading_knowledge, float
@@ -169,23 +179,28 @@ def diagnose(
     spurious = spurious_knowledge(knowledge) if knowledge.size else None
     p_value = smallest_adjusted(errors, spurious, blame)
     if p_value >= FILTER_RATE and not rejected:
-        return _of_consistent_errors(before, p_value, nis_ratio or 0.0, blame)
+        return _of_consistent_errors(before, p_value, nis_ratio or 0.0)
     if _is_of_the_association(blame, errors):
         return _of_the_association(before, blame, errors)
-    if p_value >= FILTER_RATE and 1 / LEAST_RATIO < errors.ratio < LEAST_RATIO:
-        text = f"{before}a test rejects the filter, although {errors.text}."
-        return Diagnosis(CANNOT_TELL, p_value, f"cannot tell: {text}")
-    what = f"{before}{errors.text} ({p_text(p_value)})"
+    shown = p_value if p_value < FILTER_RATE else errors.p_of_one
+    if shown >= FILTER_RATE or (
+        p_value >= FILTER_RATE and 1 / LEAST_RATIO < errors.ratio < LEAST_RATIO
+    ):
+        text = f"{before}a test rejects the filter, although on average {errors.text}"
+        sentence = f"cannot tell: {text} ({p_text(errors.p_of_one)})."
+        return Diagnosis(CANNOT_TELL, p_value, sentence, others)
+    what = f"{before}{errors.text} ({p_text(shown)})"
     what += _also(knowledge, spurious, nis_ratio)
     if small_noise is None:
         cause, text = CANNOT_TELL, _WITHOUT_SMALL_NOISE
     else:
-        cause, text = excess_of(pose, heading, small_noise, nis_ratio or 0.0)
-    repeat = runs_to_repeat(pose, heading) if cause == CANNOT_TELL else 0
+        cause, text = excess_of(pose, heading, small_noise, nis_ratio or 0.0, most)
+    repeat = runs_to_repeat(pose, heading, small_noise, cause)
     if cause == WRONG_COVARIANCE and p_value >= FILTER_RATE:
         # The repeated runs have the same random numbers: what is chance stays, too.
         cause, text = CANNOT_TELL, f"{text} It may be chance: try another seed."
-    return Diagnosis(cause, p_value, f"{cause}: {what}. {text}", repeat=repeat)
+    sentence = f"{cause}: {what}. {text}"
+    return Diagnosis(cause, shown, sentence, others, repeat)
 
 
 def _blamed(
@@ -234,29 +249,66 @@ def _checked(nees: ArrayLike, heading_nees: ArrayLike) -> tuple[Array, Array]:
     return pose[:, first:], heading[:, np.isfinite(heading).all(axis=0)]
 
 
-def _of_the_noise(guilty: list[noise_findings.Finding], errors: Errors) -> Diagnosis:
-    """Answer by the finding with the largest effect."""
-    first = guilty[0]
-    others = dict.fromkeys(f.cause for f in guilty[1:] if f.cause != first.cause)
+#: Times of what a wrong size of noise explains that errors of a nonlinear filter reach.
+_SLACK = 2.0
+
+
+def _explains(finding: noise_findings.Finding, errors: Errors) -> bool:
+    """Whether a fault of the noise changes the errors in the way that they show."""
+    if errors.p_value >= FILTER_RATE:
+        return True
+    return finding.sign != (-1 if errors.ratio > 1 else 1)
+
+
+def _exceeds(pose: Array, heading: Array, most: float) -> bool:
+    """Whether the squared errors are shown to be larger than a number of times."""
+    return math.isfinite(most) and any(
+        score.mean() > most
+        and _beyond_margin(score.mean(axis=1) / most) < FILTER_RATE / 2
+        for score in [pose / POSE] + [heading] * bool(heading.size)
+    )
+
+
+def _before(findings: list[noise_findings.Finding], errors: Errors) -> str:
+    """Write what is known about the noise, which does not explain the errors."""
+    if not findings:
+        return "the noise is as assumed, but "
+    first = findings[0]
+    found = f"{first.text} ({p_text(first.p_value)})"
+    if not _explains(first, errors):
+        change = "smaller" if errors.ratio > 1 else "larger"
+        return f"{found}, which makes errors {change} than stated, but "
+    return f"{found}, which explains at most {first.at_most:.3g} times, but "
+
+
+def _of_the_noise(
+    agreeing: list[noise_findings.Finding],
+    guilty: list[noise_findings.Finding],
+    errors: Errors,
+) -> Diagnosis:
+    """Answer by the largest finding of those that explain the errors."""
+    first = agreeing[0]
+    others = dict.fromkeys(f.cause for f in guilty if f.cause != first.cause)
     also = f"; also {', '.join(others)}" if others else ""
     found = f"{first.cause}: {first.text} ({p_text(first.p_value)})"
     sentence = f"{found}{also}; {errors.text}."
     return Diagnosis(first.cause, first.p_value, sentence, tuple(others))
 
 
-def _of_consistent_errors(
-    before: str, p_value: float, nis_ratio: float, blame: Blame | None
-) -> Diagnosis:
-    """Return the answer for errors that no test rejects: honest, if the NIS agrees."""
+def _of_consistent_errors(before: str, p_value: float, nis_ratio: float) -> Diagnosis:
+    """Return the answer for errors that no test rejects, whatever the NIS is.
+
+    The NIS of a reading that is far from linear is large even if the filter corrects
+    its belief well.
+    """
     agree = before.removesuffix(", but ") + ", and " if before else ""
     agree += "the errors agree with the covariances"
-    if blame is not None or nis_ratio <= LARGEST_NIS:
-        return Diagnosis(HONEST, p_value, f"honest: {agree}.")
-    sentence = (
-        f"cannot tell: {agree}, but the squared innovations are {nis_ratio:.3g} times "
-        "too large: the filter may not use the noise that it is given."
-    )
-    return Diagnosis(CANNOT_TELL, p_value, sentence)
+    if nis_ratio > LARGEST_NIS:
+        agree += (
+            f", although the reported squared innovations are {nis_ratio:.3g} times "
+            "what is expected"
+        )
+    return Diagnosis(HONEST, p_value, f"honest: {agree}.")
 
 
 def _is_of_the_association(blame: Blame | None, errors: Errors) -> TypeGuard[Blame]:
@@ -307,13 +359,15 @@ KNOWABLE = 0.9
 #: A run has diverged if its NEES has a smaller p-value than the first number. The
 #: second is the accepted share of such runs.
 DIVERGED_LEVEL, DIVERGED_RATE = 1e-4, 1e-3
-#: Factors on the excess NEES when the noise is reduced: below the first, the excess is
-#: due to the linearisation; above the second, to a wrong model.
-SHRINKS, GROWS = 0.5, 3.0
+#: An excess that vanishes with the noise falls below this share. What is left of it
+#: is at most a quarter, or .25, and never more than .5.
+SHRINKS = 0.5
+_LEFT, _LEAST_LEFT, _MOST_LEFT = 0.25, 0.25, 0.5
 SMALLEST_NOISE = 0.01
 _CLEARLY, _MOST = 2.0, 0.75
 _FEWEST_OF_A_KIND = 5
 _FEWEST_DIVERGED = 2
+_FEW_LOST = 0.05  # share of diverged runs that do not count with less noise
 
 
 class Errors(NamedTuple):
@@ -326,6 +380,8 @@ class Errors(NamedTuple):
     diverged: int
     #: "pose" or "heading".
     of: str
+    #: That their averages are 1, without the margin of a tenth.
+    p_of_one: float
 
     @property
     def text(self) -> str:
@@ -373,7 +429,9 @@ def errors_of(pose: Array, heading: Array) -> Errors:
     ratios = [float(average.mean()) for average in averages]
     ratio = max(ratios, key=lambda x: abs(np.log(x)))
     of = ("pose", "heading")[ratios.index(ratio)]
-    return Errors(min(1.0, len(p_values) * min(p_values)), ratio, diverged, of)
+    p_of_one = len(averages) * min(time_average_test(a, 1).p_value for a in averages)
+    p_value = min(1.0, len(p_values) * min(p_values))
+    return Errors(p_value, ratio, diverged, of, min(1.0, p_of_one))
 
 
 def diverged_runs(pose: Array) -> BoolArray:
@@ -386,17 +444,27 @@ def diverged_runs(pose: Array) -> BoolArray:
     return np.asarray(pose.mean(axis=1) > chdtri(POSE, DIVERGED_LEVEL))
 
 
-def runs_to_repeat(pose: Array, heading: Array) -> int:
-    """Return how many of the first runs show what is left of the excess.
+def runs_to_repeat(
+    pose: Array, heading: Array, small: SmallNoise | None = None, cause: str = ""
+) -> int:
+    """Return how many of the first runs to repeat with less noise, 0 for none.
 
-    They are a tenth of the runs, at least 10, where most runs err clearly; otherwise as
-    many as show half of the excess in 90 % of cases, or five diverged runs.
+    At first, they are a tenth of the runs, at least 10, where most runs err clearly;
+    otherwise as many as show half of the excess in 90 % of cases, or five diverged
+    runs.  An excess that does not vanish is repeated with still less noise; one that
+    seems to vanish then needs as many runs as show it in 90 % of cases.
 
     Parameters
     ----------
     pose, heading : ndarray, shape (M, K), (M, L)
         As for `errors_of`.
+    small : SmallNoise, optional
+        Of runs that were repeated before.
+    cause : str
+        To which they point.
     """
+    if small is not None and cause == LINEARISATION:
+        return 0
     score, few = _averages(pose, heading), max(10, len(pose) // 10)
     diverged = np.flatnonzero(diverged_runs(pose))
     if np.median(score) > _CLEARLY:
@@ -406,18 +474,49 @@ def runs_to_repeat(pose: Array, heading: Array) -> int:
     else:
         excess = max(abs(float(score.mean()) - 1), LEAST_RATIO - 1)
         needed = math.ceil((3.5 * float(score.std()) / excess) ** 2)
+    if small is not None:
+        if small.factor <= SMALLEST_NOISE and cause != CANNOT_TELL:
+            return 0
+        needed = max(needed, _runs_to_show(pose, heading, small))
+        known = int(np.isfinite(np.asarray(small.nees, float)).sum())
+        if small.factor <= SMALLEST_NOISE and min(needed, len(pose)) <= known:
+            return 0
     return min(max(needed, few), len(pose))
 
 
+def _runs_to_show(pose: Array, heading: Array, small: SmallNoise) -> int:
+    """Return how many runs show in 90 % of cases that an excess vanishes."""
+    needed = 0.0
+    for _, before, after in _pairs(pose, heading, small):
+        left, known = _left(float(before.mean())), after[np.isfinite(after)]
+        if len(known) >= _FEWEST_OF_A_KIND and abs(np.median(known) - 1) < 1:
+            needed = max(needed, (3.0 * float(known.std()) / left) ** 2)
+    return math.ceil(needed)
+
+
+def _left(ratio: float) -> float:
+    """Return the largest excess that counts as none, after a ratio with all noise."""
+    return float(np.clip(_LEFT * abs(ratio - 1), _LEAST_LEFT, _MOST_LEFT))
+
+
 def excess_of(
-    pose: Array, heading: Array, small: SmallNoise, nis_ratio: float = 0.0
+    pose: Array,
+    heading: Array,
+    small: SmallNoise,
+    nis_ratio: float = 0.0,
+    of_the_noise: float = 1.0,
 ) -> tuple[str, str]:
     """Compare the errors of the same runs with much and with little noise.
 
     With the average NEES per degree a of a run and b with less noise, the excess b − 1
-    is tested against the shares `SHRINKS` and `GROWS` of a − 1 (t-test over runs).  If
-    most runs err clearly, or if some diverged, the answer is what most of these runs
-    show, because a few of them make the average.
+    is tested against shares of a − 1 (t-test over runs): `SHRINKS`, and one over the
+    factor by which the noise is smaller, the mean of what a wrong covariance and a
+    wrong model do.  If there are runs with two factors, a is that of the larger one: a
+    filter that diverges with all noise is no measure.  If most runs err clearly, or if
+    some diverged, the answer is what most of these runs show, because a few of them
+    make the average.
+
+    An excess vanishes only if the 90 % interval of b shows that it is small.
 
     Parameters
     ----------
@@ -428,6 +527,8 @@ def excess_of(
     nis_ratio : float
         Sum of all NIS divided by their degrees of freedom.  Linearisation hardly
         changes the size of innovations.
+    of_the_noise : float
+        Ratio that wrong sizes of the noise explain, >= 1.
 
     Returns
     -------
@@ -436,53 +537,138 @@ def excess_of(
     sentence : str
     """
     errors, diverged = errors_of(pose, heading), diverged_runs(pose)
-    both = {
-        "pose": np.asarray(small.nees, float) / POSE,
-        "heading": np.asarray(small.heading_nees, float),
-    }
-    is_known = np.isfinite(both[errors.of])
+    pairs = _pairs(pose, heading, small)
+    after = {name: values / of_the_noise for name, _, values in pairs}
+    is_known = np.isfinite(after[errors.of])
     if is_known.sum() < _FEWEST_OF_A_KIND:
         return CANNOT_TELL, "Too few runs succeed with less noise."
-    many, few = _averages(pose, heading)[is_known], both[errors.of][is_known]
-    change = _change(many, few, diverged[is_known], 1.0 if errors.ratio > 1 else -1.0)
-    ratio = float(few.mean())
-    rests = [
-        float(rest.mean())
-        for rest in (each[is_known] for each in both.values())
-        if rest.mean() > LEAST_RATIO and _beyond_margin(rest) < _ERROR_RATE / len(both)
-    ]
-    remains = bool(rests)
-    if remains and change == "shrinks":
-        ratio = max(rests)
-    share = "a tenth" if small.factor == 0.1 else f"{100 * small.factor:.0f} %"
-    found = f"With {share} of the noise, the squared errors are {ratio:.3g} times"
-    if change == "grows":
+    sign = 1.0 if errors.ratio > 1 else -1.0
+    rest = _rest_of(after, is_known, errors.of, sign)
+    found = rest.text(small.factor, of_the_noise)
+    many, factor = _averages(pose, heading), small.factor
+    of_all = _change(many, after[errors.of], diverged, sign)
+    if small.larger is not None:
+        many = _averages_of(small.larger)[errors.of]
+        factor /= small.larger.factor
+        share = _share(small.larger.factor)
+        found += f", for {np.nanmean(many):.3g} times with {share}"
+    if _change(many, after[errors.of], diverged, sign, 1 / factor) == "grows":
         return WRONG_MODEL, (
             f"{found}, and thus do not shrink with it: a model of the filter is wrong, "
             "such as a bias, a sign, an offset or a delay."
         )
-    if change == "stays" or (
-        change == "shrinks" and remains and small.factor <= SMALLEST_NOISE
-    ):
+    is_off = rest.remains or (rest.low > 1 if sign > 0 else rest.high < 1)
+    is_left = rest.remains and small.factor <= SMALLEST_NOISE
+    if (of_all == "stays" and is_off) or (of_all == "shrinks" and is_left):
+        left = "the excess stays" if of_all == "stays" else "some of the excess stays"
         return WRONG_COVARIANCE, (
-            f"{found}, so the excess stays: a Jacobian or a covariance of the filter "
-            "is wrong."
+            f"{found}, so {left}: a Jacobian or a covariance of the filter is wrong."
         )
-    if change != "shrinks" or remains:
+    is_small = all(
+        _is_small(float(before.mean()), after[name][rest.kept], sign)
+        for name, before, _ in pairs
+    )
+    if of_all != "shrinks" or rest.remains or not is_small:
         return CANNOT_TELL, f"{found}, which does not show the cause."
     if nis_ratio > np.sqrt(max(errors.ratio, 1.0)):
         return CANNOT_TELL, (
             f"{found}, but the innovations are too large for linearisation: is an "
             "angle not wrapped?"
         )
-    if ratio > max(errors.ratio, 1.0):  # a few runs diverge with less noise, too
-        typical = f"those of the median run are {np.median(few):.3g} times"
-        found = f"With {share} of the noise, {typical}"
     return LINEARISATION, f"{found}, so the excess vanishes with the noise."
 
 
-def _change(many: Array, few: Array, diverged: BoolArray, sign: float) -> str:
+class _Rest(NamedTuple):
+    """What less noise leaves of the errors, NEES per degree."""
+
+    #: "pose" or "heading".
+    of: str
+    ratio: float
+    #: 90 % interval of the ratio.
+    low: float
+    high: float
+    #: Whether they still differ from 1, in the same direction.
+    remains: bool
+    #: Runs that count.
+    kept: BoolArray
+    #: Number of diverged runs, and whether these few do not count.
+    diverged: int
+    few_diverged: bool
+
+    def text(self, factor: float, times: float) -> str:
+        """Write the finding; the noise explains a number of times of it."""
+        ratio, low, high = (times * x for x in (self.ratio, self.low, self.high))
+        found = (
+            f"With {_share(factor)} of the noise, the squared errors of the {self.of} "
+            f"are {ratio:.3g} times"
+        )
+        if self.remains and self.low < 1 < self.high:  # a few runs make the average
+            return f"{found}, and {self.diverged} of {self.kept.sum()} runs diverged"
+        found += f" (90 % interval {low:.3g} to {high:.3g})"
+        if self.diverged and self.few_diverged:
+            found += f" but for {counted(self.diverged, 'diverged run')}"
+        return found
+
+
+def _rest_of(
+    after: dict[str, Array], is_known: BoolArray, of: str, sign: float
+) -> _Rest:
+    """Summarise the errors with less noise; a few runs that diverge do not count."""
+    lost = is_known & diverged_runs(POSE * after["pose"][:, None])
+    few_lost = lost.sum() <= _FEW_LOST * is_known.sum()
+    kept = is_known & ~lost if few_lost else is_known
+    heading = after["heading"][kept, None] if "heading" in after else np.empty((0, 0))
+    errors = errors_of(POSE * after["pose"][kept, None], heading)
+    remains = errors.p_value < _ERROR_RATE and (errors.ratio - 1) * sign > 0
+    of = errors.of if remains else of
+    ratio, interval = float(after[of][kept].mean()), _interval(after[of][kept])
+    return _Rest(of, ratio, *interval, remains, kept, int(lost.sum()), bool(few_lost))
+
+
+def _share(factor: float) -> str:
+    return "a tenth" if factor == 0.1 else f"{100 * factor:.0f} %"
+
+
+def _averages_of(small: SmallNoise) -> dict[str, Array]:
+    """Return NEES per degree with less noise, (M,), of pose and heading."""
+    return {
+        "pose": np.asarray(small.nees, float) / POSE,
+        "heading": np.asarray(small.heading_nees, float),
+    }
+
+
+def _pairs(
+    pose: Array, heading: Array, small: SmallNoise
+) -> list[tuple[str, Array, Array]]:
+    """Return what is known of each run: name, NEES per degree, and with less noise."""
+    after = _averages_of(small)
+    found = [("pose", pose.mean(axis=1) / POSE, after["pose"])]
+    if heading.size and np.isfinite(after["heading"]).any():
+        found.append(("heading", heading.mean(axis=1), after["heading"]))
+    return found
+
+
+def _interval(values: Array) -> tuple[float, float]:
+    """Return the 90 % interval of a mean."""
+    half = stdtrit(len(values) - 1, 0.95) * values.std(ddof=1) / np.sqrt(len(values))
+    return float(max(values.mean() - half, 0.0)), float(values.mean() + half)
+
+
+def _is_small(before: float, after: Array, sign: float) -> bool:
+    """Whether the interval of the mean shows that nothing is left of an excess."""
+    low, high = _interval(after)
+    left = _left(before)
+    return high <= 1 + left if sign > 0 else low >= 1 - left
+
+
+def _change(
+    many: Array, few: Array, diverged: BoolArray, sign: float, grows: float = math.inf
+) -> str:
     """Return whether the excess "grows", "shrinks" or "stays", else ""."""
+    known = np.isfinite(many) & np.isfinite(few)
+    many, few, diverged = many[known], few[known], diverged[known]
+    if len(few) < _FEWEST_OF_A_KIND:
+        return ""
     before, after = sign * (many - 1), sign * (few - 1)
     chosen = np.ones(len(few), np.bool_)
     if np.median(many) <= _CLEARLY and diverged.sum() >= _FEWEST_DIVERGED:
@@ -490,14 +676,14 @@ def _change(many: Array, few: Array, diverged: BoolArray, sign: float) -> str:
     if np.median(many[chosen]) > _CLEARLY:
         share = after[chosen] / before[chosen]
         shows = {
-            "grows": share > GROWS,
+            "grows": share > grows,
             "shrinks": share < SHRINKS,
-            "stays": (share >= SHRINKS) & (share <= GROWS),
+            "stays": (share >= SHRINKS) & (share <= grows),
         }
         for change, runs in shows.items():
             if runs.mean() > _MOST:
                 return change
-    if _is_positive(few - 1 - GROWS * abs(before.mean())):
+    if math.isfinite(grows) and _is_positive(few - 1 - grows * abs(before.mean())):
         return "grows"
     if _is_positive(after - SHRINKS * before):
         return "stays"

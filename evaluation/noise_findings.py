@@ -51,6 +51,10 @@ class Finding(NamedTuple):
     matters: bool
     #: What is wrong, to follow "because".
     text: str
+    #: 1 if it makes errors larger than the covariances state, -1 if smaller, else 0.
+    sign: int = 1
+    #: Ratio of the NEES of a linear filter that it explains, at most.
+    at_most: float = np.inf
 
 
 def noise_findings(sums: Array) -> list[Finding]:
@@ -123,6 +127,7 @@ def _correlation(
         abs(rho) >= _LEAST_CORRELATION,
         f"successive errors of {_SYMBOLS[channel]} have a correlation of {rho:.2g}, "
         "where the filter assumes none",
+        sign=0,
     )
 
 
@@ -137,6 +142,8 @@ def _size(channel: str, count: float, variance: float) -> Finding:
         abs(float(np.log(max(variance, 1e-12)))),
         abs(variance - 1) >= _LEAST_VARIANCE,
         f"{_SYMBOLS[channel]} is {np.sqrt(variance):.3g} times what it assumes",
+        1 if variance > 1 else -1,
+        max(variance, 1.0),
     )
 
 
@@ -187,6 +194,7 @@ def _tails(
         kurtosis - 3 >= _LEAST_KURTOSIS,
         f"the noise of {_SYMBOLS[channel]} has a kurtosis of {kurtosis:.3g}, a normal "
         "one 3",
+        sign=0,
     )
 
 

@@ -146,6 +146,9 @@ SMALL_NOISE: dict[str, Variable] = {
     "small_noise_heading_nees": Variable(RUN, "f8", "mean NEES of the heading"),
     "small_noise_factor": Variable(RUN, "f8", "of all noise, nan if not repeated"),
 }
+#: The same of runs with more noise than these, but less than in the world.
+LARGER = "larger_"
+SMALL_NOISE |= {f"{LARGER}{name}": each for name, each in SMALL_NOISE.items()}
 
 
 def variables_of(scenario: Scenario) -> dict[str, Variable]:

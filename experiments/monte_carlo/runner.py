@@ -45,6 +45,7 @@ from .results import (
     write_results,
 )
 from .run_measures import (
+    LARGER,
     ORACLE,
     SMALL_NOISE,
     Block,
@@ -58,8 +59,9 @@ if TYPE_CHECKING:
 
 
 BLOCK_SIZE = 64
-#: Factors of all noise; the second is used if the first decides nothing.
-LESS_NOISE = 0.1, SMALLEST_NOISE
+#: Factors of all noise: each is used if those before do not decide, the last with more
+#: runs.
+LESS_NOISE = 0.1, SMALLEST_NOISE, SMALLEST_NOISE
 #: Attribute of results, but of no file: share of the time for runs with less noise.
 SMALL_NOISE_SHARE = "small_noise_share"
 EACH_RUN = "estimator", "run"
@@ -241,7 +243,10 @@ def _repeated(
             )
             averages = averages_of(scores_of(small, choice.label, "invariant"))
             averages["small_noise_factor"] = np.full(count, factor)
+            is_smaller = np.nanmin(found["small_noise_factor"][row], initial=1) > factor
             for name, values in averages.items():
+                if is_smaller:
+                    found[f"{LARGER}{name}"][row] = found[name][row]
                 found[name][row, :count] = values
     if np.isnan(found["small_noise_factor"]).all():
         return {}, {}

@@ -40,7 +40,7 @@ from ...evaluation.hypothesis_tests import EQUIVALENCE_MARGIN
 from ...suggestions import counted
 from ..runs.summary import MOST_REJECTED, NIS_RANGE, nis_suspicion
 from ..runs.trace import finite, quotient
-from .run_measures import KNOWN_IDS_ATE, KNOWN_IDS_NEES, PREFIX, SMALL_NOISE
+from .run_measures import KNOWN_IDS_ATE, KNOWN_IDS_NEES, LARGER, PREFIX, SMALL_NOISE
 
 CONSISTENT = "consistent"
 NEARLY = "nearly consistent"
@@ -325,7 +325,14 @@ def _suspicions(entry: Mapping[str, Any]) -> Iterator[str]:
         )
     if nis is not None and not NIS_RANGE[0] <= nis <= NIS_RANGE[1]:
         associates = is_managed or bool(entry.get("association"))
-        yield f"the {nis_suspicion(nis, associates=associates)}"
+        if entry.get("verdict") == CONSISTENT:
+            yield (
+                f"its NIS is {nis:.3g} per degree of freedom, where 1 is expected, but "
+                "its errors agree with its covariances: the NIS may be that of "
+                "readings far from linear, or reported wrongly."
+            )
+        else:
+            yield f"the {nis_suspicion(nis, associates=associates)}"
     yield from _split_map(entry.get("association") or {})
 
 
@@ -467,12 +474,14 @@ def diagnosis_of(
 
 def _small_noise(scores: EstimatorScores, frame: ErrorFrame) -> SmallNoise | None:
     """Return the errors of the runs that were repeated with less noise, if any."""
-    name = f"small_noise_nees_{frame}"
-    if name not in scores.results or np.isnan(scores.per_run(name)).all():
-        return None
-    factor = float(np.nanmin(scores.per_run("small_noise_factor")))
-    heading = scores.per_run("small_noise_heading_nees")
-    return SmallNoise(scores.per_run(name), heading, factor)
+    found = None
+    for prefix in (LARGER, ""):
+        name = f"{prefix}small_noise_nees_{frame}"
+        if name in scores.results and not np.isnan(scores.per_run(name)).all():
+            factor = float(np.nanmin(scores.per_run(f"{prefix}small_noise_factor")))
+            heading = scores.per_run(f"{prefix}small_noise_heading_nees")
+            found = SmallNoise(scores.per_run(name), heading, factor, found)
+    return found
 
 
 def runs_to_repeat(scores: EstimatorScores) -> int:
@@ -497,7 +506,7 @@ def averages_of(scores: EstimatorScores) -> dict[str, Array]:
         Those of `SMALL_NOISE`, shape (runs,).
     """
     found = {}
-    for name in SMALL_NOISE:
+    for name in (name for name in SMALL_NOISE if not name.startswith(LARGER)):
         source = name.replace("small_noise_nees", "pose_nees")
         source = source.removeprefix("small_noise_")
         if source in scores.results:

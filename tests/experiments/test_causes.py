@@ -1,5 +1,6 @@
 """Faults of worlds, found by a Monte Carlo whose filters do not know them."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -80,6 +81,78 @@ class Offset(EkfSlam):
     def update(self, measurements, landmark_ids=None):
         rows = np.array(measurements, float).reshape(-1, 2)
         return super().update(rows + np.array([0.01, 0.0]), landmark_ids)
+
+
+NUMBER = r"(\d[\d.]*(?:e[+-]\d+)?)"
+
+
+def refutations(entry):
+    """Read the figures of a cause, and list those that contradict it."""
+    cause, text = entry["diagnosis"]["cause"], entry["diagnosis"]["sentence"]
+    if cause in ("honest", "cannot tell"):
+        return []
+    found = ["the verdict is consistent"] * (entry["verdict"] == "consistent")
+    before = float(re.search(rf"are {NUMBER} times what the cov", text)[1])
+    chance = [float(p) for p in re.findall(rf"\(p [=<] {NUMBER}\)", text)]
+    found += ["it may be chance"] * (min(chance) > 0.05)
+    sizes = [float(size) for size in re.findall(rf"σ\w is {NUMBER} times", text)]
+    if cause.endswith("too small"):
+        found += ["the noise is smaller"] * (sizes[0] <= 1)
+        found += ["the errors are smaller"] * (before < 0.9)
+    if cause.endswith("too large"):
+        found += ["the noise is larger"] * (sizes[0] >= 1)
+        found += ["the errors are larger"] * (before > 1.1)
+    if (less := re.search(rf"of the noise, .*? are {NUMBER} times", text)) is None:
+        return found
+    after, tenth = float(less[1]), re.search(rf"for {NUMBER} times with a tenth", text)
+    interval = re.search(rf"interval {NUMBER} to {NUMBER}\)", text)
+    low, high = [after, after] if interval is None else map(float, interval.groups())
+    if cause == "linearisation":
+        found += ["an excess may remain"] * (not 0.5 < low < 1.25 or not high < 1.55)
+        found += ["it does not shrink"] * (abs(after - 1) >= abs(before - 1))
+    if cause == "wrong covariance":
+        diverged = re.search(r"and (\d+) of \d+ runs diverged, ", text)
+        found += ["nothing may remain"] * (low <= 1 <= high and diverged is None)
+    if cause == "wrong model":
+        former = before if tenth is None else float(tenth[1])
+        found += ["it does not grow"] * (after <= 5 * former)
+    return found
+
+
+class Swapped(EkfSlam):
+    """Assumes the deviations of the motion in another order."""
+
+    def __init__(self, motion_std, **options):
+        super().__init__(np.asarray(motion_std)[[1, 0, 2]], **options)
+
+    def belief(self, landmark_ids=None):
+        return super().belief(landmark_ids)
+
+
+SMALL = {"motion": {"std": [0.1, 0.1, 0.08]}, "sensor": {"std": [0.03, 0.06]}}
+
+
+@pytest.mark.parametrize(
+    ("world", "assumed"),
+    [
+        ("six_landmarks", {}),
+        ("anchored", {}),
+        ("anchored", SMALL),
+        ("unknown_heading", {}),
+        ("slippery", {}),
+    ],
+)
+def test_no_figure_of_a_cause_refutes_it(world, assumed):
+    world = load_scenario(world)
+    wrong = {"scaled": Scaled, "offset": Offset, "swapped": Swapped}
+    chosen = {"ekf": "ekf", "invariant": "invariant", **wrong}
+    found = summary_of(world, chosen, assumed=world.with_changes(**assumed), runs=40)
+    refuted = {
+        label: (reasons, entry["diagnosis"]["sentence"])
+        for label, entry in found["estimators"].items()
+        if (reasons := refutations(entry))
+    }
+    assert refuted == {}
 
 
 def test_errors_in_the_code_of_a_filter_are_not_called_linearisation(tmp_path):

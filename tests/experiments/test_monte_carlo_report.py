@@ -528,6 +528,10 @@ def test_warnings_name_unused_readings_and_innovations_of_another_size():
     first, second = run_warnings({"ekf": entry}, 40)
     assert first.startswith("ekf: 12% of the readings corrected nothing")
     assert "NIS is 3 per degree of freedom" in second
+    assert "assumes too little noise" in second
+    *_, third = run_warnings({"ekf": entry | {"verdict": "consistent"}}, 40)
+    assert "its errors agree with its covariances" in third
+    assert "noise" not in third
     (warning,) = run_warnings({"mine": entry | {"nis": None}}, 40)
     assert warning.startswith("mine: its reports list no reading that corrected")
     managed = entry | {"options": {"management": True}, "nis": 1.0}
