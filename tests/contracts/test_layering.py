@@ -42,7 +42,8 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         compressed sparse_information submaps
     """,
     "evaluation": """
-        hypothesis_tests trajectory_error error_bound association_scores
+        hypothesis_tests sequential_tests trajectory_error error_bound
+        association_scores
         nees noise_findings
         diagnosis
         consistency_report

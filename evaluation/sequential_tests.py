@@ -1,0 +1,153 @@
+"""Tests that may be looked at after every run, with error rates that hold at all looks.
+
+A test with a fixed number of runs loses its error rate if more runs are added until it
+decides. An e-process does not. It is a product of likelihood ratios, at least 0 and 1
+on average if the filter is consistent, so that it ever reaches 1/α with a probability
+of at most α, however long one waits [1]_ [2]_ [3]_. :class:`EProcess` rejects, and
+:class:`ConfidenceSequence` shows that a ratio is near 1; the latter is asymptotic [4]_
+and must not reject.
+
+References
+----------
+.. [1] J. Ville, Étude critique de la notion de collectif, 1939.
+.. [2] S. R. Howard, A. Ramdas, J. McAuliffe, J. Sekhon, Time-uniform, nonparametric,
+   nonasymptotic confidence sequences, Annals of Statistics 49(2), 2021.
+.. [3] A. Ramdas, P. Grünwald, V. Vovk, G. Shafer, Game-theoretic statistics and safe
+   anytime-valid inference, Statistical Science 38(4), 2023.
+.. [4] I. Waudby-Smith, D. Arbour, R. Sinha, E. H. Kennedy, A. Ramdas, Time-uniform
+   central limit theory and asymptotic confidence sequences, 2021 (arXiv:2103.06476).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import logsumexp
+
+from ..arrays import Array
+
+#: Factors c by which squared errors may differ, each of equal weight.
+SCALES = np.delete(np.geomspace(0.3, 20.0, 43), 12)
+#: Number of runs below which a confidence sequence shows nothing.
+FEWEST_SHOWN = 30
+#: That of both ends together, so that each end, too, stays below 5 % for the skewed
+#: averages of NEES, for which the asymptotic rate is exceeded.
+SHOWN_ERROR_RATE = 0.07
+_LARGEST_LOG = 700.0
+_SQUARED_RHO = 0.1  # narrowest after about 70 runs
+
+
+class EProcess:
+    """Evidence against χ² distributed NEES at some steps, after each of many runs.
+
+    ::
+
+        eₖ(M) = mean over c of Πᵢ c^(−nᵢ/2) exp(−xᵢₖ (1/c − 1) / 2),   i = 1 … M
+        e(M)  = mean over k of eₖ(M)
+
+    xᵢₖ is the NEES of run i at step k, with nᵢ degrees of freedom. Each factor is the
+    ratio of the densities of c χ²(n) and χ²(n). Runs must be independent. Steps may be
+    correlated in any way, because an average of e-processes is one.
+    """
+
+    def __init__(self) -> None:
+        self._logs: Array | None = None
+
+    def update(self, nees: ArrayLike, degrees_of_freedom: ArrayLike) -> Array:
+        """Add runs, and return log e after each of them.
+
+        Parameters
+        ----------
+        nees : array_like, shape (M, k)
+            NEES of M runs at k steps that are chosen beforehand.
+        degrees_of_freedom : array_like
+            One number, or one per run, shape (M,). A run with 0 adds no evidence.
+
+        Returns
+        -------
+        ndarray, shape (M,)
+            The same, to the bit, whether runs are added at once or one by one.
+
+        Examples
+        --------
+        >>> EProcess().update([[3.0], [30.0], [30.0]], 3).round(1)
+        array([-0.7,  7.3, 17. ])
+        """
+        values = np.asarray(nees, dtype=np.float64)
+        freedom = np.broadcast_to(degrees_of_freedom, len(values))[:, None, None]
+        gains = np.asarray(
+            -0.5 * (freedom * np.log(SCALES) + values[:, :, None] * (1 / SCALES - 1))
+        )
+        if self._logs is None:
+            self._logs = np.zeros(gains.shape[1:])
+        logs = np.cumsum(np.concatenate([self._logs[None], gains]), axis=0)
+        self._logs = logs[-1]
+        return np.asarray(logsumexp(logs[1:], axis=(1, 2)) - np.log(logs[0].size))
+
+
+def average_of(logs: Sequence[Array], weights: Sequence[float] | None = None) -> Array:
+    """Average e-processes, which gives an e-process whatever their correlation.
+
+    Parameters
+    ----------
+    logs : sequence of ndarray
+        log e of each after every run, of one shape.
+    weights : sequence of float, optional
+        They sum to 1; equal by default.
+
+    Examples
+    --------
+    >>> average_of([np.log([1.0, 4.0]), np.log([3.0, 2.0])]).round(3)
+    array([0.693, 1.099])
+    """
+    shares = np.full(len(logs), 1 / len(logs)) if weights is None else weights
+    return np.asarray(logsumexp(np.asarray(logs).T, axis=-1, b=np.asarray(shares)).T)
+
+
+class ConfidenceSequence:
+    """Intervals of the mean of positive numbers, which hold together after every run.
+
+    ::
+
+        μ exp(± h / μ),   h = σ √(2 (M ρ² + 1) / (M² ρ²) · log(√(M ρ² + 1) / α))
+
+    with mean μ and deviation σ of M numbers; μ ± h is the sequence of [4]_ of the
+    module. On a log scale, both ends have the same error rate, because the deviation
+    of NEES grows with its mean. The intervals hold asymptotically: below
+    `FEWEST_SHOWN` runs they are [0, ∞].
+    """
+
+    def __init__(self, error_rate: float = SHOWN_ERROR_RATE) -> None:
+        self._error_rate = error_rate
+        self._sums = np.zeros((1, 3))
+
+    def update(self, ratios: ArrayLike) -> tuple[Array, Array]:
+        """Add one number of each of M runs, and return both ends after each of them.
+
+        Parameters
+        ----------
+        ratios : array_like, shape (M,)
+            For example time averages of NEES, divided by the degrees of freedom.
+
+        Returns
+        -------
+        low, high : ndarray, shape (M,)
+        """
+        values = np.asarray(ratios, dtype=np.float64)
+        powers = np.stack([np.ones_like(values), values, values**2], axis=1)
+        sums = np.cumsum(np.concatenate([self._sums, powers]), axis=0)
+        self._sums = sums[-1:]
+        runs, total, squares = sums[1:].T
+        mean = total / runs
+        variance = np.maximum(squares / runs - mean**2, 0.0)
+        grown = runs * _SQUARED_RHO + 1
+        spread = 2 * grown / (runs**2 * _SQUARED_RHO)
+        spread *= np.log(np.sqrt(grown) / self._error_rate)
+        low, high = np.zeros_like(mean), np.full_like(mean, np.inf)
+        known = (runs >= FEWEST_SHOWN) & (mean > 0)
+        half = np.sqrt(variance * spread)[known] / mean[known]
+        low[known] = mean[known] * np.exp(-half)
+        high[known] = mean[known] * np.exp(np.minimum(half, _LARGEST_LOG))
+        return low, high

@@ -1,0 +1,126 @@
+"""Tests that may be looked at after every run: their error rates hold at all looks."""
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from slamgym.evaluation.sequential_tests import (
+    FEWEST_SHOWN,
+    ConfidenceSequence,
+    EProcess,
+    average_of,
+)
+
+STUDIES, RUNS, STEPS = 200, 200, 10
+REJECTED = np.log(20)
+
+
+def correlated(rng, memory, runs=RUNS):
+    """NEES of errors that are exactly N(0, I), AR(1) in time: (runs, STEPS)."""
+    error, nees = rng.standard_normal((runs, 3)), []
+    for _ in range(STEPS):
+        fresh = rng.standard_normal((runs, 3))
+        error = memory * error + np.sqrt(1 - memory**2) * fresh
+        nees.append((error**2).sum(axis=1))
+    return np.stack(nees, axis=1)
+
+
+def at_most(count, studies=STUDIES, rate=0.05):
+    """Whether a rate of at most 5 % explains the count, but for one case in 10,000."""
+    return stats.binom.sf(count - 1, studies, rate) > 1e-4
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.9, 1.0])
+def test_honest_errors_are_rarely_rejected_at_any_of_200_looks(memory):
+    rng = np.random.default_rng(1)
+    evidence = [EProcess().update(correlated(rng, memory), 3) for _ in range(STUDIES)]
+    assert at_most(sum((each > REJECTED).any() for each in evidence))
+
+
+@pytest.mark.parametrize("freedom", [2, 3, 40])
+def test_evidence_is_1_on_average_over_honest_errors(freedom):
+    def weighed(nees):
+        evidence = EProcess().update([[nees]], freedom)[0]
+        return np.exp(evidence + stats.chi2.logpdf(nees, freedom))
+
+    total = sum(integrate.quad(weighed, *ends)[0] for ends in ((0, 100), (100, 3000)))
+    assert total == pytest.approx(1, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "most"), [(0.5, 40), (1.5, 80), (2.0, 30), (5.0, 8), (30.0, 4)]
+)
+def test_wrong_covariances_are_rejected_soon(ratio, most):
+    rng = np.random.default_rng(3)
+    looks = [
+        EProcess().update(ratio * correlated(rng, 0.9), 3) > REJECTED for _ in range(40)
+    ]
+    assert np.all(np.any(looks, axis=1))
+    assert np.median(np.argmax(looks, axis=1)) + 1 <= most
+
+
+def test_an_error_at_a_single_step_is_found():
+    rng = np.random.default_rng(4)
+    nees = correlated(rng, 0.0)
+    nees[:, 4] *= 2
+    assert EProcess().update(nees, 3)[-1] > REJECTED
+
+
+def test_runs_added_in_blocks_give_the_same_evidence_and_intervals_to_the_bit():
+    rng = np.random.default_rng(5)
+    nees, freedom = correlated(rng, 0.5), rng.integers(0, 40, RUNS)
+    whole, parts = EProcess(), EProcess()
+    blocks = np.split(np.arange(RUNS), [1, 7, 64, 65])
+    found = [parts.update(nees[block], freedom[block]) for block in blocks]
+    assert np.array_equal(np.concatenate(found), whole.update(nees, freedom))
+    sequence = ConfidenceSequence()
+    ends = [sequence.update(nees[block, 0]) for block in blocks]
+    expected = ConfidenceSequence().update(nees[:, 0])
+    assert np.array_equal(np.concatenate(ends, axis=1), expected)
+
+
+def test_evidence_counts_the_degrees_of_freedom_of_each_run():
+    rng = np.random.default_rng(6)
+    freedom = rng.integers(2, 60, 400)
+    nees = rng.chisquare(freedom)[:, None]
+    assert EProcess().update(nees, freedom).max() < REJECTED
+    assert EProcess().update(nees, freedom + 10).max() > REJECTED
+
+
+def test_a_run_without_degrees_of_freedom_adds_no_evidence():
+    found = EProcess().update([[30.0], [0.0], [30.0]], [3, 0, 3])
+    assert found[0] == found[1] < found[2]
+
+
+def test_the_average_of_e_processes_weighs_them():
+    found = average_of([np.log([1.0, 8.0]), np.log([3.0, 4.0])], [0.25, 0.75])
+    np.testing.assert_allclose(np.exp(found), [2.5, 5.0])
+
+
+def shown(ratios):
+    low, high = ConfidenceSequence().update(ratios)
+    return ((low > 0.8) & (high < 1.25)).any()
+
+
+@pytest.mark.parametrize("ratio", [0.8, 1.25])
+@pytest.mark.parametrize("memory", [0.0, 0.9, 1.0])
+def test_a_ratio_at_the_margin_is_rarely_shown_to_be_near_1_at_any_look(ratio, memory):
+    rng = np.random.default_rng(7)
+    wrong = [
+        shown(ratio * correlated(rng, memory).mean(axis=1) / 3) for _ in range(STUDIES)
+    ]
+    assert at_most(sum(wrong))
+
+
+def test_honest_errors_are_shown_to_be_near_1():
+    rng = np.random.default_rng(8)
+    found = [shown(correlated(rng, 0.9).mean(axis=1) / 3) for _ in range(40)]
+    assert np.mean(found) > 0.9
+
+
+def test_a_confidence_sequence_shows_nothing_with_few_or_zero_numbers():
+    low, high = ConfidenceSequence().update(np.ones(FEWEST_SHOWN))
+    assert np.all(low[:-1] == 0)
+    assert np.all(np.isinf(high[:-1]))
+    assert low[-1] == high[-1] == 1
+    assert not shown(np.zeros(50))
