@@ -58,6 +58,7 @@ CAUSES = (
 #: Probabilities of a false answer about the noise, and about the filter.
 NOISE_RATE, FILTER_RATE = 0.02, 0.02
 _ERROR_RATE = 0.05
+_OF_DISTANCES = 3  # the last moments
 #: NIS per degree from which on a filter does not use the noise that it is given.
 LARGEST_NIS = 1.15
 FEWEST_RUNS = 20
@@ -114,8 +115,9 @@ def diagnose(
 
     Parameters
     ----------
-    noise : array_like, shape (M, 5, 9), or None
+    noise : array_like, shape (M, 5, 12), or None
         Of :func:`~slamgym.evaluation.noise_sums`, of M runs; None if it is not known.
+        The last three may be missing: then the noise is not compared with distances.
     nees, heading_nees : array_like, shape (M, K)
         NEES of the pose (3 degrees) in the filter's own error frame, and of the
         heading (1 degree), after each of K steps; nan at leading steps without one. A
@@ -230,7 +232,9 @@ def _also(knowledge: Array, spurious: float | None, nis_ratio: float | None) -> 
 
 def _checked_sums(noise: ArrayLike, runs: int) -> Array:
     shape = runs, len(noise_findings.CHANNELS), len(noise_findings.MOMENTS)
-    sums = argument_checks.shaped("noise", noise, shape)
+    sums = argument_checks.as_floats("noise", noise)
+    if sums.shape != (*shape[:2], shape[2] - _OF_DISTANCES):
+        sums = argument_checks.shaped("noise", sums, shape)
     if not np.isfinite(sums).all():
         raise ValueError("noise must be finite: leave out runs that failed")
     return sums

@@ -36,6 +36,7 @@ _LEAST_VARIANCE = 0.05
 _LEAST_CORRELATION = 0.05
 _LEAST_BIAS = 0.1
 _LEAST_KURTOSIS = 0.5
+_LEAST_GROWTH = 0.2
 _FEWEST = 30  # numbers, for the distribution of the kurtosis
 
 
@@ -68,16 +69,24 @@ def noise_findings(sums: Array) -> list[Finding]:
         tails  kurtosis of n numbers [1]_,  matters if it is .5 above that of a normal
         time   correlation ρ of m pairs of successive numbers, without their mean,
                ρ √m ~ N(0, 1),  matters if |ρ| ≥ .05
+        far    correlation ρ of w² and the distance of the landmark, ρ √n ~ N(0, 1)
+               [2]_,  matters if the variances at one deviation of the distances below
+               and above their mean differ by .2 of the variance
+
+    A variance that depends on the distance makes the kurtosis of all numbers larger;
+    this part of it does not count as tails.
 
     Parameters
     ----------
-    sums : ndarray, shape (B, 5, 9)
+    sums : ndarray, shape (B, 5, 12)
         Of :func:`noise_sums`.
 
     References
     ----------
     .. [1] F. J. Anscombe, W. J. Glynn, Distribution of the kurtosis statistic b2 for
        normal samples, Biometrika 70(1), 1983.
+    .. [2] R. Koenker, A note on studentizing a test for heteroscedasticity, Journal of
+       Econometrics 17(1), 1981.
     """
     return [
         finding
@@ -100,16 +109,23 @@ def significant_findings(sums: Array, error_rate: float) -> list[Finding]:
 
 
 def _tests(channel: str, total: Array, runs: int) -> Iterator[Finding]:
-    found = dict(zip(MOMENTS, total.tolist(), strict=True))
+    known = dict(zip(MOMENTS, total.tolist(), strict=False))
+    found = dict.fromkeys(MOMENTS, 0.0) | known  # results of before have no distances
     count = found["count"]
     mean = found["first"] / count
     variance = (found["second"] - count * mean**2) / (count - 1)
     if channel in _BIASES and found["leverage"] > 0:
         yield _bias(channel, found, variance, runs)
-    tails = _tails(channel, found, mean, variance)
+    growth = _growth(channel, found, variance)
+    is_growing = growth is not None and growth.matters and growth.p_value < 1e-4
+    tails = _tails(channel, found, mean, variance, is_growing)
     if tails is not None:
         yield tails
-    if tails is None or not (tails.matters and tails.p_value < 1e-4):
+    if growth is not None:
+        yield growth
+    if not is_growing and (
+        tails is None or not (tails.matters and tails.p_value < 1e-4)
+    ):
         yield _size(channel, count, variance)
     if found["pairs"] >= _FEWEST and variance > 0:
         yield _correlation(channel, found, mean, variance)
@@ -128,6 +144,30 @@ def _correlation(
         f"successive errors of {_SYMBOLS[channel]} have a correlation of {rho:.2g}, "
         "where the filter assumes none",
         sign=0,
+    )
+
+
+def _growth(channel: str, found: dict[str, float], variance: float) -> Finding | None:
+    """Test whether the variance depends on the distance; None for motion."""
+    count, mean = found["count"], found["distance"] / found["count"]
+    spread = found["distance²"] / count - mean**2  # of distances
+    second, fourth = found["second"] / count, found["fourth"] / count
+    if spread <= 1e-9 * max(mean, 1.0) ** 2 or fourth <= second**2:
+        return None
+    joint = found["distance w²"] / count - mean * second
+    rho = joint / np.sqrt(spread * (fourth - second**2))
+    step = joint / np.sqrt(spread)  # of the variance, for one deviation of distances
+    near, far = (max(variance + way * step, 0.0) for way in (-1, 1))
+    which = "too small" if max(near, far) > 1 + _LEAST_VARIANCE else "too large"
+    where = [f"{mean + way * np.sqrt(spread):.2g} m" for way in (-1, 1)]
+    return Finding(
+        f"{channel} noise {which}",
+        float(2 * ndtr(-abs(rho) * np.sqrt(count))),
+        max(abs(float(np.log(max(x, 1e-12)))) for x in (near, far, variance)),
+        abs(2 * step) >= _LEAST_GROWTH * variance,
+        f"{_SYMBOLS[channel]} is {np.sqrt(far):.3g} times what it assumes at distances "
+        f"of {where[1]}, and {np.sqrt(near):.3g} times at {where[0]}",
+        0 if near < 1 < far or far < 1 < near else 1 if variance > 1 else -1,
     )
 
 
@@ -175,9 +215,13 @@ def _bias_text(channel: str, bias: float) -> str:
 
 
 def _tails(
-    channel: str, found: dict[str, float], mean: float, variance: float
+    channel: str, found: dict[str, float], mean: float, variance: float, grows: bool
 ) -> Finding | None:
-    """Test the fourth moment about the mean; None where all numbers are equal."""
+    """Test the fourth moment about the mean; None where all numbers are equal.
+
+    If the variance grows with the distance, the part of the kurtosis of a linear growth
+    is left out.
+    """
     count = found["count"]
     second = variance * (count - 1) / count
     if second <= 0:
@@ -186,6 +230,8 @@ def _tails(
         found["fourth"] - 4 * mean * found["third"] + 6 * mean**2 * found["second"]
     ) / count - 3 * mean**4
     kurtosis = fourth / second**2
+    if grows:
+        kurtosis /= 1 + _spread_of_variance(found)
     p_value = float(2 * ndtr(-abs(_kurtosis_score(kurtosis, count))))
     return Finding(
         HEAVY_TAILS,
@@ -196,6 +242,14 @@ def _tails(
         "one 3",
         sign=0,
     )
+
+
+def _spread_of_variance(found: dict[str, float]) -> float:
+    """Return the squared relative deviation of a variance linear in the distance."""
+    count, mean = found["count"], found["distance"] / found["count"]
+    spread, second = found["distance²"] / count - mean**2, found["second"] / count
+    joint = found["distance w²"] / count - mean * second
+    return float(joint**2 / (spread * second**2))
 
 
 def _kurtosis_score(kurtosis: float, n: float) -> float:
@@ -214,11 +268,13 @@ def _kurtosis_score(kurtosis: float, n: float) -> float:
 
 #: Sums over w, the standardised noise of a channel in a run: 1, w, w², w³, w⁴, and g w,
 #: g², where a bias b adds b g: g = d/σx along, so that b is a scale, else 1/σ. That of
-#: d which has no noise counts, odometry or true distance. The last two are the number
-#: of pairs of successive steps, of the same landmark, and the sum of w w' over them.
+#: d which has no noise counts, odometry or true distance. Then the number of pairs of
+#: successive steps, of the same landmark, and the sum of w w' over them.  The last are
+#: r, r², r w², where r is the true distance of a landmark, else 0.
 MOMENTS = (
     *("count", "first", "second", "third", "fourth"),
     *("slope", "leverage", "pairs", "lagged"),
+    *("distance", "distance²", "distance w²"),
 )
 _ROUNDING = 1e-9
 _LEAST_STD = 1e-6  # in place of 0, where the world has noise
@@ -233,6 +289,7 @@ class _Noise(NamedTuple):
     runs: IntArray
     #: Whether a number, but the first, is of the step after that of the one before.
     follows: BoolArray
+    distance: Array | float = 0.0
 
 
 @former_noise
@@ -277,7 +334,7 @@ def noise_sums(
 
     Returns
     -------
-    ndarray, shape (B, 5, 9)
+    ndarray, shape (B, 5, 12)
         By run, `CHANNELS` and `MOMENTS`.  A channel has zeros if it has no noise and
         the filter assumes none.
 
@@ -351,13 +408,13 @@ def _sensor_noise(
     bearing_error = wrap_angle(bearing - expected[0])
     bearing_std, range_std = sensor.stds(std, np.maximum(expected[1], 1e-12)).T
     return [
-        _Noise(bearing_error, bearing_std, 1.0, run, follows),
-        _Noise(distance - expected[1], range_std, 1.0, run, follows),
+        _Noise(bearing_error, bearing_std, 1.0, run, follows, expected[1]),
+        _Noise(distance - expected[1], range_std, 1.0, run, follows, expected[1]),
     ]
 
 
 def _summed(noise: _Noise, count: int) -> Array:
-    """Sum the moments of a channel by run, shape (count, 7)."""
+    """Sum the moments of a channel by run, shape (count, 12)."""
     std = np.broadcast_to(noise.std, noise.values.shape)
     if not std.any() and (np.abs(noise.values) < _ROUNDING).all():
         return np.zeros((count, len(MOMENTS)))
@@ -367,6 +424,8 @@ def _summed(noise: _Noise, count: int) -> Array:
     terms += [
         np.append(of, 0.0) for of in (noise.follows, noise.follows * w[1:] * w[:-1])
     ]
+    r = np.broadcast_to(noise.distance, w.shape)
+    terms += [r, r**2, r * w**2]
     return np.column_stack(
         [np.bincount(noise.runs, term[: len(w)], minlength=count) for term in terms]
     )

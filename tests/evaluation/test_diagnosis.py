@@ -77,12 +77,16 @@ def test_sums_are_those_of_the_noise_that_made_the_drive(noise_in):
         assert sums[b, 0, 5:7] == pytest.approx([(g * w[0]).sum(), (g * g).sum()])
         for channel, values in zip(sums[b], w[:3], strict=False):
             lagged = (values[1:] * values[:-1]).sum()
-            assert channel[7:] == pytest.approx([len(values) - 1, lagged], abs=1e-9)
+            assert channel[7:9] == pytest.approx([len(values) - 1, lagged], abs=1e-9)
+            assert not channel[9:].any()
         both = visible[b, 1:] & visible[b, :-1]
         for k, std in enumerate((SENSOR_STD[0], SENSOR_STD[1] + PER_METRE * far[b])):
             noise = sensor[b, ..., k] / std
             lagged = (noise[1:] * noise[:-1])[both].sum()
-            assert sums[b, 3 + k, 7:] == pytest.approx([both.sum(), lagged])
+            assert sums[b, 3 + k, 7:9] == pytest.approx([both.sum(), lagged])
+            r, w = far[b][visible[b]], noise[visible[b]]
+            of_distance = r.sum(), (r**2).sum(), (r * w**2).sum()
+            assert sums[b, 3 + k, 9:] == pytest.approx(of_distance)
 
 
 def test_steps_that_do_not_count_are_left_out_of_the_motion_alone():
@@ -504,7 +508,7 @@ def test_few_runs_decide_nothing():
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("noise", np.zeros((RUNS, 5, 6)), r"noise must have shape \(60, 5, 9\)"),
+        ("noise", np.zeros((RUNS, 5, 6)), r"noise must have shape \(60, 5, 12\)"),
         ("noise", np.full((RUNS, 5, 9), np.nan), "noise must be finite"),
         ("nees", np.ones(RUNS), r"nees must have shape \(runs, steps\)"),
         ("nees", np.full((RUNS, STEPS), np.nan), "nees must be finite"),

@@ -9,6 +9,7 @@ from slamgym.evaluation.noise_findings import (
     HEAVY_TAILS,
     noise_findings,
     noise_sums,
+    significant_findings,
 )
 
 RUNS = 3
@@ -158,3 +159,38 @@ def test_noise_where_none_is_assumed_counts_in_units_of_a_millionth():
         measurement_std=(0.1, 0.1),
     )
     assert sums[0, 1, 1] == pytest.approx(3000.0)
+
+
+def far_noise(factor, law="normal", runs=40, seed=4):
+    """Sums of ranges whose noise has another size beyond the median distance."""
+    rng = np.random.default_rng(seed)
+    r = rng.uniform(1, 9, (runs, 200))
+    drawn = rng.standard_normal(r.shape)
+    if law == "t":
+        drawn = rng.standard_t(5, r.shape) / np.sqrt(5 / 3)
+    w = np.where(r > 5, factor, 1.0) * drawn
+    sums = np.pad(sums_of("range", w), [(0, 0), (0, 0), (0, 3)])
+    moments = r.sum(axis=1), (r**2).sum(axis=1), (r * w**2).sum(axis=1)
+    sums[:, CHANNELS.index("range"), 9:] = np.stack(moments, axis=1)
+    return sums
+
+
+@pytest.mark.parametrize(("factor", "size"), [(1.6, "too small"), (0.6, "too large")])
+def test_noise_of_another_size_far_away_is_no_heavy_tail(factor, size):
+    first, *others = significant_findings(far_noise(factor), 0.02)
+    assert first.cause == f"range noise {size}"
+    assert f"σr is {factor:.1f}"[:7] in first.text
+    assert "times at 2.7 m" in first.text
+    assert others == []
+
+
+def test_heavy_tails_are_named_even_if_the_noise_grows_with_the_distance():
+    causes = [f.cause for f in significant_findings(far_noise(1.6, "t"), 0.02)]
+    assert set(causes) == {"range noise too small", HEAVY_TAILS}
+
+
+def test_noise_of_one_size_does_not_depend_on_the_distance():
+    found = [significant_findings(far_noise(1.0, seed=s), 0.02) for s in range(20)]
+    assert found == [[]] * 20
+    heavy = significant_findings(far_noise(1.0, "t"), 0.02)
+    assert [f.cause for f in heavy] == [HEAVY_TAILS]
