@@ -275,6 +275,9 @@ class Belief:
     ) -> Array:
         """Return the error of this belief against the truth.
 
+        The origin of the invariant frame is the estimated position, so that error and
+        covariance keep their digits in a world whose origin is far away.
+
         Parameters
         ----------
         true_pose : array_like, shape (3,)
@@ -297,14 +300,19 @@ class Belief:
                 f"(n, 2), got {np.shape(true_pose)} and {np.shape(true_landmarks)}"
             )
         if self._chosen(frame) == "invariant":
-            return rigid_motion.invariant_error(truth, self.mean)
+            mean, truth = self._seen_from_here(self.mean, truth)
+            return rigid_motion.invariant_error(truth, mean)
         return rigid_motion.additive_error(truth, self.mean)
 
     def error_covariance(self, frame: str | None = None) -> Array:
         """Return the covariance (3 + 2n, 3 + 2n) that belongs to :meth:`error`."""
         if self._chosen(frame) == "invariant":
-            return rigid_motion.invariant_covariance(self.mean, self.covariance)
+            (mean,) = self._seen_from_here(self.mean)
+            return rigid_motion.invariant_covariance(mean, self.covariance)
         return self.covariance
+
+    def _seen_from_here(self, *states: Array) -> list[Array]:
+        return [rigid_motion.seen_from(self.mean[:2], state) for state in states]
 
     def __repr__(self) -> str:
         n = len(self.landmark_ids)

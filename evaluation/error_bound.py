@@ -26,6 +26,7 @@ from scipy.special import stdtrit
 
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.models.bearing_range import reading_slopes_jit
+from ..estimator.models.rigid_motion import seen_from
 from ..estimator.models.sensors import (
     BEARING_RANGE,
     POSITION,
@@ -51,6 +52,8 @@ class PosteriorBound(NamedTuple):
     #: Of (x, y, θ, l1x, …) at the end of each run, shape (3 + 2n, 3 + 2n) for the n
     #: landmarks that it read, in the order of their rows.
     covariances: tuple[Array, ...] = ()
+    #: Origin of the invariant frame (x, y) [m].
+    origin: tuple[float, float] = (0.0, 0.0)
 
 
 class Efficiency(NamedTuple):
@@ -73,6 +76,7 @@ def posterior_bound(
     start_std: ArrayLike,
     pose_std: ArrayLike = (np.inf, np.inf, np.inf),
     sensor: str | Sensor = "bearing_range",
+    origin: tuple[float, float] = (0.0, 0.0),
 ) -> PosteriorBound:
     """Return the bound of many runs, each along its own true path.
 
@@ -96,6 +100,9 @@ def posterior_bound(
     sensor : str or Sensor
         ``"bearing_range"``, or ``"position"`` with `measurement_std` (σx, σy) [m].  The
         bound of other sensors is nan: their first reading of a landmark is no bound.
+    origin : (float, float)
+        Origin of the invariant frame [m].  It must lie near the path: about a distant
+        one, every error is that of the heading, and the others lose their digits.
 
     Raises
     ------
@@ -114,6 +121,8 @@ def posterior_bound(
     ):
         if array.shape != shape:
             raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+    about = argument_checks.finite_vector("origin", origin, 2)
+    poses, places = seen_from(about, poses), places - about
     check = argument_checks.standard_deviations
     stds = check("measurement_std", measurement_std, 2)
     read = find_sensor(sensor)
@@ -124,7 +133,8 @@ def posterior_bound(
     fixes = np.broadcast_to(np.square(pose_std), (count, steps, 3)).astype(np.float64)
     position, heading, raw = (np.full((count, steps), np.nan) for _ in range(3))
     if read not in (BEARING_RANGE, POSITION):
-        return PosteriorBound(position, heading, raw, np.full(count, np.nan))
+        unknown = np.full(count, np.nan)
+        return PosteriorBound(position, heading, raw, unknown, origin=origin)
     starts = _invariant_start(poses[:, :1], start)
     runs = zip(poses, places, seen, durations, fixes, strict=True)
     rows = zip(position, heading, raw, strict=True)
@@ -133,7 +143,7 @@ def posterior_bound(
         for run, start, out in zip(runs, starts, rows, strict=True)
     )
     spread = np.array([_about_centre(covariance) for covariance in covariances])
-    return PosteriorBound(position, heading, raw, spread, covariances)
+    return PosteriorBound(position, heading, raw, spread, covariances, origin)
 
 
 def efficiency(bound: Array, squared_error: Array) -> Efficiency:

@@ -19,6 +19,7 @@ from ..estimator.models.rigid_motion import (
     additive_error,
     invariant_covariance,
     invariant_error,
+    seen_from,
 )
 from ..estimator.support.argument_checks import one_of
 
@@ -218,10 +219,15 @@ def _whiten_each(errors: Array, correlations: Array) -> Array:
 def _in_frame(
     true_states: Array, means: Array, covariances: Array, frame: ErrorFrame
 ) -> tuple[Array, Array]:
-    """Return errors and their claimed covariances in a named frame."""
+    """Return errors and their claimed covariances in a named frame.
+
+    The origin of the invariant frame is the estimated position, so that the NEES has
+    the same digits wherever the world's origin lies.
+    """
     if one_of("frame", frame, ERROR_FRAMES) == "invariant":
-        errors = invariant_error(true_states, means)
-        return errors, invariant_covariance(means, covariances)
+        origins = means[..., :2]
+        truth, means = seen_from(origins, true_states), seen_from(origins, means)
+        return invariant_error(truth, means), invariant_covariance(means, covariances)
     return additive_error(true_states, means), covariances
 
 

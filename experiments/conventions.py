@@ -212,8 +212,12 @@ def _nearer(truth: Array, readings: Sequence[Reading], before: _Fit) -> str:
 
 def _fit(truth: Array, reading: Reading) -> _Fit:
     """Compare a reading with the truth, by the invariant error of the pose."""
-    covariances = rigid_motion.invariant_covariance(reading.poses, reading.covariances)
-    errors = rigid_motion.invariant_error(truth, reading.poses)
+    there, here = (
+        rigid_motion.seen_from(reading.poses[..., :2], poses)
+        for poses in (truth, reading.poses)
+    )
+    covariances = rigid_motion.invariant_covariance(here, reading.covariances)
+    errors = rigid_motion.invariant_error(there, here)
     order = [2, 0, 1]  # the heading first: no frame changes it
     plain = rigid_motion.additive_error(truth, reading.poses)
     middle = (

@@ -7,7 +7,7 @@ functions of mean (3 + 2n,) and covariance P (3 + 2n, 3 + 2n) in the order
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -186,12 +186,8 @@ class PoseReading(NamedTuple):
         self, mean: Array, covariance: Array, *, frame: ErrorFrame, once: bool
     ) -> ObservedMap:
         """Condition beliefs (..., 3 + 2n) on the reading, see :func:`observe`."""
-
-        def innovation(state: Array) -> Array:
-            return self.innovation(state[..., :3])
-
-        H, R = self.matrix, self.covariance
-        return observe(mean, covariance, H, R, innovation, frame=frame, once=once)
+        H, R, nu = self.matrix, self.covariance, self.innovation(mean[..., :3])
+        return observe(mean, covariance, H, R, nu, frame=frame, once=once)
 
     def rows(self) -> list[tuple[float, float, float]]:
         """Return the reading as rows of three numbers; the first ends with −k."""
@@ -247,7 +243,7 @@ def observe(
     covariance: Array,
     H: Array,
     R: Array,
-    innovation: Callable[[Array], Array],
+    nu: Array,
     *,
     frame: ErrorFrame = "additive",
     once: bool = False,
@@ -265,8 +261,8 @@ def observe(
         H_δ = H [I  J (p − p̂); 0  1]
 
     They are those of the corrected position, found by iteration with the same prior
-    and ν = z − h(x ⊕ δ) + H_δ δ.  Two readings at one place then have the same slopes,
-    and do not appear to observe the heading.
+    and ν − H (x ⊕ δ − x) + H_δ δ in place of ν.  Two readings at one place then have
+    the same slopes, and do not appear to observe the heading.
 
     Parameters
     ----------
@@ -276,15 +272,15 @@ def observe(
         ∂h of the first m components of the state; m = 3 where it is iterated.
     R : ndarray, shape (k, k)
         Noise of the reading.
-    innovation : callable
-        Returns z − h(x) at states x.
+    nu : ndarray, shape (..., k)
+        ν = z − h(x) at the prior.
     frame : {"additive", "invariant"}
         Error frame of the filter.
     once : bool
         Whether to leave out the iterations.  Where they do not end, they are left out
         as well.
     """
-    m, nu = H.shape[1], innovation(mean)
+    m = H.shape[1]
     L, gains = _whitened(covariance, H, R)
     white = np.linalg.solve(L, nu[..., None])
     shift = (_turned(gains) @ white)[..., 0]
@@ -293,15 +289,16 @@ def observe(
         return ObservedMap(mean + shift, _reduced(covariance, gains), nu, L, nis)
     first, moves = (shift, gains), np.ones(nis.shape, dtype=np.bool_)
     for _ in range(0 if once else MOST_ITERATIONS):
-        at = moved(mean, shift)
-        slopes = slopes_at(H, at[..., :2] - mean[..., :2])
+        way = moves_of(shift[..., :m])
+        slopes = slopes_at(H, way[..., :2])
         root, rows = _whitened(covariance, slopes, R)
-        again = innovation(at)[..., None] + slopes @ shift[..., :m, None]
+        again = nu - way @ H.T
+        again = again[..., None] + slopes @ shift[..., :m, None]
         after = (_turned(rows) @ np.linalg.solve(root, again))[..., 0]
-        way = np.abs(after[..., :3] - shift[..., :3]).max(axis=-1)
+        change = np.abs(after[..., :3] - shift[..., :3]).max(axis=-1)
         shift = np.where(moves[..., None], after, shift)
         gains = np.where(moves[..., None, None], rows, gains)
-        moves = moves & (way > STEP_TOLERANCE)
+        moves = moves & (change > STEP_TOLERANCE)
         if not moves.any():
             break
     shift = np.where(moves[..., None], first[0], shift)
@@ -365,7 +362,7 @@ def observe_relative_pose(
     H, columns = np.eye(3, len(belief.mean)), _columns(slots.tolist())
     H[2, columns] = -turned
     H[:2, columns] = -np.tile(np.eye(2) / k, k) - np.outer(lever, turned)
-    arguments = belief.mean, belief.covariance, H, covariance, lambda _: nu
+    arguments = belief.mean, belief.covariance, H, covariance, nu
     return observe(*arguments, frame=belief.frame, once=True)
 
 
@@ -515,18 +512,17 @@ def retracted(mean: Array, covariance: Array, shift: Array) -> ConditionedMap:
         q ← R(t) q + V(t) (δq − t J q) = q + V(t) δq,    θ ← θ + t,    t = δθ
         P ← T P Tᵀ,    T = I + v e_θᵀ,    v = J (q⁺ − q)
     """
-    new = moved(mean, shift)
-    way = state_of(1j * points_of(new - mean), np.zeros(mean.shape[:-1]))[..., None]
+    moves = moves_of(shift)
+    way = state_of(1j * points_of(moves), np.zeros(mean.shape[:-1]))[..., None]
     cross = way * covariance[..., 2:3, :]
     square = covariance[..., 2:3, 2:3] * (way * _turned(way))
-    return ConditionedMap(new, covariance + (cross + _turned(cross)) + square)
+    return ConditionedMap(mean + moves, covariance + (cross + _turned(cross)) + square)
 
 
-def moved(mean: Array, shift: Array) -> Array:
-    """Return the states after a correction, over any leading axes."""
+def moves_of(shift: Array) -> Array:
+    """Return the way x ⊕ δ − x of every coordinate, over any leading axes."""
     turn = shift[..., 2]
-    moves = left_jacobian(turn)[..., None] * points_of(shift)
-    return np.asarray(mean + state_of(moves, turn))
+    return state_of(left_jacobian(turn)[..., None] * points_of(shift), turn)
 
 
 def _turned(matrices: Array) -> Array:

@@ -49,7 +49,7 @@ from ..models.sensors import Sensor
 from ..support import saved_states
 from ..support.argument_checks import LOWEST_ID, RESERVED_IDS
 from ..support.saved_states import NUMBERS, WHOLE, Table, with_prefix, without_prefix
-from .conditioning import moved, retracted
+from .conditioning import moves_of, retracted
 from .gaussian_map import GaussianMap
 
 #: Past poses kept; beyond it, the one nearest to the pose before it goes.
@@ -478,7 +478,7 @@ def _conditioned(
 
 def _moved(mean: Array, shift: Array, turns: bool) -> Array:
     """Return the state after a correction, in the frame of the filter."""
-    return moved(mean, shift) if turns else np.asarray(mean + shift)
+    return np.asarray(mean + (moves_of(shift) if turns else shift))
 
 
 def _across(points: Array) -> Array:

@@ -21,8 +21,11 @@ from .ekf import EkfSlam
 from .gaussian_map import LANDMARKS, complete, parts_jit, update_map
 
 # The state that the kernels see, in the robot's frame at the last scan: the motion
-# since that scan in place of the pose; the world's origin (x, y), its heading and a
-# zero in place of the first two landmarks; then the landmarks.
+# since that scan in place of the pose; the start (x, y), the world's heading and a zero
+# in place of the first two landmarks; then the landmarks.  The start is where the robot
+# was expected at first, a point of the world near the drive.  The world's origin may
+# lie far away, where the smallest turn moves it by more than the map is uncertain.  The
+# start's place in the world is the reference of the first landmark.
 ORIGIN, HEADING, FIRST_LANDMARK = 3, 5, 7
 RESERVED = (-(2**63), 1 - 2**63)  # ids of these two places
 TAKEN = -5  # status of an update with one of these ids
@@ -44,7 +47,7 @@ def update_and_move(block: Array, readings: Array, ids: IntArray) -> int:
 
 
 class RobocentricEkfSlam(EkfSlam):
-    """EKF-SLAM with world origin and landmarks estimated in the robot's frame.
+    """EKF-SLAM with the start and the landmarks estimated in the robot's frame.
 
     The method is that of Castellanos et al. [1]_.  Between scans, the filter estimates
     only the motion w = (x, y, θ) since the last scan, which starts at zero without
@@ -74,11 +77,12 @@ class RobocentricEkfSlam(EkfSlam):
         only_placing(self.sensor, "the robocentric filter")
         first = argument_checks.finite_vector("pose", pose, 3)
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
-        origin, jacobian = _inverse_pose(first)
+        origin, jacobian = _inverse_pose(np.array([0.0, 0.0, first[2]]))
         mean, reference = np.zeros(FIRST_LANDMARK), np.zeros(FIRST_LANDMARK)
         covariance = np.zeros((FIRST_LANDMARK, FIRST_LANDMARK))
         world = slice(ORIGIN, HEADING + 1)
         mean[world], reference[:3] = origin, first
+        reference[ORIGIN:HEADING] = first[:2]
         moved = as_covariance(jacobian @ np.diag(std**2) @ jacobian.T)
         covariance[world, world] = moved
         state = {"mean": mean, "covariance": covariance, "reference": reference}
@@ -93,12 +97,14 @@ class RobocentricEkfSlam(EkfSlam):
         self, given: PoseReading, mean: Array, covariance: Array
     ) -> ObservedMap:
         """Correct the state; the pose in the world is a function of it."""
+        whole, jacobian = _in_world(mean, self._start)
+        H, nu = given.matrix @ jacobian[:3], given.innovation(whole[:3])
+        return observe(mean, covariance, H, given.covariance, nu)
 
-        def innovation(state: Array) -> Array:
-            return given.innovation(_in_world(state)[0][:3])
-
-        H = given.matrix @ _in_world(mean)[1][:3]
-        return observe(mean, covariance, H, given.covariance, innovation)
+    @property
+    def _start(self) -> Array:
+        """Where the start lies in the world, shape (2,) [m]."""
+        return self.map.reference[ORIGIN:HEADING]
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit in a filter of the same settings."""
@@ -111,7 +117,7 @@ class RobocentricEkfSlam(EkfSlam):
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
         """Return the belief in the world's frame, as `EkfSlam.belief`."""
         n, ids = self.map.size, self.landmark_ids
-        mean, jacobian = _in_world(self.map.mean[:n])
+        mean, jacobian = _in_world(self.map.mean[:n], self._start)
         moved = as_covariance(jacobian @ self.map.covariance[:n, :n] @ jacobian.T)
         whole = Belief(mean, moved, ids)
         if landmark_ids is None:
@@ -180,17 +186,19 @@ def _turn_rows(mean: Array, covariance: Array, size: int, c: float, s: float) ->
             covariance[i + 1, j] = c * q - s * p - x * covariance[2, j]
 
 
-def _in_world(state: Array) -> tuple[Array, Array]:
+def _in_world(state: Array, start: Array) -> tuple[Array, Array]:
     """Transform a robocentric state to the world's frame; return its Jacobian too.
 
-    A point q lies at R(−φ) (q − o), and the robot's heading is θ_w − φ.
+    With the start at s in the world and at o in the robot's frame, a point q lies at
+    s + R(−φ) (q − o), and the robot's heading is θ_w − φ.
     """
     origin, heading = state[ORIGIN:HEADING], state[HEADING]
     c, s = np.cos(heading), np.sin(heading)
     turn = np.array([[c, s], [-s, c]])
     points = np.concatenate([state[None, :2], state[FIRST_LANDMARK:].reshape(-1, 2)])
     moved = (points - origin) @ turn.T
-    mean = np.concatenate([moved[0], [state[2] - heading], moved[1:].ravel()])
+    places = moved + start
+    mean = np.concatenate([places[0], [state[2] - heading], places[1:].ravel()])
     jacobian = np.zeros((len(mean), len(state)))
     jacobian[2, 2], jacobian[2, HEADING] = 1.0, -1.0
     for k, (x, y) in enumerate(moved):

@@ -246,6 +246,36 @@ def invariant_covariance(mean: Array, covariance: Array) -> Array:
     return np.asarray(half - np.swapaxes(lever, -1, -2) * half[..., :, 2:3])
 
 
+def seen_from(origin: Array, state: Array) -> Array:
+    """Return states with positions relative to another origin; any leading axes.
+
+    Coordinates far from the world's origin lose their digits in ξ, which turns about
+    it.  The error about another origin o is Ad ξ, so the NEES is the same::
+
+        ξ_q' = ξ_q + J o ξ_θ,    ξ_θ' = ξ_θ
+
+    Parameters
+    ----------
+    origin : ndarray, shape (..., 2)
+    state : ndarray, shape (..., 3 + 2n)
+
+    Returns
+    -------
+    ndarray, shape (..., 3 + 2n)
+
+    Examples
+    --------
+    >>> seen_from(np.array([4e6, 5e6]), np.array([4e6 + 1, 5e6 + 2, 0.5, 4e6, 5e6 + 3]))
+    array([1. , 2. , 0.5, 0. , 3. ])
+    """
+    moved = np.array(state)
+    moved[..., 0] -= origin[..., 0]
+    moved[..., 1] -= origin[..., 1]
+    moved[..., 3::2] -= origin[..., :1]
+    moved[..., 4::2] -= origin[..., 1:2]
+    return moved
+
+
 def points_of(state: Array) -> ComplexArray:
     """Robot position and landmarks as complex numbers, shape (..., 1 + n)."""
     x = np.concatenate([state[..., :1], state[..., 3::2]], axis=-1)

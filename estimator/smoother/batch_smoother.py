@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from ...arrays import Array, IntArray
 from ..interface import Belief, SlamEstimator, SupportsSmoothing
 from ..map_management.managed_slam import ManagedFilter
 from ..models.bearing_range import locate_landmark, wrap_angle
+from ..models.rigid_motion import seen_from
 from ..models.sensors import BEARING_RANGE
 from ..support import argument_checks
 from ..support.argument_checks import LandmarkIds
@@ -118,14 +120,34 @@ def smooth(
             tolerance=tolerance,
             iterations=iterations,
         )
-    kernel, given = robust_kernel(robust, robust_scale), landmarks
+    kernel, given = robust_kernel(robust, robust_scale), landmarks or {}
+    # Far from the world's origin, coordinates are rounded by more than the last steps.
+    origin = drive.initial_pose[:2]
+    drive, given, start = drive.seen_from(origin), *_seen_from(origin, given, start)
     if not drive.sensor.places:
-        drive, start, given = _placed(drive, start, landmarks or {})
+        drive, start, given = _placed(drive, start, given)
     arrays, order = drive.arrays()
     optimiser = Optimiser(arrays, Noise(drive.sensor, drive.rules, *kernel))
-    starts = _starts(drive, start, _places(given or {}, order), order)
+    starts = _starts(drive, start, _places(given, order), order)
     found = _best(optimiser, starts, tolerance, iterations)
-    return SmoothedDrive(optimiser, found, order.tolist(), drive)
+    return SmoothedDrive(optimiser, found, order.tolist(), drive, origin)
+
+
+def _seen_from(
+    origin: Array, landmarks: Mapping[int, ArrayLike], start: Start | None
+) -> tuple[dict[int, ArrayLike], Start | None]:
+    """Return what to start from with positions relative to another origin."""
+    given: dict[int, ArrayLike] = {
+        i: argument_checks.finite_vector(f"landmarks[{i}]", place, 2) - origin
+        for i, place in landmarks.items()
+    }
+    if start is None:
+        return given, None
+    if isinstance(start, Belief):
+        return given, replace(start, mean=seen_from(origin, start.mean))
+    poses = argument_checks.as_floats("start", start)
+    shaped = poses.ndim > 0 and poses.shape[-1] == 3  # else refused with its shape
+    return given, seen_from(origin, poses) if shaped else poses
 
 
 def smooth_repaired(found: Reassociation, **options: Any) -> SmoothedDrive:
@@ -274,10 +296,17 @@ class SmoothedDrive:
         The landmarks in the order of the elimination.
     drive : Drive
         What was smoothed.
+    origin : ndarray, shape (2,)
+        About which the optimiser and the drive know their positions [m].
     """
 
     def __init__(
-        self, optimiser: Optimiser, solution: Solution, order: list[int], drive: Drive
+        self,
+        optimiser: Optimiser,
+        solution: Solution,
+        order: list[int],
+        drive: Drive,
+        origin: Array,
     ) -> None:
         estimate = solution.estimate
         #: Half the sum of the squared, normalised residuals; of a robust kernel, ρ.
@@ -289,7 +318,7 @@ class SmoothedDrive:
         #: In the order of their first reading.
         self.landmark_ids = drive.landmark_ids
         #: (x, y, θ), shape (N, 3) [m, m, rad], heading in [-π, π).
-        self.poses = estimate.poses.copy()
+        self.poses = estimate.poses + np.append(origin, 0.0)
         self.poses[:, 2] = wrap_angle(self.poses[:, 2])
         self._motions, self._noise = tuple(drive.motions), drive.motion_noise
         #: Number of readings of landmarks.
@@ -298,7 +327,7 @@ class SmoothedDrive:
         #: Number of components of readings of the poses themselves.
         self.pose_components = drive.pose_components
         self._slots = {i: slot for slot, i in enumerate(order)}
-        self._all = estimate.landmarks
+        self._all = estimate.landmarks + np.tile(origin, len(order))
         #: Positions in the order of `landmark_ids`, shape (n, 2) [m].
         self.landmarks = self._all[self._columns(self.landmark_ids)].reshape(-1, 2)
         self._optimiser, self._solution = optimiser, solution

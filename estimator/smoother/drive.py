@@ -246,6 +246,19 @@ class Drive:
         )
         return made
 
+    def seen_from(self, origin: Array) -> Drive:
+        """Return the drive with positions relative to another origin (2,) [m]."""
+        made, shift = copy(self), np.append(origin, 0.0)
+        observed = {
+            pose: [
+                given._replace(value=given.value - given.matrix @ shift)
+                for given in readings
+            ]
+            for pose, readings in self._observed.items()
+        }
+        vars(made).update(initial_pose=self.initial_pose - shift, _observed=observed)
+        return made
+
     def sightings(self, pose: int) -> Sightings:
         """Return all readings of one pose."""
         scans = self._sightings[pose]

@@ -255,6 +255,7 @@ def bound_runs(scenario: Scenario, runs: SimulatedRuns) -> PosteriorBound:
         start_std=scenario.start.std,
         pose_std=runs.fix_std,
         sensor=sensor_with_noise(scenario.sensor.kind, scenario),
+        origin=scenario.start.pose[:2],
     )
     return bound._replace(covariances=())
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...arrays import Array
 from ...estimator.interface import Belief
 from ...estimator.models.bearing_range import wrap_angle
-from ...estimator.models.rigid_motion import ERROR_FRAMES, invariant_error
+from ...estimator.models.rigid_motion import ERROR_FRAMES, invariant_error, seen_from
 from ...evaluation import nees
 from ...evaluation.association_scores import (
     AssociationScores,
@@ -190,7 +190,8 @@ def measure_runs(
     failures = dict(filtered.failures)
     for run in range(len(runs.visible)):
         with np.errstate(all="ignore"):  # a diverged run may overflow
-            measured = _measure_path(runs.true_poses[run], filtered, run)
+            truth = runs.true_poses[run]
+            measured = _measure_path(truth, filtered, run, np.array(bound.origin))
             map_measures = _try_to_measure_map(runs, run, filtered, resolution)
         if isinstance(map_measures, Failure):
             failures[run] = map_measures
@@ -247,7 +248,9 @@ def _empty_block(runs: SimulatedRuns) -> Block:
     }
 
 
-def _measure_path(truth: Array, filtered: FilteredRuns, run: int) -> dict[str, Value]:
+def _measure_path(
+    truth: Array, filtered: FilteredRuns, run: int, origin: Array
+) -> dict[str, Value]:
     poses = filtered.trace.poses[run]
     covariances = filtered.trace.pose_covariances[run]
     posed = truth, poses, covariances
@@ -259,7 +262,8 @@ def _measure_path(truth: Array, filtered: FilteredRuns, run: int) -> dict[str, V
         "nis_dof": filtered.trace.degrees_of_freedom[run],
         "position_error": np.hypot(errors[:, 0], errors[:, 1]),
         "position_error_invariant": np.linalg.norm(
-            invariant_error(truth, poses)[:, :2], axis=1
+            invariant_error(seen_from(origin, truth), seen_from(origin, poses))[:, :2],
+            axis=1,
         ),
         "heading_error": wrap_angle(errors[:, 2]),
         "heading_std": np.sqrt(variances[:, 2]),
@@ -328,8 +332,9 @@ def measure_landmarks(
         Of these [m²].
     """
     truth = true_landmarks[ids]
-    states = (np.append(true_pose, truth.ravel()), np.append(pose, landmarks.ravel()))
-    _, centred = invariant_squares(invariant_error(*states))
+    states = np.append(true_pose, truth.ravel()), np.append(pose, landmarks.ravel())
+    near = (seen_from(pose[:2], state) for state in states)
+    _, centred = invariant_squares(invariant_error(*near))
     accuracy = position_accuracy(landmarks, truth)
     return {
         "map_error_centred": float(np.sqrt(centred)),

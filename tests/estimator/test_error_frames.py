@@ -10,6 +10,7 @@ from slamgym.estimator.models.rigid_motion import (
     composed,
     invariant_covariance,
     invariant_error,
+    seen_from,
 )
 from slamgym.evaluation.hypothesis_tests import average_band
 from slamgym.evaluation.nees import heading_nees, normalised_squared_error, pose_nees
@@ -74,11 +75,27 @@ def test_a_belief_gives_its_error_and_the_covariance_of_it(frame):
     belief = Belief(MEAN, P, (4, 9), frame)
     error = belief.error(TRUTH[:3], TRUTH[3:].reshape(2, 2))
     by_hand = {"additive": additive_error, "invariant": invariant_error}[frame]
-    np.testing.assert_allclose(error, by_hand(TRUTH, MEAN), atol=1e-15)
-    expected = P if frame == "additive" else invariant_covariance(MEAN, P)
+    truth, mean = (seen_from(MEAN[:2], state) for state in (TRUTH, MEAN))
+    np.testing.assert_allclose(error, by_hand(truth, mean), atol=1e-15)
+    expected = P if frame == "additive" else invariant_covariance(mean, P)
     np.testing.assert_array_equal(belief.error_covariance(), expected)
     other = belief.error(TRUTH[:3], TRUTH[3:], frame="additive")
     np.testing.assert_allclose(other, additive_error(TRUTH, MEAN))
+
+
+def test_the_invariant_error_about_another_origin_is_that_of_the_adjoint():
+    P, origin = np.diag(np.arange(1.0, 8.0)), np.array([7.0, -3.0])
+    adjoint = np.eye(7)
+    adjoint[[0, 1, 3, 4, 5, 6], 2] = np.tile([3.0, 7.0], 3)  # J o
+    truth, mean = (seen_from(origin, state) for state in (TRUTH, MEAN))
+    np.testing.assert_allclose(
+        invariant_error(truth, mean), adjoint @ invariant_error(TRUTH, MEAN), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        invariant_covariance(mean, P),
+        adjoint @ invariant_covariance(MEAN, P) @ adjoint.T,
+        atol=1e-12,
+    )
 
 
 @pytest.mark.parametrize("kind", [list, np.array, dict.fromkeys, tuple])

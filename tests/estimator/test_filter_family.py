@@ -9,6 +9,7 @@ from dense_ekf import DenseEkf
 from dense_family import TWINS, DenseAdaptiveInvariant, belief_of
 from dense_family import tell_truth as tell
 from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
+from far_origins import far_origins, rounding, shifted
 
 from slamgym.estimator import EkfSlam, list_estimators, make_batch, make_estimator
 from slamgym.estimator.smoother.recorded_slam import RecordedSlam
@@ -306,6 +307,41 @@ def test_reset_equals_a_new_filter(case):
     slam.reset((0, 0, 0), (0, 0, 0))
     drive_all(9, 15, slam, fresh)
     assert_same_bits(slam.belief(), fresh.belief())
+
+
+def at_origin(case, far, steps, with_fixes):
+    """Return the belief at the end of a drive and the NIS of its scans."""
+    start = {"initial_pose": (*far, 0), "initial_pose_std": (0.1, 0.1, 0.1)}
+    slam, nis, rng = make(case, **start), [], np.random.default_rng(5)
+    for odometry, readings, truth in drive(7, steps, start_std=(0.1, 0.1, 0.1)):
+        tell_truth(slam, shifted(truth, far), dict(enumerate(SIX + far)))
+        slam.predict(odometry)
+        nis.append(slam.update(readings, IDS).nis)
+        if with_fixes:
+            z = shifted(truth, far)[:2] + 0.3 * rng.standard_normal(2)
+            nis.append(slam.observe_pose(z, np.eye(3)[:2], 0.09 * np.eye(2)).nis)
+    return slam.belief(), np.array(nis)
+
+
+@far_origins
+@pytest.mark.parametrize("with_fixes", [False, True])
+@pytest.mark.parametrize("case", FAMILY)
+def test_a_world_far_from_the_origin_gives_the_same_belief(case, with_fixes, far):
+    if with_fixes and not hasattr(make(case), "observe_pose"):
+        pytest.skip("it takes no readings of the pose")
+    steps = 40
+    (near, nis), (there, nis_there) = (
+        at_origin(case, origin, steps, with_fixes) for origin in ((0, 0), far)
+    )
+    slack = rounding(far, steps)
+    np.testing.assert_allclose(there.mean, shifted(near.mean, far), atol=slack, rtol=0)
+    # Readings notice a rounding by their noise: 2 cm is that of a bearing at 1 m.
+    std = np.sqrt(near.covariance.diagonal())
+    change = (there.covariance - near.covariance) / np.outer(std, std)
+    assert np.abs(change).max() < slack / MEASUREMENT_STD.min()
+    np.testing.assert_allclose(
+        np.sqrt(nis_there), np.sqrt(nis), atol=12 * slack / MEASUREMENT_STD.min()
+    )
 
 
 @pytest.mark.parametrize("case", FAMILY)

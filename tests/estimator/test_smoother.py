@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from dense_smoother import DenseSmoother
 from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
+from far_origins import far_origins, rounding, shifted
 
 from slamgym.estimator import make_estimator
 from slamgym.estimator.map_management import ManagedSlam
@@ -23,6 +24,7 @@ from slamgym.estimator.smoother.optimiser import start_of
 NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
 START_STD = (0.1, 0.2, 0.05)
 RANGE = 7.0  # of the sensor [m]
+IDS = list(range(len(SIX)))
 
 
 def recorded(seed=3, steps=12, start_std=START_STD, **settings):
@@ -56,6 +58,43 @@ def example():
     return smooth(result), moves, scans
 
 
+@far_origins
+@pytest.mark.parametrize("kind", ["bearing_range", "bearing"])
+def test_a_drive_far_from_the_origin_has_the_same_solution(kind, far):
+    found = []
+    for origin in ((0.0, 0.0), far):
+        given = {"initial_pose": (*origin, 0.0), "initial_pose_std": START_STD}
+        made = Drive(**NOISE, **given, sensor=kind)
+        for odometry, readings, truth in drive(3, 30):
+            made.predict(odometry)
+            made.update(readings if kind == "bearing_range" else readings[:, :1], IDS)
+            made.observe_pose(shifted(truth, origin)[:2], np.eye(3)[:2], np.eye(2))
+        found.append(smooth(made, robust="cauchy"))
+    near, there = found
+    slack, mean = rounding(far, 30), near.belief().mean
+    np.testing.assert_allclose(there.poses, shifted(near.poses, far), atol=slack)
+    np.testing.assert_allclose(there.belief().mean, shifted(mean, far), atol=slack)
+    assert there.cost == pytest.approx(near.cost, rel=12 * rounding(far))
+    P, Q = near.belief().covariance, there.belief().covariance
+    np.testing.assert_allclose(Q, P, rtol=0, atol=P.max() * 12 * rounding(far))
+
+
+@far_origins
+def test_a_start_far_from_the_origin_leads_to_the_same_solution(example, far):
+    made, _ = recorded(initial_pose=(*far, 0.0))[:2]
+    near = example[0]
+    starts = [shifted(near.poses, far), replaced_mean(near.belief(), far)]
+    for start in starts:
+        there = smooth(made, start=start)
+        slack = rounding(far, 12)
+        np.testing.assert_allclose(there.poses, shifted(near.poses, far), atol=slack)
+
+
+def replaced_mean(belief, far):
+    """Return a belief about the world at another place."""
+    return replace(belief, mean=shifted(belief.mean, far))
+
+
 def test_solution_cost_and_covariances_are_those_of_dense_least_squares(example):
     made, moves, scans = example
     twin, state, order = dense_twin(made, moves, scans)
@@ -85,7 +124,7 @@ def test_other_sensors_are_smoothed_as_by_dense_least_squares(sensor, std):
     slam = SmoothingSlam(MOTION_STD, initial_pose_std=START_STD, **noise)
     slam.update(np.empty((0, 2)), [])
     moves, scans = [], [(np.empty((0, 2)), [])]
-    for odometry, readings, _ in drive(3, 30):
+    for odometry, readings, _ in drive(3, 12):
         seen = np.arange(len(readings))
         moves.append(odometry)
         scans.append((sensor.read(*from_bearing_range(*readings.T)), seen))

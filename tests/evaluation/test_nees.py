@@ -39,6 +39,32 @@ def test_nees_is_chi_square_in_either_frame(small_errors, frame):
         expect_chi_square(nees, 2)
 
 
+@pytest.mark.parametrize("frame", ["additive", "invariant"])
+@pytest.mark.parametrize("far", [(1e3, -1e3), (451234.5, 4412345.25), (1e9, -1e9)])
+def test_nees_does_not_depend_on_the_origin_of_the_world(small_errors, far, frame):
+    truth, means, covariances = (1e2 * array[:50] for array in small_errors)
+    covariances = 1e2 * covariances
+    shift = np.array([*far, 0, *far, *far])
+    least = np.sqrt(np.linalg.eigvalsh(covariances)[:, 0])  # what an error counts in
+    rounding = 10 * np.spacing(max(np.abs(far))) / least
+    for nees in (pose_nees, position_nees, state_nees, landmark_nees):
+        there = truth + shift, means + shift
+        near = nees(there[0] - shift, there[1] - shift, covariances, frame=frame)
+        found = nees(*there, covariances, frame=frame)
+        slack = (rounding if near.ndim == 1 else rounding[:, None]) * np.sqrt(near)
+        assert (np.abs(found - near) <= slack + 1e-9 * near).all()
+
+
+def test_poses_far_from_the_origin_with_a_thin_covariance_keep_their_nees():
+    rng = np.random.default_rng(3)
+    P = np.diag([0.001, 0.001, 0.05]) ** 2
+    poses = np.zeros((2000, 3))
+    poses[:, 0] = np.linspace(0, 2000, len(poses))
+    truth = poses + rng.standard_normal(poses.shape) * [0.001, 0.001, 0.05]
+    nees = pose_nees(truth, poses, np.tile(P, (2000, 1, 1)), frame="invariant")
+    expect_chi_square(np.tile(nees, RUNS // len(nees)), 3)
+
+
 def test_nees_of_the_relative_map_is_chi_square(small_errors):
     expect_chi_square(relative_map_nees(*small_errors), 4)
 

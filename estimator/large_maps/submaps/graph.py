@@ -23,6 +23,7 @@ from ...models.rigid_motion import (
     ErrorFrame,
     as_covariance,
     compose,
+    invariant_covariance,
     points_of,
     state_of,
 )
@@ -427,9 +428,10 @@ class ActiveSubmap:
 
     def gaussian(self) -> Gaussian:
         """Return pose, landmarks and links, with the error in ``frame``."""
-        gaussian = self.filter.map
-        mean = gaussian.mean[: gaussian.size].copy()
-        return Gaussian(mean, self.filter.belief().error_covariance())
+        mean, covariance, _ = self.filter.map.used
+        if self.filter.frame == "invariant":
+            return Gaussian(mean.copy(), invariant_covariance(mean, covariance))
+        return Gaussian(mean.copy(), covariance.copy())
 
     def remove(
         self, ids: Collection[int], index: LandmarkIndex, shared: Collection[int]
