@@ -4,6 +4,9 @@
 `noise_of_runs` the actual noise of the runs.
 """
 
+import contextlib
+import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
@@ -18,7 +21,9 @@ from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.motions import find_motion
 from ...estimator.models.sensors import Sensor, find_sensor
 from ...estimator.smoother.batch_smoother import smoother_in
+from ...estimator.support.saved_states import is_semidefinite
 from ...evaluation.error_bound import PosteriorBound, posterior_bound
+from ...evaluation.nees import SINGULAR
 from ...evaluation.noise_findings import noise_sums
 from ...sim_configs import Scenario
 from ..runs.filter_settings import FilterSettings, refuse_large_maps
@@ -229,6 +234,105 @@ def _erase(trace: BatchTrace, run: int, step: int) -> None:
     for array in (trace.poses, trace.pose_covariances, trace.nis):
         array[run, step:] = np.nan
     trace.degrees_of_freedom[run, step:] = 0
+
+
+# --------------------------------------------------------------------------------------
+# Why a covariance gives no NEES: which part of it is wrong, and since when.
+
+_POSE_NAMES = ("x", "y", "θ")
+
+
+def covariance_flaw(covariance: Array, names: Sequence[str] = _POSE_NAMES) -> str:
+    """Write why a covariance gives no NEES, "" if it gives one.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (n, n)
+    names : sequence of str
+        Of its n numbers.
+
+    Examples
+    --------
+    >>> covariance_flaw(np.array([[4.0, 4.08], [4.08, 4.0]]), ("x", "y"))
+    'has the correlation 1.02 of x and y'
+    >>> covariance_flaw(np.zeros((3, 3)))
+    'is all zeros'
+    """
+    variances = covariance.diagonal()
+    if not np.isfinite(covariance).all():
+        return "is not finite"
+    if not covariance.any():
+        return "is all zeros"
+    if variances[least := int(variances.argmin())] <= 0:
+        return f"has the variance {variances[least]:.3g} of {names[least]}"
+    correlations = covariance / np.sqrt(np.outer(variances, variances))
+    apart = np.abs(correlations - np.eye(len(variances)))
+    i, j = sorted(divmod(int(apart.argmax()), len(variances)))
+    if apart[i, j] > 1 + 1e-5:
+        rho = float(correlations[i, j])
+        return f"has the correlation {rho:.6g} of {names[i]} and {names[j]}"
+    value = float(np.linalg.eigvalsh((correlations + correlations.T) / 2)[0])
+    if value > SINGULAR:
+        return ""
+    kind = "indefinite" if value < -SINGULAR else "singular"
+    return f"is {kind}: the least eigenvalue of its correlations is {value:.2g}"
+
+
+def belief_flaw(belief: interface.Belief) -> str:
+    """Name the smallest part of an indefinite covariance that is wrong, "" if none is.
+
+    The parts are the pose, single landmarks, a landmark with the pose, two landmarks,
+    and the whole state.
+
+    Examples
+    --------
+    >>> P = np.eye(5)
+    >>> P[0, 3] = P[3, 0] = 1.5
+    >>> print(belief_flaw(interface.Belief(np.zeros(5), P, (7,))))
+    the covariance of the pose and landmark 7 has the correlation 1.5 of x and x of 7
+    """
+    P = (belief.covariance + belief.covariance.T) / 2
+    variances = P.diagonal()
+    if (variances >= 0).all():
+        std = np.sqrt(np.where(variances > 0, variances, 1.0))
+        if is_semidefinite(P / np.outer(std, std)):
+            return ""
+    rows: dict[str, list[int]] = {"the pose": [0, 1, 2]}
+    for slot, landmark in enumerate(belief.landmark_ids):
+        rows[f"landmark {landmark}"] = [3 + 2 * slot, 4 + 2 * slot]
+    singles, pairs = [(name,) for name in rows], itertools.combinations(rows, 2)
+    for parts in itertools.chain(singles, pairs):
+        at = [row for name in parts for row in rows[name]]
+        flaw = covariance_flaw(P[np.ix_(at, at)], _names(parts))
+        if flaw and not flaw.startswith("is singular"):
+            return f"the covariance of {' and '.join(parts)} {flaw}"
+    return f"the covariance of the state {covariance_flaw(P, [''] * len(P))}"
+
+
+def _names(parts: Sequence[str]) -> list[str]:
+    own = [
+        _POSE_NAMES if part == "the pose" else (f"x of {part[9:]}", f"y of {part[9:]}")
+        for part in parts
+    ]
+    return [name for names in own for name in names]
+
+
+def first_flaw(settings: FilterSettings, runs: SimulatedRuns, run: int) -> str:
+    """Repeat a run, and write since when and where its covariance is indefinite.
+
+    It is "" if it never is, or if the filter knows the truth.
+    """
+    slam = settings.make(runs.initial_poses[run])
+    trace = FilteredRuns.unknown(runs).trace
+    recorder = DecisionRecorder(slam)
+    if isinstance(slam, interface.SupportsTruth):
+        return ""
+    with contextlib.suppress(Exception):  # of a filter that fails after this
+        for step in range(runs.visible.shape[1]):
+            belief = _step(slam, runs, run, step, trace, recorder)
+            if flaw := belief_flaw(belief):
+                return f"since step {step}, {flaw}"
+    return ""
 
 
 _MANY = 6  # deviations that a displacement hardly exceeds

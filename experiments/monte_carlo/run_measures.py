@@ -7,12 +7,12 @@ above that of the same filter with known identities on the same readings.
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, BoolArray
 from ...estimator.interface import Belief
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.rigid_motion import ERROR_FRAMES, invariant_error, seen_from
@@ -32,7 +32,14 @@ from ..logs.slamlog import NO_LANDMARK
 from ..runs.filter_settings import FilterSettings
 from ..runs.simulated_runs import SimulatedRuns
 from ..runs.trace import compare_association
-from .filtered_runs import Failure, FilteredRuns, filter_runs, sensor_with_noise
+from .filtered_runs import (
+    Failure,
+    FilteredRuns,
+    covariance_flaw,
+    filter_runs,
+    first_flaw,
+    sensor_with_noise,
+)
 
 Block = dict[str, NDArray[np.generic]]
 
@@ -204,7 +211,67 @@ def measure_runs(
     block["noise_sums"] = noise
     block["readings"] = runs.visible.sum(axis=(1, 2))
     write_failures(block, failures)
+    _explain_gaps(block, filtered)
     return block
+
+
+#: A NEES or NIS above counts as none: squares of larger numbers would overflow.
+LARGEST_SCORE = 1e100
+
+
+def gaps_of(block: Any, frame: str = "invariant") -> tuple[int, BoolArray]:
+    """Return the first step that has a NEES, >= 1, and the later steps without one.
+
+    Steps without a NIS, though they have readings, count as well.
+
+    Parameters
+    ----------
+    block : mapping or Dataset
+        Results by name, of one estimator.
+    frame : {"invariant", "additive"}
+        Error coordinates of the NEES.
+
+    Returns
+    -------
+    int
+    ndarray of bool, shape (B, T)
+    """
+    nis, freedom = np.asarray(block["nis"]), np.asarray(block["nis_dof"])
+    known = np.asarray(block[f"pose_nees_{frame}"]) < LARGEST_SCORE
+    first = 1 + int(known[:, 1:].any(axis=0).argmax())
+    gaps = ~known
+    gaps[:, :first] = False
+    return first, gaps | (~(nis < LARGEST_SCORE) & (freedom > 0))
+
+
+def _explain_gaps(block: Block, filtered: FilteredRuns) -> None:
+    """Write a message for runs that did not fail, but have steps without a NEES."""
+    _, gaps = gaps_of(block)
+    messages = list(block["message"])
+    for run in np.flatnonzero(gaps.any(axis=1) & ~block["failed"].astype(bool)):
+        step = int(gaps[run].argmax())
+        nees_of_step = float(block["pose_nees_invariant"][run, step])
+        flaw = covariance_flaw(filtered.trace.pose_covariances[run, step])
+        if flaw and not nees_of_step < LARGEST_SCORE:
+            messages[run] = f"the covariance of the pose {flaw}"
+        elif not nees_of_step < LARGEST_SCORE:
+            messages[run] = f"its NEES is {nees_of_step:.3g}"
+        else:
+            messages[run] = f"its NIS is {block['nis'][run, step]:.3g}"
+    block["message"] = np.array(messages)
+
+
+def explain_first_gap(
+    block: Block, settings: FilterSettings, runs: SimulatedRuns
+) -> None:
+    """Add to the message of the first such run since when its covariance is wrong."""
+    messages = list(block["message"])
+    explained = np.array([bool(message) for message in messages])
+    for run in np.flatnonzero(explained & ~block["failed"].astype(bool))[:1].tolist():
+        flaw = first_flaw(settings, runs, run)
+        if flaw and messages[run] not in flaw:
+            messages[run] = f"{messages[run]}; {flaw}"
+    block["message"] = np.array(messages)
 
 
 def _try_to_measure_map(

@@ -49,6 +49,7 @@ from .run_measures import (
     ORACLE,
     SMALL_NOISE,
     Block,
+    explain_first_gap,
     measure_runs,
     oracle_of_runs,
     with_known_ids,
@@ -306,6 +307,7 @@ class _Work:
             part = measure_runs(
                 runs, filtered, bound, noise, resolution=self.job.resolution
             )
+            explain_first_gap(part, settings, runs)
             if runs.true_ids is not None:
                 part |= with_known_ids(settings, runs, self.threads)
                 part[ORACLE] = oracle

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import textwrap
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
@@ -40,7 +41,14 @@ from ...evaluation.hypothesis_tests import EQUIVALENCE_MARGIN
 from ...suggestions import counted
 from ..runs.summary import MOST_REJECTED, NIS_RANGE, nis_suspicion
 from ..runs.trace import finite, quotient
-from .run_measures import KNOWN_IDS_ATE, KNOWN_IDS_NEES, LARGER, PREFIX, SMALL_NOISE
+from .run_measures import (
+    KNOWN_IDS_ATE,
+    KNOWN_IDS_NEES,
+    LARGER,
+    PREFIX,
+    SMALL_NOISE,
+    gaps_of,
+)
 
 CONSISTENT = "consistent"
 NEARLY = "nearly consistent"
@@ -249,7 +257,7 @@ LARGE_MAP = 1.2
 
 _MOST_GROUPS = 3
 _MOST_SEEDS = 5
-_LETTERS = 160  # of a message
+_LETTERS = 240  # of a message
 
 
 def failure_groups(failures: Iterable[FailedRun]) -> list[dict[str, Any]]:
@@ -269,8 +277,15 @@ def failure_groups(failures: Iterable[FailedRun]) -> list[dict[str, Any]]:
     groups: dict[str, dict[str, Any]] = {}
     for run, step, message in failures:
         new = {"count": 0, "message": message, "run": run, "step": step}
-        groups.setdefault(message, new)["count"] += 1
+        groups.setdefault(_kind(message), new)["count"] += 1
     return sorted(groups.values(), key=lambda group: -int(group["count"]))
+
+
+def _kind(message: str) -> str:
+    """Return a message about a covariance without its numbers, and others as is."""
+    if not message.startswith("the covariance of the pose "):
+        return message
+    return re.sub(r"-?\d[\d.]*(e[+-]\d+)?", "", message.partition(";")[0])
 
 
 def run_warnings(entries: Mapping[str, Mapping[str, Any]], runs: int) -> list[str]:
@@ -553,7 +568,6 @@ def _known_nees(scores: EstimatorScores, frame: ErrorFrame) -> Array | None:
 
 POSE_FREEDOM, POINT_FREEDOM = 3, 2
 _FIRST = 1
-_LARGEST = 1e100  # squares of larger numbers would overflow
 _NO_MESSAGE = "its NEES or NIS is not finite, or above 1e100"
 
 
@@ -622,13 +636,7 @@ def scores_of(dataset: xr.Dataset, label: str, frame: ErrorFrame) -> EstimatorSc
     """
     one_of("frame", frame, ERROR_FRAMES)
     results = dataset.sel(estimator=label)
-    nees = results[f"pose_nees_{frame}"].values
-    nis, freedom = results["nis"].values, results["nis_dof"].values
-    known = nees < _LARGEST
-    first = _FIRST + int(known[:, _FIRST:].any(axis=0).argmax())
-    gaps = ~known
-    gaps[:, :first] = False
-    gaps |= ~(nis < _LARGEST) & (freedom > 0)
+    first, gaps = gaps_of(results, frame)
     flagged = results["failed"].values.astype(bool)
     good = ~(flagged | gaps.any(axis=1))
     at = np.where(flagged, results["failed_at"].values, gaps.argmax(axis=1))

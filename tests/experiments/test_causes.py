@@ -170,6 +170,71 @@ def test_errors_in_the_code_of_a_filter_are_not_called_linearisation(tmp_path):
     assert causes(without) == dict.fromkeys(wrong, "cannot tell")
 
 
+class WithCovariance(EkfSlam):
+    """Reports another covariance from the twelfth correction on."""
+
+    steps = 0
+
+    def update(self, measurements, landmark_ids=None):
+        self.steps += 1
+        return super().update(measurements, landmark_ids)
+
+    def belief(self, landmark_ids=None):
+        found = super().belief(landmark_ids)
+        changed = found.covariance.copy()
+        if self.steps >= 12:
+            self.change(changed)
+        return replace(found, covariance=changed)
+
+
+class Correlated(WithCovariance):
+    def change(self, P):
+        P[0, 1] = P[1, 0] = 1.02 * np.sqrt(P[0, 0] * P[1, 1])
+
+
+class Certain(WithCovariance):
+    def change(self, P):
+        P[:] = 0.0
+
+
+class Negative(WithCovariance):
+    def change(self, P):
+        P[2, 2] *= -1.0
+
+
+class Crossed(WithCovariance):
+    """Errs first between the pose and a landmark, three steps later in the pose."""
+
+    def change(self, P):
+        P[0, 3] = P[3, 0] = 1.3 * np.sqrt(P[0, 0] * P[3, 3])
+        if self.steps >= 15:
+            P[0, 0] *= -1.0
+
+
+@pytest.mark.parametrize(
+    ("filter_class", "step", "text"),
+    [
+        (Correlated, 11, r"the pose has the correlation 1\.02 of x and y$"),
+        (Certain, 11, "the pose is all zeros$"),
+        (Negative, 11, r"the pose has the variance -[\d.e-]+ of θ$"),
+        (
+            Crossed,
+            14,
+            r"of the pose has the variance -.* of x; since step 11, the covariance of "
+            r"the pose and landmark (\d) has the correlation -?1\.3 of x and x of \1$",
+        ),
+    ],
+)
+def test_a_run_without_nees_names_the_wrong_part_of_its_covariance(
+    filter_class, step, text
+):
+    results = monte_carlo(WORLD.with_changes(steps=20), {"bad": filter_class}, 3, SEED)
+    entry = summarise_monte_carlo(results)["estimators"]["bad"]
+    (group,) = entry["failure_groups"]
+    assert (group["count"], group["step"]) == (3, step)
+    assert re.search(text, group["message"]), group["message"]
+
+
 def test_only_a_consistent_filter_is_honest():
     entry = summary_of(WORLD, runs=20)["estimators"]["invariant"]
     is_honest = entry["diagnosis"]["cause"] == "honest"
