@@ -621,10 +621,15 @@ def _rest_of(
     lost = is_known & diverged_runs(POSE * after["pose"][:, None])
     few_lost = lost.sum() <= _FEW_LOST * is_known.sum()
     kept = is_known & ~lost if few_lost else is_known
-    heading = after["heading"][kept, None] if "heading" in after else np.empty((0, 0))
-    errors = errors_of(POSE * after["pose"][kept, None], heading)
-    remains = errors.p_value < _ERROR_RATE and (errors.ratio - 1) * sign > 0
-    of = errors.of if remains else of
+    off = {
+        name: abs(math.log(max(float(values[kept].mean()), 1e-300)))
+        for name, values in after.items()
+        if (values[kept].mean() - 1) * sign > 0
+        and _beyond_margin(values[kept]) < _ERROR_RATE / len(after)
+    }
+    many_lost = bdtrc(lost.sum() - 1, is_known.sum(), DIVERGED_RATE) < _ERROR_RATE
+    remains = bool(off) or (sign > 0 and not few_lost and bool(many_lost))
+    of = max(off, key=lambda name: off[name], default=of)
     ratio, interval = float(after[of][kept].mean()), _interval(after[of][kept])
     return _Rest(of, ratio, *interval, remains, kept, int(lost.sum()), bool(few_lost))
 

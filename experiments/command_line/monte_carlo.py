@@ -6,12 +6,13 @@ import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.text import Text
 
-from ...sim_configs import load_scenario
+from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.field_types import unknown_choice
 from . import options
 from .program import FAILURE, BadInputError, Reporter, command, interruptible
@@ -130,6 +131,7 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
     ):
         summary = monte_carlo.summarise_monte_carlo(results)
         summary["files"] = [RESULTS, SUMMARY, REPORT]
+        _quote_checks(summary, world)
         if given.figures:
             summary["files"] += write_figures(results, summary, place, given.figures)
         with replace_own(place / REPORT) as partial:
@@ -139,6 +141,29 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
     share = results.attrs.get(SMALL_NOISE_SHARE, 0.0)
     more = f"Runs with less noise, which show causes, took {share:.0%} of the time."
     return show_study(reporter, summary, place, *[more] * bool(share))
+
+
+_MOST_FINDINGS = 2
+
+
+def _quote_checks(summary: dict[str, Any], world: Scenario) -> None:
+    """Add findings of `check_estimator` about own filters that are not consistent.
+
+    The check has a world of its own, with the sensor and the motion of the presets.
+    """
+    from ...estimator.check_estimator import find_breaches
+    from ...estimator.registry import find_estimator
+    from ..monte_carlo.verdict import KINDS
+
+    if world.sensor.kind != "bearing_range" or not world.sensor.identities:
+        return
+    for entry in summary["estimators"].values():
+        is_bad = KINDS[entry["verdict"]] == "bad" or entry["failed_runs"]
+        if ":" not in entry["name"] or not is_bad:
+            continue
+        factory = partial(find_estimator(entry["name"]), **(entry["options"] or {}))
+        found = find_breaches(factory, ("required", "correct"))
+        entry["check"] = [finding.message for finding in found[:_MOST_FINDINGS]]
 
 
 _MOST_COLUMNS = 4  # of estimators, in a terminal of 80

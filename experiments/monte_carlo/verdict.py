@@ -413,7 +413,9 @@ def diagnosis_summary(
 
 
 def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
-    """Write the cause in an entry of the summary, and seeds to look at, as lines.
+    """Write the cause in an entry of the summary, and what helps to find it, as lines.
+
+    These are findings of `check_estimator` and seeds to look at.
 
     Examples
     --------
@@ -424,6 +426,7 @@ def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
     found, lines = entry.get("diagnosis"), []
     if found is not None and found["cause"] != HONEST:
         lines.append(f"cause: {found['sentence']}")
+    lines += [f"check_estimator finds: {text}" for text in entry.get("check", ())]
     if seeds := entry.get("seeds_sentence"):
         lines.append(seeds)
     return tuple(f"{label}: {line}" for line in lines)

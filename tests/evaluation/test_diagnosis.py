@@ -288,6 +288,15 @@ def test_an_excess_that_remains_in_the_pose_alone_does_not_vanish():
     assert diagnose(**scores, small_noise=few).cause == "linearisation"
 
 
+def test_a_cautious_heading_does_not_hide_an_excess_that_remains():
+    scores = wrong(11, 25.0)
+    small = less_noise(scores, 0.75 / 24, factor=0.01)
+    small = small._replace(heading_nees=0.5 * small.heading_nees)
+    found = diagnose(**scores, small_noise=small)
+    assert found.cause == "wrong covariance"
+    assert "the squared errors of the pose are 1.7" in found.sentence
+
+
 def test_an_excess_with_very_large_innovations_is_not_of_the_linearisation():
     scores = wrong(11, 40.0)
     small = less_noise(scores, 0.001)

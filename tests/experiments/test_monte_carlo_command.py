@@ -162,3 +162,31 @@ def test_a_noise_study_over_many_runs_writes_figure_and_table(here):
     assert "--change must be" in refused(
         "noise-study", "anchored", "--runs", 3, "--change", "filtre"
     )
+
+
+CARELESS = """
+from slamgym.estimator import EkfSlam, InvariantEkfSlam
+
+class Good(InvariantEkfSlam):
+    pass
+
+class Careless(EkfSlam):
+    def predict(self, odometry, dt=1.0):
+        super().predict(odometry, 0.0)
+"""
+
+
+def test_a_filter_of_ones_own_that_is_not_consistent_is_checked(here, monkeypatch):
+    (here / "careless.py").write_text(CARELESS)
+    monkeypatch.syspath_prepend(here)
+    names = "careless:Good,careless:Careless,ekf"
+    result = slamgym("monte-carlo", "anchored", "-e", names, "--runs", 20)
+    assert result.exit_code == 0, result.stderr
+    words = " ".join(result.stdout.split())
+    finding = "careless:Careless: check_estimator finds: predict(): the motion noise is"
+    assert finding in words
+    assert "careless:Good: check_estimator" not in words
+    (file,) = here.glob("results/*/summary.json")
+    entries = json.loads(file.read_text())["estimators"]
+    assert ["check" in entry for entry in entries.values()] == [False, True, False]
+    assert len(entries["careless:Careless"]["check"]) <= 2
