@@ -134,6 +134,11 @@ class Drive:
         return len(self._motions)
 
     @property
+    def readings_until(self) -> IntArray:
+        """How many readings of odometry lead to each pose, shape (N,)."""
+        return np.cumsum([len(motion.steps) for motion in self._motions])
+
+    @property
     def readings(self) -> int:
         """Number of readings."""
         return sum(len(scan.ids) for scan in self.scans)

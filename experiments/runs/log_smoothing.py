@@ -22,7 +22,7 @@ from ...estimator.smoother.batch_smoother import smooth_repaired, smoother_in
 from ...estimator.smoother.drive import Sightings
 from ...evaluation import nees
 from ..logs.ground_truth import path_accuracy, true_landmarks_of, true_poses_of
-from ..logs.recording import predictions_until, steps_of
+from ..logs.recording import predictions_until
 from ..logs.slamlog import SlamLog
 from . import summary
 from .filter_settings import FilterSettings, one_blas_thread
@@ -95,12 +95,15 @@ def smooth_log(
     smoother = smoother_in(slam)  # of the hypothesis that is the best one now
     repair: Reassociation | None = None
     drive: SmoothedPath | None = None
+    readings = predictions_until(log)
     with one_blas_thread():
         recorder = getattr(slam, "filter", slam)
         if associate and isinstance(recorder, SmoothingSlam):
+            whole = _with_all_readings(recorder.recorded(), log, slam)
+            ends = np.searchsorted(readings, whole.readings_until, side="right") - 1
             repair = reassociate(
-                _with_all_readings(recorder.recorded(), log, slam),
-                start=filtered.trace.poses[_scan_steps(log)],
+                whole,
+                start=filtered.trace.poses[ends],
                 progress=repairing or (lambda done, steps: None),
             )
             drive = smooth_repaired(repair, **recorder.kernel)
@@ -108,7 +111,6 @@ def smooth_log(
             drive = smoother.smoothed()
     if not isinstance(drive, SmoothedDrive):
         raise ValueError(f"estimator '{settings.estimator}' is not slamgym's smoother")
-    readings = predictions_until(log)
     scan_steps = np.searchsorted(readings, drive.readings_until).astype(np.int64)
     return SmoothedLog(filtered, drive, drive.path[readings], scan_steps, repair)
 
@@ -133,12 +135,6 @@ def _with_all_readings(drive: Drive, log: SlamLog, slam: SlamEstimator) -> Drive
         near = z[:, 1] >= drive.rules.min_range
         sightings.append(Sightings(z[near], np.array(ids, dtype=np.int64)[near]))
     return drive.with_scans(sightings)
-
-
-def _scan_steps(log: SlamLog) -> IntArray:
-    """Return the steps whose poses are those of a drive: the first, and all scans."""
-    scanned = [step.scan is not None for step in steps_of(log)]
-    return np.flatnonzero([True, *scanned[1:]])
 
 
 def summarise_smoothing(
