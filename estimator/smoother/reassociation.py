@@ -1,16 +1,21 @@
 """Repair the association of a drive: find the landmark of each reading.
 
-`reassociate` alternates smoothing and association.  It accepts a change if that lowers
-the score of the whole drive ::
+`reassociate` alternates smoothing and association.  A change of the search lowers the
+score of the whole drive ::
 
-    J = smoothed cost + ½ ln det S + m ln (A / 2π) + c u + d v
+    J = smoothed cost + ½ ln det S + m ln (A / 2π) + c u − ln L
 
 with the information S of the m landmarks after the poses are eliminated, and the area A
 that the readings cover: together the negative logarithm of the evidence, by Laplace's
 approximation [1]_.  u readings are given to no landmark, each for the price c of
-clutter.  v times a scan does not show a landmark that is well in view, between its
-first and its last reading; without this price d, two landmarks for one would lower the
-cost, each of them with the nearer half of the readings.
+clutter.  L is the likelihood of the detections: scans show or miss the landmarks that
+are well in view, as a Markov chain with two states, whose rates are those of the drive.
+Without it, two landmarks for one would lower the cost, each of them with the nearer
+half of the readings; but then each of them is missed when the other is shown.
+
+The result must be better by more than chance where both associations explain equally
+many readings; else the drive stays as it was given.  Real readings have errors that no
+noise explains, and an additional landmark explains them at the price of a wrong path.
 
 The search begins with the associations given or, if these score lower, with those of
 the default filter.  Small changes keep the poses: readings go to the landmarks that
@@ -48,12 +53,13 @@ from .optimiser import Estimate, Noise, Optimiser, filter_options, moved_along, 
 NONE = -1  # the landmark of a reading that has none
 #: c: a reading costs no more; half of χ² with two degrees of freedom, 99.75 %.
 PRICE = 6.0
-#: What a landmark costs that is well in view of a scan, but not in it.
-MISS = 1.0
 #: Readings of the smallest landmark.
 LEAST = 3
-#: Least decrease of the score that counts.
+#: Least decrease of the score that counts in the search.
 SIGNIFICANT = 0.1
+#: Least decrease for the result, in standard deviations of the cost of n readings: √n,
+#: since twice this cost is χ² with 2n degrees of freedom.
+CHANCE = 5.0
 ROUNDS, BIRTHS, SEEDS = 8, 10, 150  # of small changes
 GAP = 30  # scans without a landmark that end a visit
 PARTS = 8  # into which the drive is taken apart
@@ -75,6 +81,9 @@ class Reassociation(NamedTuple):
     score: float
     #: J before.
     first_score: float
+    #: Whether another association is better by more than chance; else the association
+    #: is the given one, without the landmarks of too few readings.
+    changed: bool
 
 
 def reassociate(
@@ -98,7 +107,8 @@ def reassociate(
     Returns
     -------
     Reassociation
-        Its score is no higher than before.
+        Its score is lower than before by more than chance, or its association is that
+        of `drive`.
 
     Raises
     ------
@@ -128,7 +138,8 @@ def reassociate(
     if trial is not None and trial.score < best.score:
         best = trial
     progress(steps, steps)
-    return search.result(best, first.score)
+    changed = first.advantage_of(best) > CHANCE * math.sqrt(min(first.used, best.used))
+    return search.result(best if changed else first, first.score, changed)
 
 
 class _State(NamedTuple):
@@ -138,7 +149,25 @@ class _State(NamedTuple):
     poses: Array  # (N, 3)
     places: Array  # of the landmarks, shape (m, 2)
     score: float
+    cost: float  # of motions and readings
     covariance: Array  # of the landmarks, shape (2m, 2m)
+
+    @property
+    def used(self) -> int:
+        """How many readings are given to landmarks."""
+        return int((self.labels != NONE).sum())
+
+    def advantage_of(self, other: _State) -> float:
+        """Return by how much another state is better with equally many readings.
+
+        The state that explains more readings gets the cost of as many as the other one
+        explains, by its average, and no credit for the others.
+        """
+        mine, others = self.used, other.used
+        gain = self.score - PRICE * (len(self.labels) - mine) - self.cost
+        gain -= other.score - PRICE * (len(other.labels) - others) - other.cost
+        gain += self.cost * min(1.0, others / mine)
+        return gain - other.cost * min(1.0, mine / others)
 
 
 class _Search:
@@ -149,6 +178,7 @@ class _Search:
         self.noise = Noise(drive.sensor, drive.rules, 0.0, 1.0)
         counts = np.diff(self.data.firsts)
         self.count = len(counts)
+        self.empty = counts == 0
         self.owners = np.repeat(np.arange(self.count), counts)
         self.starts = self.data.firsts[:-1][counts > 0]
         self.rows = np.arange(len(self.owners))
@@ -229,11 +259,12 @@ class _Search:
         labels = np.full_like(labels, NONE)
         labels[used] = slots
         score = found.cost + PRICE * float((~used).sum())
-        score += MISS * self.missed(found.estimate.poses, places, labels)
+        score += _surprise(self.detections(found.estimate.poses, places, labels))
         score += len(rows) * (self.log_area - math.log(2 * math.pi))
         score += float(np.linalg.slogdet(information)[1]) / 2
         covariance = inverse[np.ix_(entries, entries)]
-        return _State(labels, found.estimate.poses, places, score, covariance)
+        poses = found.estimate.poses
+        return _State(labels, poses, places, score, found.cost, covariance)
 
     def settled(self, state: _State) -> _State:
         """Make small changes until none lowers the score."""
@@ -253,8 +284,9 @@ class _Search:
         own = state.covariance.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)]
         information = -float(np.linalg.slogdet(own)[1].mean()) / 2  # of one, at least
         price = self.log_area - math.log(2 * math.pi) + information
+        prices = _prices(self.detections(state.poses, places, state.labels))
         for _ in range(BIRTHS):
-            born = self.birth(state.poses, costs, price)
+            born = self.birth(state.poses, costs, price, prices)
             if born is None:
                 break
             places = np.vstack([places, born])
@@ -283,7 +315,9 @@ class _Search:
             labels[first:last] = np.minimum(linear_sum_assignment(table)[1], m)
         return np.where(labels == m, NONE, labels)
 
-    def birth(self, poses: Array, costs: Array, price: float) -> Array | None:
+    def birth(
+        self, poses: Array, costs: Array, price: float, prices: Array
+    ) -> Array | None:
         """Return the place of a new landmark worth its price, if there is one."""
         labels = self.assigned(costs)
         paid = np.where(labels == NONE, PRICE, costs[self.rows, labels])
@@ -297,7 +331,8 @@ class _Search:
         best = int(gains.sum(axis=0).argmax())
         enough = (gains[:, best] > 0).sum() >= LEAST
         own = np.where(saved[:, best] > 0, 0, NONE)
-        price += MISS * self.missed(poses, located[best, None], own)
+        seen = self.detections(poses, located[best, None], own)
+        price += float((prices * seen).sum())
         worth = gains[:, best].sum() > price
         return located[best] if enough and worth else None
 
@@ -416,24 +451,23 @@ class _Search:
         along = distance[:, None] * np.column_stack([np.cos(ahead), np.sin(ahead)])
         return np.asarray(at[:, :2] + along)
 
-    def missed(self, poses: Array, places: Array, labels: IntArray) -> int:
-        """Return how often scans do not show a landmark that is in view.
+    def detections(self, poses: Array, places: Array, labels: IntArray) -> IntArray:
+        """Count how scans show the landmarks that are well in view, shape (2, 2).
 
-        Only scans between its first and its last reading count.
+        Entry [a, b] counts the scans in which a landmark is missed (b = 0) or shown
+        (1), and was so (a) in the scan before that had it in view.
         """
         d = places - poses[:, None, :2]
         ahead = np.arctan2(d[..., 1], d[..., 0]) - poses[:, 2:]
         in_view = np.hypot(d[..., 0], d[..., 1]) <= self.reach
         in_view &= np.abs(wrap_angle(ahead)) <= self.width
-        used = np.flatnonzero(labels != NONE)
-        scans, own = self.owners[used], labels[used]
-        first, last = np.full((2, len(places)), [[len(in_view)], [-1]])
-        np.minimum.at(first, own, scans)
-        np.maximum.at(last, own, scans)
-        number = np.arange(len(in_view))[:, None]
-        in_view &= (number > first) & (number < last)
-        in_view[scans, own] = False
-        return int(in_view.sum())
+        in_view[self.empty] = False
+        used, shown = labels != NONE, np.zeros(in_view.shape, dtype=np.int64)
+        shown[self.owners[used], labels[used]] = 1
+        own, scans = np.nonzero(in_view.T)  # one landmark after the other
+        states, same = shown[scans, own], own[1:] == own[:-1]
+        pairs = 2 * states[:-1] + states[1:]
+        return np.bincount(pairs[same], minlength=4).reshape(2, 2)
 
     def costs(self, poses: Array, places: Array) -> Array:
         """Return ½ νᵀ Q⁻¹ ν of readings and landmarks, at most c, shape (M, m)."""
@@ -442,11 +476,11 @@ class _Search:
         fill_costs(poses, self.owners, self.data.readings, places, values, found)
         return found
 
-    def result(self, state: _State, first_score: float) -> Reassociation:
+    def result(self, state: _State, first: float, changed: bool) -> Reassociation:
         """Return the drive with the associations of a state."""
         drive = self.relabelled(state.labels)
         ids = self.by_scan(state.labels)
-        return Reassociation(drive, state.poses, ids, state.score, first_score)
+        return Reassociation(drive, state.poses, ids, state.score, first, changed)
 
     def by_scan(self, labels: IntArray) -> list[IntArray]:
         """Return the labels of each scan."""
@@ -482,6 +516,18 @@ def fill_costs(
                 turn = wrap_angle_jit(math.atan2(dy, dx) - pose[2] - z[0])
                 cost += turn**2 / (2 * to_bearing)
                 costs[i, j] = min(costs[i, j], cost)
+
+
+def _surprise(counts: IntArray) -> float:
+    """Return −ln of the likelihood of detections, with the rates of these counts."""
+    rates = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+    return -float((counts * np.log(np.where(counts > 0, rates, 1.0))).sum())
+
+
+def _prices(counts: IntArray) -> Array:
+    """Return the price of one more detection or miss after each, shape (2, 2)."""
+    rates = (counts + 0.5) / (counts.sum(axis=1, keepdims=True) + 1.0)
+    return np.asarray(-np.log(rates))
 
 
 def _renamed(labels: IntArray, rename: IntArray) -> IntArray:

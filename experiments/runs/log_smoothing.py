@@ -106,8 +106,9 @@ def smooth_log(
                 start=filtered.trace.poses[ends],
                 progress=repairing or (lambda done, steps: None),
             )
-            drive = smooth_repaired(repair, **recorder.kernel)
-        elif smoother is not None:
+            if repair.changed:
+                drive = smooth_repaired(repair, **recorder.kernel)
+        if drive is None and smoother is not None:
             drive = smoother.smoothed()
     if not isinstance(drive, SmoothedDrive):
         raise ValueError(f"estimator '{settings.estimator}' is not slamgym's smoother")

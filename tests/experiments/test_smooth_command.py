@@ -12,7 +12,14 @@ from drives import MEASUREMENT_STD, MOTION_STD, drive
 from slamgym.estimator.smoother import Drive, SmoothedDrive, smooth
 from slamgym.evaluation.trajectory_error import Alignment
 from slamgym.experiments.figures.maps import smoothed_figure
-from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog, write_slamlog
+from slamgym.experiments.logs.ground_truth import true_poses_of, without_identities
+from slamgym.experiments.logs.slamlog import (
+    OdometryRow,
+    Scan,
+    SlamLog,
+    read_slamlog,
+    write_slamlog,
+)
 from slamgym.experiments.runs.filter_settings import SMOOTHER, settings_for
 from slamgym.experiments.runs.log_smoothing import smooth_log, summarise_smoothing
 from slamgym.experiments.runs.summary import summarise
@@ -83,6 +90,53 @@ def test_the_smoother_is_closer_to_the_truth_than_the_filter(example):
     assert 0.2 < summary["nees"]["smoother"]["per_degree"] < 3
     assert summary["poses"] == 31
     assert summary["readings"] == 30 * 6
+
+
+def repaired(log):
+    return smooth_log(log, settings_for(log, estimator=SMOOTHER), associate=True)
+
+
+def hidden(events):
+    log = without_identities(replace(a_log(), events=tuple(events)))
+    return replace(log, header=log.header | {"identities": "false"})
+
+
+def test_a_repair_takes_scans_without_motion_and_motion_without_a_scan():
+    """A drive has one pose for the former, and one for the latter."""
+    events = list(a_log().events)
+    at_rest = [e for event in events for e in (event,) * (1 + isinstance(event, Scan))]
+    for changed in (events[:-1], at_rest):
+        found = repaired(hidden(changed))
+        assert found.repair is not None
+        assert found.repair.poses.shape == found.drive.poses.shape
+        assert summarise_smoothing(found)["ate"]["smoother"]["aligned"] < 0.2
+
+
+def test_a_repair_that_finds_nothing_better_leaves_the_smoothed_drive():
+    log = hidden(a_log().events)
+    found = repaired(log)
+    assert found.repair is not None
+    assert not found.repair.changed
+    plain = smooth_log(log, settings_for(log, estimator=SMOOTHER))
+    np.testing.assert_array_equal(found.drive.poses, plain.drive.poses)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("begin", [42, 418, 543])
+def test_a_repair_does_not_harm_a_real_drive(public_logs, begin):
+    whole = without_identities(read_slamlog(public_logs / "utias_d6_r3.csv"))
+    events = tuple(e for e in whole.events if begin <= e.t < begin + 120)
+    start = true_poses_of(whole, np.array([events[0].t]))[0]
+    log = replace(whole, events=events, start=start)
+    noise = {
+        "motion_std": (0.03, 0.05, 0.05),
+        "measurement_std": (0.01, 0.15),
+        "options": {"range_std_per_metre": 0.03},
+    }
+    settings = settings_for(log, estimator=SMOOTHER, **noise)
+    plain, found = smooth_log(log, settings), smooth_log(log, settings, associate=True)
+    errors = [summarise_smoothing(one)["ate"]["smoother"] for one in (plain, found)]
+    assert errors[1]["aligned"] <= 1.05 * errors[0]["aligned"]
 
 
 def test_poses_that_are_certain_have_no_nees(example, monkeypatch):
