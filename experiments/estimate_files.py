@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import AnyArray, Array, IntArray
-from .logs.importers import read_log
+from .logs.importers.any_format import read_true_path
 from .logs.log_lines import LogLine, read_lines
 from .logs.slamlog import LogError
 from .trajectories.manifest import MANIFEST, load_trajectories
@@ -46,12 +46,8 @@ class Estimate(NamedTuple):
 
 
 def true_path(path: Path) -> Array:
-    """Read rows (t, x, y, θ) of TUM, or of a log with ground truth."""
-    line = read_lines(path)[0]
-    if len(line.text.split()) < 8:
-        return read_log(path).ground_truth
-    rows = [_tum_row(line)[:8] for line in _content(path)]
-    return np.array([(t, x, y, _heading(*q)) for t, x, y, _, *q in rows])
+    """Read rows (t, x, y, θ); without times, t counts the poses."""
+    return read_true_path(path).rows
 
 
 _CSV = (

@@ -107,7 +107,7 @@ def smooth(
     if not isinstance(drive, Drive):
         raise TypeError(
             f"drive must be a Drive, got {type(drive).__name__}; smooth_log smooths "
-            "a log"
+            "a log, or the file of one"
         )
     argument_checks.whole("iterations", iterations, 1)
     argument_checks.above("tolerance", tolerance, 0.0)

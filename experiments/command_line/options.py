@@ -117,7 +117,7 @@ class Options:
     robot
         Which robot of a UTIAS folder.
     truth
-        A graph file with the true poses of an iSAM or g2o text, by their ids.
+        The true path: TUM, EuRoC, KITTI, csv, or a log; of a graph also another graph.
     noise_from_file
         Take the noise from the information matrices of an iSAM or g2o text.
     seed

@@ -53,7 +53,8 @@ def replay(
         typer.Argument(
             metavar="LOG",
             help="A slamlog CSV, a course data.txt, a Freiburg sensor.dat, iSAM or g2o "
-            "text, or a folder of UTIAS MR.CLAM or Victoria Park; the content decides.",
+            "text, or a folder of csv files with named columns, UTIAS MR.CLAM or "
+            "Victoria Park; the content decides.",
         ),
     ],
     *,

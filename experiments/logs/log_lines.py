@@ -131,29 +131,33 @@ def content_of(lines: list[LogLine]) -> list[LogLine]:
     >>> [line.text for line in content_of(lines)]
     ['0 1 2']
     """
-    found = []
-    for line in lines:
-        text = line.text
-        if _COMMENT.search(text):
-            text = _COMMENT.split(text, maxsplit=1)[0].strip()
-        if text:
-            found.append(line._replace(text=text))
+    texts = ((line, without_comment(line.text)) for line in lines)
+    found = [line._replace(text=text) for line, text in texts if text]
     if not found:
         raise lines[0].error("rows", "comments only")
     is_header = not any(map(is_number, split_fields(found[0].text)))
     return found[1:] if is_header and len(found) > 1 else found
 
 
+def without_comment(text: str) -> str:
+    """Return a line up to its comment."""
+    return _COMMENT.split(text, maxsplit=1)[0].strip()
+
+
 def split_fields(text: str) -> list[str]:
-    """Split a line at its commas, semicolons or tabs, or else at white space.
+    """Split a line at its semicolons, commas or tabs, or else at white space.
+
+    Between semicolons, a comma is that of a decimal number.
 
     Examples
     --------
-    >>> split_fields("1, 2,,3"), split_fields("1 2  3")
-    (['1', '2', '', '3'], ['1', '2', '3'])
+    >>> split_fields("1, 2,,3"), split_fields("1 2  3"), split_fields("1,5; 2")
+    (['1', '2', '', '3'], ['1', '2', '3'], ['1.5', '2'])
     """
-    separator = next((mark for mark in ",;\t" if mark in text), None)
-    return [field.strip() for field in text.split(separator)]
+    separator = next((mark for mark in ";,\t" if mark in text), None)
+    if separator == ";":
+        text = text.replace(",", ".")
+    return [field.strip(" \t\"'") for field in text.split(separator)]
 
 
 def is_number(field: str) -> bool:

@@ -23,8 +23,8 @@ scan.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -60,13 +60,7 @@ ROW_FORMS = {
 }
 
 
-def refuse_other_log(log: object) -> None:
-    """Refuse what is no log, for example the path of its file."""
-    if not isinstance(log, SlamLog):
-        raise TypeError(f"log must be a SlamLog, as read_log returns it, got {log!r}")
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SlamLog:
     """One drive: the readings of the robot, and the truth as far as it is known.
 
@@ -123,6 +117,23 @@ class SlamLog:
         object.__setattr__(self, "start", start)
         object.__setattr__(self, "ground_truth", truth)
         object.__setattr__(self, "events", tuple(self.events))
+
+    def __repr__(self) -> str:
+        """Summarise the log in a line, whatever its length.
+
+        Examples
+        --------
+        >>> SlamLog("drive", events=(OdometryRow(1.0, 2.0, 0.0, 1.0),))
+        SlamLog('drive', 1 odometry rows, 0 scans, 0 true landmarks, 0 true poses)
+        """
+        counts = {
+            "odometry rows": sum(isinstance(e, OdometryRow) for e in self.events),
+            "scans": len(self.scans),
+            "true landmarks": len(self.landmarks),
+            "true poses": len(self.ground_truth),
+        }
+        parts = ", ".join(f"{count} {what}" for what, count in counts.items())
+        return f"SlamLog({self.name!r}, {parts})"
 
     @property
     def scans(self) -> list[Scan]:
@@ -293,20 +304,36 @@ def _parse(lines: list[LogLine], default_name: str) -> SlamLog:
     parser = _SlamlogParser()
     for line in (*lines[:place], *lines[place + 1 :]):
         parser.take(line)
-    notes = {key: _value(line) for key, line in parser.header.items()}
-    for key in _NOISES & notes.keys():
-        for number in notes[key].split(","):
-            parser.header[key].to_real(number)
-    known = ("name", "motion", "start")
-    return SlamLog(
-        name=notes.get("name", default_name),
-        header={key: value for key, value in notes.items() if key not in known},
-        motion=_motion(parser.header.get("motion")),
-        start=_start(parser.header.get("start")),
+    log = SlamLog(
+        name=default_name,
         landmark_ids=np.array(list(parser.landmarks), dtype=np.int64),
         landmarks=np.array(list(parser.landmarks.values())).reshape(-1, 2),
         events=parser.recorder.finish(),
         ground_truth=np.array(parser.ground_truth).reshape(-1, 4),
+    )
+    return with_header(log, parser.header)
+
+
+def with_header(log: SlamLog, header: Mapping[str, LogLine]) -> SlamLog:
+    """Return a log with what lines ``# key: value`` set, by their keys.
+
+    Raises
+    ------
+    LogError
+        If the value of a known key is none of it.
+    """
+    notes = {key: _value(line) for key, line in header.items()}
+    for key in _NOISES & notes.keys():
+        for number in notes[key].split(","):
+            header[key].to_real(number)
+    known = ("name", "motion", "start")
+    others = {key: value for key, value in notes.items() if key not in known}
+    return replace(
+        log,
+        name=notes.get("name", log.name),
+        header={**log.header, **others},
+        motion=_motion(header["motion"]) if "motion" in notes else log.motion,
+        start=_start(header["start"]) if "start" in notes else log.start,
     )
 
 
@@ -314,9 +341,7 @@ def _value(line: LogLine) -> str:
     return line.text.partition(":")[2].strip()
 
 
-def _motion(line: LogLine | None) -> str:
-    if line is None:
-        return "turn-last"
+def _motion(line: LogLine) -> str:
     motion = _value(line)
     if motion not in UNICYCLES:
         try:
@@ -327,9 +352,7 @@ def _motion(line: LogLine | None) -> str:
     return motion
 
 
-def _start(line: LogLine | None) -> Array:
-    if line is None:
-        return np.zeros(3)
+def _start(line: LogLine) -> Array:
     fields = _value(line).split(",")
     line.check_count(fields, (3,), "# start: x,y,theta")
     return np.array([line.to_real(number) for number in fields])

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc
@@ -28,8 +28,14 @@ from ...evaluation.hypothesis_tests import (
 from ...evaluation.nees import pose_nees
 from ..logs import slamlog
 from ..logs.ground_truth import hides_identities, true_poses_of
+from ..logs.importers.any_format import as_log
 from ..logs.log_lines import read_lines, write_whole
-from ..runs.filter_settings import FilterSettings, one_blas_thread
+from ..runs.filter_settings import (
+    FilterSettings,
+    noise_or_assumed,
+    one_blas_thread,
+    settings_for,
+)
 from ..runs.log_replay import Progress
 from . import search
 from .scoring import associated_log, events_of
@@ -78,8 +84,8 @@ class NoiseFit:
 
 
 def fit_noise(
-    log: slamlog.SlamLog,
-    settings: FilterSettings,
+    log: slamlog.SlamLog | str | PathLike[str],
+    settings: FilterSettings | None = None,
     *,
     progress: Progress | None = None,
     threads: int | None = None,
@@ -88,12 +94,13 @@ def fit_noise(
 
     Parameters
     ----------
-    log : SlamLog
+    log : SlamLog or path
         With odometry and readings.  If it does not identify all landmarks, the filter
         of the settings associates its readings once, with the noise of the settings.
-    settings : FilterSettings
+    settings : FilterSettings, optional
         The noise to begin with, and the filter: one that runs in batches.  Without a
-        gate they get that of the fit, `GATE_PROBABILITY`.
+        gate they get that of the fit, `GATE_PROBABILITY`.  By default, the invariant
+        filter with the noise in the log, or an assumed one.
     progress : callable, optional
         Called with (steps done, steps) while a filter associates readings.
     threads : int, optional
@@ -125,6 +132,10 @@ def fit_noise(
     >>> [(noise.name, noise.verdict) for noise in fit.noise][:2]
     [('σx', 'fitted'), ('σy', 'fitted')]
     """
+    log = as_log(log)
+    if settings is None:
+        stds: dict[str, Any] = {**noise_or_assumed(log, {})}
+        settings = settings_for(log, **stds)
     if not hides_identities(log):
         options = {"gate_probability": GATE_PROBABILITY, **settings.options}
         return _fit_known(log, replace(settings, options=options), threads)

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -26,8 +27,9 @@ from ...estimator.support import argument_checks
 from ...sim_configs import Scenario
 from ...suggestions import closest
 from ..logs.ground_truth import hides_identities
+from ..logs.importers.any_format import as_log
 from ..logs.recording import log_header
-from ..logs.slamlog import UNICYCLES, LogError, SlamLog, refuse_other_log
+from ..logs.slamlog import UNICYCLES, LogError, SlamLog
 
 if TYPE_CHECKING:
     from .simulated_runs import SimulatedRuns
@@ -129,7 +131,7 @@ class FilterSettings:
 
 
 def settings_for(
-    log: SlamLog,
+    log: SlamLog | str | PathLike[str],
     *,
     estimator: str = "invariant",
     motion_std: Sequence[float] | None = None,
@@ -147,7 +149,7 @@ def settings_for(
 
     Parameters
     ----------
-    log : SlamLog
+    log : SlamLog or path
         The log.
     estimator : str
         Registered name or "module:Class", with or without options in brackets, which
@@ -167,7 +169,7 @@ def settings_for(
     LogError
         If a value in the header is malformed.
     """
-    refuse_other_log(log)
+    log = as_log(log)
     name, own = registry.read_label(estimator)
     estimator = OFFLINE.get(name, name)
     factory = registry.find_estimator(estimator)

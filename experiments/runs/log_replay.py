@@ -8,6 +8,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from os import PathLike
 from typing import Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
@@ -17,7 +18,8 @@ from ...estimator import interface
 from ...estimator.interface import Belief, MapView, SlamEstimator, UpdateReport
 from ...estimator.map_management.managed_slam import ManagedFilter
 from ..logs import ground_truth, recording, slamlog
-from .filter_settings import one_blas_thread, refuse_large_map
+from ..logs.importers.any_format import as_log
+from .filter_settings import one_blas_thread, refuse_large_map, settings_for
 from .trace import (
     DecisionRecorder,
     MapEstimate,
@@ -73,8 +75,8 @@ class Replay:
 
 
 def replay(
-    log: slamlog.SlamLog,
-    estimator: SlamEstimator,
+    log: slamlog.SlamLog | str | PathLike[str],
+    estimator: SlamEstimator | str,
     *,
     name: str | None = None,
     keep_history: bool = False,
@@ -89,10 +91,11 @@ def replay(
 
     Parameters
     ----------
-    log : SlamLog
+    log : SlamLog or path
         The log; a scan without landmark ids is left to the estimator to associate.
-    estimator : SlamEstimator
-        At its start, with an empty map; afterwards it is at the end of the log.
+    estimator : SlamEstimator or str
+        At its start, with an empty map; afterwards it is at the end of the log. Or the
+        label of one, for the noise in the log, see `settings_for`.
         One that observes the truth (``ideal``) receives it, if the log holds all of it.
     name : str, optional
         Name of the estimator in the trace; its class by default.
@@ -116,8 +119,7 @@ def replay(
         If the estimator refuses a reading, naming the time in the log; before the
         first step, if the log names more landmarks than a belief of it may hold.
     TypeError
-        If the estimator is no filter, but a class or a name, for example, or the log
-        is a path.
+        If the estimator is no filter, but a class, for example, or the log is none.
     numpy.linalg.LinAlgError
         If its covariance degenerates or is not finite, naming the time too.
     MemoryError
@@ -133,7 +135,10 @@ def replay(
     >>> replay(log, slam).readings
     ReadingCounts(associated=1, added=1, rejected=0, skipped=0, near=1, ...
     """
-    slamlog.refuse_other_log(log)
+    log = as_log(log)
+    if isinstance(estimator, str):
+        name = name or estimator
+        estimator = settings_for(log, estimator=estimator).make(log.start)
     if isinstance(estimator, type) or not hasattr(estimator, "predict"):
         raise TypeError(
             f"estimator must be a filter, as make_estimator returns it, got {estimator}"

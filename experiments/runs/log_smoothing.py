@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import count
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -22,10 +23,17 @@ from ...estimator.smoother.batch_smoother import smooth_repaired, smoother_in
 from ...estimator.smoother.drive import Sightings
 from ...evaluation import nees
 from ..logs.ground_truth import path_accuracy, true_landmarks_of, true_poses_of
+from ..logs.importers.any_format import as_log
 from ..logs.recording import predictions_until
 from ..logs.slamlog import SlamLog
 from . import summary
-from .filter_settings import FilterSettings, one_blas_thread
+from .filter_settings import (
+    SMOOTHER,
+    FilterSettings,
+    noise_or_assumed,
+    one_blas_thread,
+    settings_for,
+)
 from .log_replay import Progress, Replay, replay
 from .trace import accuracy_of, finite
 
@@ -53,8 +61,8 @@ class SmoothedLog:
 
 
 def smooth_log(
-    log: SlamLog,
-    settings: FilterSettings,
+    log: SlamLog | str | PathLike[str],
+    settings: FilterSettings | None = None,
     *,
     associate: bool = False,
     progress: Progress | None = None,
@@ -64,10 +72,11 @@ def smooth_log(
 
     Parameters
     ----------
-    log : SlamLog
+    log : SlamLog or path
         The log.
-    settings : FilterSettings
-        Of `SMOOTHER`; by ``management`` it associates readings without identity.
+    settings : FilterSettings, optional
+        Of `SMOOTHER`; by ``management`` it associates readings without identity. By
+        default with the noise in the log, or an assumed one.
     associate : bool
         Whether to repair the associations of the filter by the whole drive, see
         `reassociate`.
@@ -82,6 +91,10 @@ def smooth_log(
     numpy.linalg.LinAlgError
         If the smoother does not converge.
     """
+    log = as_log(log)
+    if settings is None:
+        stds: dict[str, Any] = {**noise_or_assumed(log, {})}
+        settings = settings_for(log, estimator=SMOOTHER, **stds)
     slam = settings.make(log.start)
     if smoother_in(slam) is None:
         raise ValueError(f"estimator '{settings.estimator}' does not smooth")

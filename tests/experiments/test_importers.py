@@ -241,12 +241,9 @@ def test_a_wrong_world_file_is_named(file, log, world, message):
     [
         ({"robot": 3}, "robot needs a UTIAS folder, but .*log.txt is none"),
         ({"noise_from_file": True}, "noise_from_file needs a graph"),
-        ({"truth": "true.txt"}, "truth needs a graph, .*, but .*log.txt is none"),
     ],
 )
 def test_an_option_of_another_format_is_refused(file, option, message):
-    truth = file(ISAM, "true.txt")
-    option = {key: truth if key == "truth" else each for key, each in option.items()}
     with pytest.raises(ValueError, match=message):
         read_log(file(FREIBURG), **option)
 
@@ -749,7 +746,7 @@ def test_an_imported_log_can_be_kept_as_slamlog(file, tmp_path, text):
 
 @pytest.mark.parametrize("text", ["hello world\n", "{}\n", "\x00\x01\n", "1.0 two\n"])
 def test_what_is_no_log_is_refused_with_the_known_formats(file, text):
-    with pytest.raises(LogError, match=r"line 1: expected a log: slamlog 1, a course"):
+    with pytest.raises(LogError, match=r"line 1: .*; the nearest formats are .* and "):
         read_log(file(text))
 
 

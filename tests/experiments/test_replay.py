@@ -14,9 +14,17 @@ from slamgym.experiments.logs.ground_truth import (
 )
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.recording import record_episode, steps_of
-from slamgym.experiments.logs.slamlog import LogError, OdometryRow, Scan, SlamLog
+from slamgym.experiments.logs.slamlog import (
+    LogError,
+    OdometryRow,
+    Scan,
+    SlamLog,
+    numbers,
+    write_slamlog,
+)
 from slamgym.experiments.runs.filter_settings import FilterSettings, settings_for
 from slamgym.experiments.runs.log_replay import MapHistory, replay
+from slamgym.experiments.runs.log_smoothing import smooth_log
 from slamgym.experiments.runs.summary import LOST, pose_nees, summarise
 from slamgym.sim_configs import load_scenario
 
@@ -592,13 +600,25 @@ def test_a_truth_that_is_known_at_some_steps_only_gives_no_warning_of_numpy():
     assert np.isnan(pose_nees(done.trace)).any()
 
 
-@pytest.mark.parametrize("given", [None, "ekf", EkfSlam])
+@pytest.mark.parametrize("given", [None, EkfSlam])
 def test_what_is_no_filter_is_refused_by_replay(given):
     with pytest.raises(TypeError, match="estimator must be a filter, as make_estimat"):
         replay(SlamLog("empty"), given)
 
 
 @pytest.mark.parametrize("use", [replay, settings_for])
-def test_the_path_of_a_log_is_no_log(use):
-    with pytest.raises(TypeError, match=r"log must be a SlamLog, .*, got 'a\.csv'"):
-        use("a.csv", estimator="ekf")
+def test_what_is_no_log_is_refused(use):
+    with pytest.raises(TypeError, match=r"log must be a SlamLog or the path .* got 3"):
+        use(3, estimator="ekf")
+
+
+def test_python_takes_the_path_of_a_log_and_the_name_of_a_filter(tmp_path):
+    path = tmp_path / "drive.csv"
+    stds = {key: numbers(*std) for key, std in NOISE.items()}
+    log = short_drive(header=stds)
+    write_slamlog(log, path)
+    by_name = replay(path, "ekf").trace
+    by_hand = replay(log, settings_for(log, estimator="ekf").make(log.start)).trace
+    np.testing.assert_array_equal(by_name.poses, by_hand.poses)
+    assert by_name.estimator == "ekf"
+    assert len(smooth_log(str(path)).poses) == len(by_hand.poses)

@@ -45,7 +45,18 @@ UTIAS = {
     "Robot3_Measurement.dat": f"{EPOCH} 63 1 0\n{EPOCH + 0.1} 81 7.05 -0.036\n",
     "Robot3_Groundtruth.dat": f"{EPOCH} 1 2 3\n{EPOCH + 0.8} 2 2 -3\n",
 }
-TEXTS = (SLAMLOG, COURSE, FREIBURG, ISAM, G2O)
+NAMED = "t,v,omega,id,bearing [deg],range\n0,1,0,7,1,5\n1,1,.5,7,1,4\n2,0,0,9,1,3\n"
+INCREMENTS = "time;dx;dy;dtheta;bearing;range\n0;1;.1;.2;.1;5\n1;-1;0;0;;\n"
+TEXTS = (SLAMLOG, COURSE, FREIBURG, ISAM, G2O, NAMED, INCREMENTS)
+PATHS = (
+    "0 5 6 0 0 0 0.6 0.8\n1 6 6 0 0 0 0 1\n",
+    "1 0 0 5 0 1 0 6 0 0 1 0\n1 0 0 6 0 1 0 6 0 0 1 0\n",
+    "#timestamp, p_RS_R_x [m], y, z, q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []\n"
+    "1403636579758555392,1,2,0,1,0,0,0\n1403636580758555392,2,2,0,1,0,0,0\n",
+    "t,x,y,yaw [deg]\n0,1,2,3\n1,2,3,\n",
+    "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0.5\n",
+    SLAMLOG.replace("truth,", "groundtruth,"),
+)
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.05, 0.1)}
 
 
@@ -78,6 +89,17 @@ def test_damaged_logs_are_refused_or_usable(fuzzer, tmp_path):
 
     texts = st.one_of(st.sampled_from(TEXTS), st.text(max_size=40))
     fuzzer.check(read, texts, edits, st.booleans(), few=50)
+
+
+def test_damaged_true_paths_are_refused_or_usable(fuzzer, tmp_path):
+    log, truth = tmp_path / "log.g2o", tmp_path / "truth.txt"
+    log.write_text(G2O, encoding="utf-8")
+
+    def read(text, changes):
+        truth.write_text(edited(text, changes), encoding="utf-8")
+        attempt(tmp_path, log, truth=truth)
+
+    fuzzer.check(read, st.sampled_from(PATHS), edits, few=50)
 
 
 def test_bytes_that_are_no_log_are_refused(fuzzer, tmp_path):

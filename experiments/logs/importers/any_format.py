@@ -1,20 +1,42 @@
-"""Read a log of any known format."""
+"""Read a log of any known format, and the true path of a robot: one door for files."""
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ....evaluation.trajectory_error import poses_at
 from .. import log_lines, slamlog
-from . import course, graph, utias, victoria_park
+from . import course, graph, named_columns, utias, victoria_park
+from .planar_paths import TruePath, numeric_rows, path_format_of, path_of
 
-EXPECTED = (
-    "a log: slamlog 1, a course data.txt, a Freiburg sensor.dat, "
-    "iSAM or g2o text, or a folder of UTIAS MR.CLAM or Victoria Park"
+
+class _Format(NamedTuple):
+    """A format, as a refusal names it."""
+
+    name: str
+    row: str
+    #: First words of its lines.
+    tags: tuple[str, ...] = ()
+    has_commas: bool = False
+    is_log: bool = True
+
+
+FORMATS = (
+    _Format("slamlog 1", f"{slamlog.FORMAT_LINE!r} above rows", ("slamlog",), True),
+    _Format("csv with named columns", named_columns.EXPECTED, ("t", "time"), True),
+    _Format("course data.txt", "'β r β r …' and 'd α' in turn"),
+    _Format("Freiburg sensor.dat", "'ODOMETRY r1 t r2'", ("ODOMETRY", "SENSOR")),
+    _Format("iSAM or g2o text", "'EDGE_SE2 i j dx dy dθ …'", graph.GRAPH_TAGS),
+    _Format("TUM", "'t x y z qx qy qz qw'", is_log=False),
+    _Format("KITTI", "12 numbers of a matrix [R t]", is_log=False),
+    _Format("EuRoC", "'#timestamp, p_RS_R_x, …'", ("timestamp",), True, is_log=False),
 )
 READERS = {
     "slamlog": slamlog.read_slamlog,
@@ -38,17 +60,19 @@ def read_log(
     ----------
     path : path
         A file in the format ``slamlog 1``, a course ``data.txt``, a Freiburg
-        ``sensor.dat`` (with ``world.dat`` beside it), an iSAM or g2o text, or the
-        folder of a UTIAS MR.CLAM data set, or that of Victoria Park, with
-        ``aa3_dr.mat``, ``aa3_gpsx.mat``, and the trees as ``victoria_park.csv``.
+        ``sensor.dat`` (with ``world.dat`` beside it), an iSAM or g2o text, csv files
+        with named columns in a folder or in one file, the folder of a UTIAS MR.CLAM
+        data set, or that of Victoria Park, with ``aa3_dr.mat``, ``aa3_gpsx.mat``, and
+        the trees as ``victoria_park.csv``.
     landmarks : array_like, shape (n, 2), optional
         True positions of the landmarks 0, 1, …, n - 1 [m], in place of those in the
         log.
     robot : int, optional
         Which robot of a UTIAS folder; the lowest by default.
     truth : path, optional
-        A graph file of the true poses of an iSAM or g2o text, by their ids: ``VERTEX2``
-        or ``VERTEX_SE2`` lines, or exact edges.
+        A file of the true path, in place of that in the log; see `read_true_path`. For
+        an iSAM or g2o text it may be a graph of the true poses, by their ids:
+        ``VERTEX2`` or ``VERTEX_SE2`` lines, or exact edges.
     noise_from_file : bool, default False
         Whether the header of an iSAM or g2o text gets the noise that the information
         matrices specify: ``motion_std``, ``measurement_std``, ``bearing_std_metres``.
@@ -66,31 +90,115 @@ def read_log(
     OSError
         If a file cannot be opened.
     ValueError
-        If ``robot`` is given for a log that is no UTIAS folder, or ``truth`` or
-        ``noise_from_file`` for one that is no graph.
+        If ``robot`` is given for a log that is no UTIAS folder, or ``noise_from_file``
+        for one that is no graph.
     """
     source = Path(path)
     if source.is_dir():
-        kind = "victoria" if (source / victoria_park.DRIVE).is_file() else "utias"
+        kind, tables = _format_of_folder(source)
     else:
         path = log_lines.ReadFile(path)
-        kind = _format_of(log_lines.read_lines(path))
-    graph_text = "a graph, iSAM or g2o text"
+        kind, tables = _format_of_log(source, log_lines.read_lines(path))
     for name, is_given, needed, what in (
         ("robot", robot is not None, "utias", "a UTIAS folder"),
-        ("truth", truth is not None, "isam", graph_text),
-        ("noise_from_file", noise_from_file, "isam", graph_text),
+        ("noise_from_file", noise_from_file, "isam", "a graph, iSAM or g2o text"),
     ):
         if is_given and kind != needed:
             raise ValueError(f"{name} needs {what}, but {source} is none")
     if kind == "utias":
         log = utias.read_utias(source, robot=robot)
+    elif kind == "csv":
+        log = named_columns.read_named(tables, source.resolve().stem, source)
     elif kind == "isam":
-        log = graph.read_isam(path, truth=truth, noise_from_file=noise_from_file)
+        log = _read_graph(path, truth, noise_from_file=noise_from_file)
     else:
         log = READERS[kind](path)
-    if landmarks is None:
+    if truth is not None and kind != "isam":
+        log = _with_true_path(log, truth)
+    return log if landmarks is None else _with_landmarks(log, landmarks)
+
+
+def as_log(log: slamlog.SlamLog | str | PathLike[str]) -> slamlog.SlamLog:
+    """Return a log, or read it from a path.
+
+    Raises
+    ------
+    TypeError
+        If it is neither.
+    """
+    if isinstance(log, slamlog.SlamLog):
         return log
+    if isinstance(log, str | PathLike):
+        return read_log(log)
+    raise TypeError(f"log must be a SlamLog or the path of one, got {log!r}")
+
+
+def read_true_path(path: str | PathLike[str]) -> TruePath:
+    """Read the true path of a robot from a file of any known format.
+
+    Parameters
+    ----------
+    path : path
+        A TUM, KITTI or EuRoC file, a csv file with columns t, x, y, theta (or a
+        quaternion), rows ``t x y θ``, a graph with the poses as vertices, or a log with
+        ground truth.
+
+    Returns
+    -------
+    TruePath
+        Its rows, and whether they have times.
+
+    Raises
+    ------
+    LogError
+        If the file holds no path, or the robot leaves the plane.
+    OSError
+        If it cannot be opened.
+    """
+    source = Path(path)
+    if source.is_dir():
+        return TruePath(read_log(source).ground_truth)
+    path = log_lines.ReadFile(path)
+    lines = log_lines.read_lines(path)
+    kind, table = _format_of(source, lines)
+    if table is not None and "truth" in table.kinds:
+        return TruePath(named_columns.true_path_of(table))
+    if kind == "isam":
+        return graph.true_path(log_lines.content_of(lines))
+    numbers = numeric_rows(log_lines.content_of(lines))
+    if numbers is not None and (kind != "course" or numbers.shape[1] == 4):
+        if kind == "course":
+            return TruePath(numbers)  # rows t x y θ
+        return path_of(numbers, kind, str(source))
+    rows = read_log(path).ground_truth
+    if not len(rows):
+        raise slamlog.LogError(
+            f"{source}: expected a true path, got a log without one: rows "
+            "'groundtruth,t,x,y,theta' hold it, or a file in the format of TUM, "
+            "'t x y z qx qy qz qw'"
+        )
+    return TruePath(rows)
+
+
+def _read_graph(
+    path: str | PathLike[str],
+    truth: str | PathLike[str] | None,
+    *,
+    noise_from_file: bool,
+) -> slamlog.SlamLog:
+    """Read a graph, and its truth from another graph or from a path."""
+    is_graph = False
+    if truth is not None:
+        truth = log_lines.ReadFile(truth)
+        is_graph = _format_of(Path(truth), log_lines.read_lines(truth))[0] == "isam"
+    log = graph.read_isam(
+        path, truth=truth if is_graph else None, noise_from_file=noise_from_file
+    )
+    return log if truth is None or is_graph else _with_true_path(log, truth)
+
+
+def _with_landmarks(log: slamlog.SlamLog, landmarks: ArrayLike) -> slamlog.SlamLog:
+    """Return a log with other true positions of its landmarks."""
     positions = slamlog.float_array("landmarks", landmarks, columns=2)
     return replace(
         log,
@@ -100,20 +208,113 @@ def read_log(
     )
 
 
-def _format_of(lines: list[log_lines.LogLine]) -> str:
-    """Detect the format from the first line of a file that is no comment."""
+def _with_true_path(log: slamlog.SlamLog, path: str | PathLike[str]) -> slamlog.SlamLog:
+    """Return a log with the true path of a file, and the true pose as its start.
+
+    Poses without times are those of the log's times. Stamps on the clock of the log's
+    ``epoch`` are set to its own.
+    """
+    rows, has_times = read_true_path(path)
+    times = [event.t for event in log.events] or [0.0]
+    first = log.events[0] if log.events else None
+    start = times[0] - (first.dt if isinstance(first, slamlog.OdometryRow) else 0.0)
+    if not has_times:
+        due = np.unique([start, *times])
+        if len(due) != len(rows):
+            raise slamlog.LogError(
+                f"{path}: expected a pose for each of the {len(due)} times of the log, "
+                f"as the poses have no times, got {len(rows)}"
+            )
+        rows = np.column_stack([due, rows[:, 1:]])
+    epoch = float(log.header.get("epoch", 0.0)) if len(rows) else 0.0
+    if abs(rows[0, 0]) > epoch / 2 > 0:
+        rows = np.column_stack([rows[:, 0] - epoch, rows[:, 1:]])
+    if rows[-1, 0] < start or rows[0, 0] > times[-1]:
+        raise slamlog.LogError(
+            f"{path}: expected times of the log, {start:.15g} to {times[-1]:.15g}, got "
+            f"{rows[0, 0]:.15g} to {rows[-1, 0]:.15g}: give both on one clock"
+        )
+    known = poses_at([start], rows)[0]
+    begins = bool(np.isfinite(known).all()) and not log.start.any()
+    return replace(
+        log,
+        header={**log.header, "truth": Path(path).name},
+        start=known if begins else log.start,
+        ground_truth=rows,
+    )
+
+
+def _format_of_folder(folder: Path) -> tuple[str, list[named_columns.Table]]:
+    """Detect the format by the files of a folder, and read tables of named columns."""
+    if (folder / victoria_park.DRIVE).is_file():
+        return "victoria", []
+    is_utias = utias.robots_in(folder)
+    tables = [] if is_utias else named_columns.tables_in(folder)
+    return "csv" if tables else "utias", tables
+
+
+def _format_of_log(
+    source: Path, lines: list[log_lines.LogLine]
+) -> tuple[str, list[named_columns.Table]]:
+    """Detect the format of a log; refuse a file that holds a path only."""
+    kind, table = _format_of(source, lines)
+    if kind in {known.name for known in FORMATS if not known.is_log}:
+        raise lines[0].error(
+            "a log of odometry and readings",
+            f"a path in the format of {kind}, which --truth reads (truth= in Python)",
+        )
+    return kind, [] if table is None else [table]
+
+
+def _format_of(
+    source: Path, lines: list[log_lines.LogLine]
+) -> tuple[str, named_columns.Table | None]:
+    """Detect the format from the first lines of a file that are no comments."""
     if slamlog.format_line_of(lines) is not None:
-        return "slamlog"
-    line = log_lines.content_of(lines)[0]
+        return "slamlog", None
+    content = log_lines.content_of(lines)
+    kind = _kind_by_tag(content[0])
+    if kind:
+        return kind, None
+    table = named_columns.read_table(source, lines)
+    if table is None or not table.kinds >= {"odometry", "measurements"}:
+        numbers = numeric_rows(content)
+        kind = "" if numbers is None else path_format_of(numbers)
+    if kind or table is not None:
+        return kind or "csv", table
+    if content[0].text.split(",")[0].strip() in slamlog.ROW_FORMS:
+        raise lines[0].error(slamlog.FORMAT_LINE, log_lines.shown(lines[0].text))
+    if all(map(log_lines.is_number, content[0].text.split())):
+        return "course", None
+    raise _unknown(content[0])
+
+
+def _kind_by_tag(line: log_lines.LogLine) -> str:
+    """Return the format whose lines begin with a tag; empty if it has none."""
     tag, *fields = line.text.split()
-    if "," in line.text:
-        return "slamlog"
     if (tag, len(fields)) == ("ODOMETRY", 3) or tag == "SENSOR":
         return "freiburg"
-    if tag in graph.GRAPH_TAGS or tag.startswith(graph.PREFIXES):
-        return "isam"
-    try:
-        np.array([tag, *fields], dtype=np.float64)
-    except ValueError:
-        raise line.error(EXPECTED, log_lines.shown(line.text)) from None
-    return "course"
+    is_graph = tag in graph.GRAPH_TAGS or tag.startswith(graph.PREFIXES)
+    return "isam" if is_graph else ""
+
+
+def _unknown(line: log_lines.LogLine) -> slamlog.LogError:
+    """Return the error of an unknown format, with the two that come nearest."""
+    first, *_ = log_lines.split_fields(line.text)
+    is_numeric = log_lines.is_number(first)
+
+    def nearness(known: _Format) -> float:
+        tags = [] if is_numeric else [tag.lower() for tag in known.tags]
+        ratios = (
+            difflib.SequenceMatcher(None, first[:40].lower(), tag).ratio()
+            for tag in tags
+        )
+        similar = max(ratios, default=0.5 if is_numeric and not known.tags else 0.0)
+        return similar + 0.5 * (known.has_commas == ("," in line.text))
+
+    nearest = sorted(FORMATS, key=nearness, reverse=True)[:2]
+    return line.error(
+        f"a log or a path; the nearest formats are "
+        f"{' and '.join(f'{known.name} ({known.row})' for known in nearest)}",
+        log_lines.shown(line.text),
+    )

@@ -23,6 +23,7 @@ import numpy as np
 from ....arrays import Array
 from .. import slamlog
 from ..log_lines import LogLine, content_of, read_lines, shown
+from .planar_paths import TruePath
 
 EDGE_TAGS = ("EDGE_SE2", "EDGE2")
 ODOMETRY_TAGS = ("ODOMETRY", *EDGE_TAGS)
@@ -383,6 +384,15 @@ def with_truth(
         landmarks=np.array(list(places.values())).reshape(-1, 2),
         ground_truth=table,
     )
+
+
+def true_path(lines: list[LogLine]) -> TruePath:
+    """Return the poses in the vertices of a graph, by their ids."""
+    poses, _ = _values(sort_lines(lines))
+    if not poses:
+        raise lines[-1].error(f"{' or '.join(POSE_TAGS)} lines", "the end of the file")
+    rows = [(k, *poses[i]) for k, i in enumerate(sorted(poses))]
+    return TruePath(np.array(rows, dtype=np.float64), has_times=False)
 
 
 def _values(graph: Graph) -> tuple[dict[int, Point], dict[int, Point]]:

@@ -91,15 +91,22 @@ def read_utias(folder: Path, *, robot: int | None = None) -> slamlog.SlamLog:
     )
 
 
-def _choose_robot(folder: Path, robot: int | None) -> int:
+def robots_in(folder: Path) -> list[int]:
+    """Return the robots whose odometry is in a folder."""
     matches = (ODOMETRY_NAME.fullmatch(file.name) for file in folder.iterdir())
-    robots = sorted(int(match[1]) for match in matches if match)
+    return sorted(int(match[1]) for match in matches if match)
+
+
+def _choose_robot(folder: Path, robot: int | None) -> int:
+    robots = robots_in(folder)
     if not robots:
         log = folder / "log.csv"
         hint = f"; did you mean {log}?" if log.is_file() else ""
         raise slamlog.LogError(
             f"{folder}: expected a log, or a folder with Robot<k>_Odometry.dat (UTIAS "
-            f"MR.CLAM) or aa3_dr.mat (Victoria Park), got another folder{hint}"
+            "MR.CLAM), aa3_dr.mat (Victoria Park) or csv files with named columns "
+            "(odometry.csv with t, d, alpha or t, v, omega; measurements.csv with t, "
+            f"id, bearing, range), got another folder{hint}"
         )
     if robot is None:
         return robots[0]

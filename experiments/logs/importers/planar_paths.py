@@ -1,0 +1,122 @@
+"""True paths in the files of other programs: `path_format_of`, `path_of`.
+
+TUM has rows ``t x y z qx qy qz qw``, KITTI the twelve entries of the 3 × 4 matrix [R t]
+by rows, without times, and EuRoC rows ``t [ns], x, y, z, qw, qx, qy, qz, …``. Four
+numbers in a row are ``t x y θ``, as in UTIAS. Poses in space are projected onto the
+plane in which the robot turns.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ....arrays import Array
+from .. import log_lines, slamlog
+
+#: Tilt up to which a pose counts as one in the plane [rad]: steep roads stay below it.
+MOST_TILT = np.deg2rad(30)
+_UNIT = 5e-2  # how far a quaternion or a rotation may be from its unit length
+
+
+#: Numbers of a covariance after the pose of TUM, which have no meaning for a truth.
+TUM_SIZES = (0, 6, 9, 21, 36)
+
+
+class TruePath(NamedTuple):
+    """The true path of a robot."""
+
+    #: Rows (t, x, y, θ), shape (n, 4) [s, m, m, rad]; θ nan where unknown.
+    rows: Array
+    #: Whether t is a time, or only counts the poses.
+    has_times: bool = True
+
+
+def numeric_rows(lines: list[log_lines.LogLine]) -> Array | None:
+    """Return the numbers of a file, all rows of equal length; None for another file."""
+    rows = [log_lines.split_fields(line.text) for line in lines]
+    if len({len(row) for row in rows}) > 1:
+        return None
+    try:
+        table = np.array(rows, dtype=np.float64)
+    except ValueError:
+        return None
+    return table if np.isfinite(table).all() else None
+
+
+def path_format_of(table: Array) -> str:
+    """Return which format of true paths a table of numbers has; empty if none."""
+    columns = table.shape[1]
+    with np.errstate(over="ignore", invalid="ignore"):
+        if columns == 12 and _are_rotations(table.reshape(-1, 3, 4)[:, :, :3]):
+            return "KITTI"
+        if columns >= 8 and _are_units(table[:, 4:8]):
+            if columns != 8 and float(np.abs(table[:, 0]).min()) > 1e14:
+                return "EuRoC"
+            return "TUM" if columns - 8 in TUM_SIZES else ""
+    return ""
+
+
+def _are_units(quaternions: Array) -> bool:
+    return bool((abs(np.linalg.norm(quaternions, axis=1) - 1) < _UNIT).all())
+
+
+def _are_rotations(matrices: Array) -> bool:
+    products = matrices @ matrices.swapaxes(1, 2)
+    return bool((abs(products - np.eye(3)) < _UNIT).all())
+
+
+def path_of(table: Array, kind: str, file: str) -> TruePath:
+    """Return the path in a table of a known format."""
+    if kind == "KITTI":
+        poses = _planar_matrices(table.reshape(-1, 3, 4), file)
+        return TruePath(np.column_stack([np.arange(len(poses)), poses]), False)
+    quaternions = table[:, [5, 6, 7, 4]] if kind == "EuRoC" else table[:, 4:8]
+    headings = heading_of(file, quaternions)
+    times = table[:, 0] * (1e-9 if kind == "EuRoC" else 1.0)
+    return TruePath(np.column_stack([times, table[:, 1:3], headings]))
+
+
+def heading_of(file: str, quaternions: Array) -> Array:
+    """Return the headings of quaternions (n, 4), in the order x, y, z, w.
+
+    They need not have unit length.
+
+    Raises
+    ------
+    LogError
+        If a pose is tilted, so that it has no heading in the plane.
+    """
+    qx, qy, qz, qw = quaternions.T
+    squares = qw * qw + qx * qx + qy * qy + qz * qz
+    tilts = qw * qw - qx * qx - qy * qy + qz * qz < np.cos(MOST_TILT) * squares
+    if tilts.any():
+        raise _tilted(file, int(tilts.argmax()))
+    sine, cosine = 2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz
+    return np.asarray(np.arctan2(sine, cosine))
+
+
+def _planar_matrices(matrices: Array, file: str) -> Array:
+    """Project matrices [R t] onto the plane about whose normal they turn.
+
+    With z up it is that of x and y. A camera looks along z with x to the right and y
+    down, so that its plane has the axes z and -x.
+    """
+    about_z, about_y = (matrices[:, k, k].min() for k in (2, 1))
+    _, y, z = np.ptp(matrices[:, :, 3], axis=0)
+    is_camera = about_y > about_z if min(about_y, about_z) < 0.999 else z > y
+    if max(about_z, about_y) < np.cos(MOST_TILT):
+        normal = 1 if is_camera else 2
+        raise _tilted(file, int(matrices[:, normal, normal].argmin()))
+    if is_camera:
+        headings = np.arctan2(-matrices[:, 0, 2], matrices[:, 2, 2])
+        return np.column_stack([matrices[:, 2, 3], -matrices[:, 0, 3], headings])
+    headings = np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])
+    return np.column_stack([matrices[:, 0, 3], matrices[:, 1, 3], headings])
+
+
+def _tilted(file: str, pose: int) -> slamlog.LogError:
+    degrees = round(float(np.rad2deg(MOST_TILT)))
+    return slamlog.LogError(
+        f"{file}: expected poses of a robot in the plane, got pose {pose} tilted by "
+        f"more than {degrees}°: convert the poses to a frame of the robot with z up"
+    )

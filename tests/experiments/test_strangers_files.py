@@ -1,0 +1,374 @@
+"""Files as other people have them: read, or refused with the remedy."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import slamgym
+
+from slamgym import read_log
+from slamgym.experiments.estimate_files import true_path
+from slamgym.experiments.logs.slamlog import LogError, OdometryRow, Scan, write_slamlog
+
+ODOMETRY = "t,d,alpha\n1,1,0\n2,1,0.5\n3,2,0\n"
+MEASUREMENTS = "t,id,bearing,range\n0,4,0.1,5\n1,4,0.1,4\n1,7,-0.2,3\n3,7,0,1\n"
+TRUTH = "t,x,y,theta\n0,5,6,0.25\n1,6,6,0.25\n2,7,6,0.75\n3,8,8,0.75\n"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    def save(**texts):
+        place = tmp_path / "drive"
+        place.mkdir(exist_ok=True)
+        for name, text in texts.items():
+            (place / f"{name}.csv").write_text(text, encoding="utf-8")
+        return place
+
+    return save
+
+
+@pytest.fixture
+def file(tmp_path):
+    def save(text, name="file.txt"):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        return tmp_path / name
+
+    return save
+
+
+def own(folder, **changes):
+    return read_log(
+        folder(**{"odometry": ODOMETRY, "measurements": MEASUREMENTS} | changes)
+    )
+
+
+def events_of(log):
+    return [
+        (e.t, e.d, e.alpha, e.dt)
+        if isinstance(e, OdometryRow)
+        else (e.t, e.landmark_ids.tolist(), e.measurements.tolist())
+        for e in log.events
+    ]
+
+
+# csv files with named columns
+
+
+def test_a_folder_of_two_tables_is_a_log(folder):
+    log = own(folder)
+    assert (log.name, log.motion, log.start.tolist()) == ("drive", "turn-last", [0] * 3)
+    assert events_of(log) == [
+        (0, [4], [[0.1, 5]]),
+        (1, 1, 0, 1),
+        (1, [4, 7], [[0.1, 4], [-0.2, 3]]),
+        (2, 1, 0.5, 1),
+        (3, 2, 0, 1),
+        (3, [7], [[0, 1]]),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("odometry", "measurements"),
+    [
+        ("Time;Dist;Turn\n1;1,0;0\n2;1;0,5\n3;2;0\n", MEASUREMENTS),
+        ("time [s],distance [cm],dtheta [deg]\n1,100,0\n"
+         f"2,100,{math.degrees(0.5)!r}\n3,200,0\n", MEASUREMENTS),
+        ("step\tds\tdyaw\n1\t1\t0\n2\t1\t.5\n3\t2\t0\n", MEASUREMENTS),
+        ("# t d alpha\n1 1 0\n2 1 0.5\n3 2 0\n", MEASUREMENTS),
+        ('"t","d","alpha","battery"\n1,1,0,9\n2,1,0.5,9\n3,2,0,9\n', MEASUREMENTS),
+        (ODOMETRY, "Timestamp,Range_mm,Phi,landmark_id\n0,5000,.1,4\n1,4000,.1,4.0\n"
+         "1,3000,-.2,7.0\n3,1000,0,7\n"),
+        (ODOMETRY, MEASUREMENTS + "2,,,\n2,7,nan,nan\n"),
+        (ODOMETRY, "t,id,bearing,range\n3,7,0,1\n1,4,.1,4\n1,7,-.2,3\n0,4,.1,5\n"),
+        (ODOMETRY, MEASUREMENTS.replace("\n", "  # seen\n").replace("range  #", "r #")),
+    ],
+    ids=["names", "units", "tabs", "comment", "quotes", "order", "empty", "late", "#"],
+)  # fmt: skip
+def test_other_spellings_of_the_tables_are_the_same_log(folder, odometry, measurements):
+    log = own(folder)
+    texts = {"odometry": odometry, "measurements": measurements}
+    for ours, theirs in zip(own(folder, **texts).events, log.events, strict=True):
+        assert type(ours) is type(theirs)
+        if isinstance(ours, Scan):
+            np.testing.assert_allclose(ours.measurements, theirs.measurements)
+            assert ours.landmark_ids.tolist() == theirs.landmark_ids.tolist()
+        else:
+            expected = (theirs.t, theirs.d, theirs.alpha, theirs.dt)
+            assert (ours.t, ours.d, ours.alpha, ours.dt) == pytest.approx(expected)
+
+
+def test_two_tables_of_one_kind_are_refused(folder):
+    with pytest.raises(LogError, match=r"one file with odometry, got odom.csv and odo"):
+        own(folder, odom=ODOMETRY)
+
+
+def test_one_table_may_hold_both(file):
+    text = (
+        "t,d,alpha,id,bearing,range\n0,,,4,0.1,5\n1,1,0,4,0.1,4\n1,,,7,-0.2,3\n"
+        "2,1,0.5,,,\n3,2,0,7,0,1\n"
+    )
+    assert [e[0] for e in events_of(read_log(file(text, "all.csv")))] == [
+        0, 1, 1, 2, 3, 3,
+    ]  # fmt: skip
+
+
+def test_truth_and_landmarks_are_read_and_the_log_starts_at_the_truth(folder):
+    log = own(folder, groundtruth=TRUTH, landmarks="id,x,y\n7,1,2\n4,3,4\n")
+    assert log.start.tolist() == [5, 6, 0.25]
+    assert log.ground_truth.tolist()[1] == [1, 6, 6, 0.25]
+    assert log.landmark_ids.tolist() == [7, 4]
+    assert log.header["truth"] == "groundtruth.csv"
+
+
+def test_velocities_hold_until_the_next_row_and_are_split_at_readings(folder):
+    odometry = "t,v,omega\n0,2,0.5\n2,1,0\n3,0,0\n"
+    readings = "t,id,bearing,range\n0.5,1,0,4\n3,1,0,2\n"
+    log = own(folder, odometry=odometry, measurements=readings)
+    assert log.motion == "midpoint"
+    assert [e for e in events_of(log) if len(e) == 4] == [
+        (0.5, 1, 0.25, 0.5),
+        (2, 3, 0.75, 1.5),
+        (3, 1, 0, 1),
+    ]
+
+
+def test_increments_with_a_part_to_the_left_turn_drive_and_turn(folder):
+    log = own(folder, odometry="t,dx,dy,dtheta\n1,-1,1,0.5\n3,0,0,0\n")
+    turn, drive = [e for e in log.events if isinstance(e, OdometryRow)][:2]
+    assert (turn.d, turn.dt, drive.dt) == (0, 0, 2)  # the first lasts as the second
+    assert drive.d == pytest.approx(-math.sqrt(2))
+    assert turn.alpha + drive.alpha == pytest.approx(0.5)
+
+
+def test_the_first_increment_is_not_divided_by_earlier_readings(folder):
+    odometry = "t,d,alpha\n0.1,1,0.5\n0.2,1,0\n0.3,1,0\n"
+    readings = "t,id,bearing,range\n0,4,0.1,5\n0.1,4,0.1,5\n"
+    log = own(folder, odometry=odometry, measurements=readings)
+    assert [e[0] for e in events_of(log)] == [0, 0.1, 0.1, 0.2, 0.3]
+    assert log.events[1].dt == pytest.approx(0.1)
+    assert "left_out" not in log.header
+
+
+@pytest.mark.parametrize(
+    ("first", "begin", "known"),
+    [("1,1,0", 0, True), ("1,1,0", 1, False), ("1,0,0", 1, True)],
+)
+def test_the_start_is_the_true_pose_before_the_first_motion(
+    folder, first, begin, known
+):
+    truth = "t,x,y,theta\n" + "".join(f"{k},{k + 5},6,0.25\n" for k in range(begin, 4))
+    readings = "t,id,bearing,range\n2,7,0,1\n"
+    odometry = ODOMETRY.replace("1,1,0", first)
+    log = own(folder, odometry=odometry, measurements=readings, groundtruth=truth)
+    assert log.start.tolist() == ([5 + begin, 6, 0.25] if known else [0, 0, 0])
+
+
+@pytest.mark.parametrize(("unit", "name"), [(1, "t"), (1e3, "t"), (1e9, "stamp [ns]")])
+def test_epoch_stamps_count_from_the_first_odometry(folder, unit, name):
+    epoch = 1.7e9
+
+    def stamped(text):
+        head, *rows = (line.split(",") for line in text.split())
+        rows = [[f"{(float(t) + epoch) * unit:.0f}", *others] for t, *others in rows]
+        return "\n".join(map(",".join, [[name, *head[1:]], *rows])) + "\n"
+
+    log = own(folder, odometry=stamped(ODOMETRY), measurements=stamped(MEASUREMENTS))
+    assert [e.t for e in log.events] == [-1, 0, 0, 1, 2, 2]
+    assert float(log.header["epoch"]) == epoch + 1
+
+
+def test_readings_outside_the_odometry_are_left_out_and_counted(folder):
+    log = own(folder, measurements=MEASUREMENTS + "9,4,0,1\n9,7,0,1\n")
+    expected = "2 readings outside the time of the odometry"
+    assert log.header["left_out"] == expected
+
+
+def test_readings_without_id_are_hidden(folder):
+    log = own(folder, measurements="t,bearing,range\n1,0.1,4\n1,0.2,3\n")
+    assert log.scans[0].landmark_ids is None
+
+
+def test_comments_set_the_noise_the_motion_and_the_start(folder):
+    remarks = "# motion_std: 0.1,0.1,0.05\n# motion: midpoint\n# start: 1,2,3\n"
+    log = own(folder, odometry=remarks + ODOMETRY)
+    assert (log.motion, log.start.tolist()) == ("midpoint", [1, 2, 3])
+    assert log.header["motion_std"] == "0.1,0.1,0.05"
+
+
+def test_a_log_of_tables_can_be_kept_as_slamlog(folder, tmp_path):
+    log = own(folder, groundtruth=TRUTH)
+    write_slamlog(log, tmp_path / "kept.csv")
+    kept = read_log(tmp_path / "kept.csv")
+    assert (events_of(kept), kept.header) == (events_of(log), log.header)
+
+
+def test_the_example_of_the_page_runs(folder, monkeypatch, tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "logs.md").read_text(encoding="utf-8")
+    section = page.split("## Your own csv files")[1].split("\n## ")[0]
+    odometry, measurements, commands = (
+        block.partition("\n")[2] for block in section.split("```")[1::2]
+    )
+    folder(odometry=odometry, measurements=measurements)
+    monkeypatch.chdir(tmp_path)
+    for command in commands.splitlines():
+        result = slamgym(*command.split()[1:])
+        assert result.exit_code == 0, result.output
+    replayed = tmp_path / "results" / "drive-invariant" / "summary.json"
+    summary = json.loads(replayed.read_text(encoding="utf-8"))
+    assert summary["readings"]["rejected"] == 0
+    assert 0.1 < summary["nis"]["per_degree"] < 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"measurements": "t,tag,angle,far\n1,4,0,1\n"},
+         "expected measurements, a table with the columns t, id, bearing, range, got"),
+        ({"odometry": "t,d,alpha\n1,1,0\n0.5,1,0\n"},
+         r"odometry.csv, line 3: expected t >= 1, the time before, got 0.5"),
+        ({"odometry": "t,d,alpha\n1,1,0\n2,1\n"},
+         r"odometry.csv, line 3: expected 3 fields, as in line 1, got 2"),
+        ({"odometry": "t,d,alpha\n1,1,left\n"},
+         r"odometry.csv, line 2: expected a finite number, got 'left'"),
+        ({"measurements": "t,id,bearing,range\n1,tree,0,1\n"},
+         r"measurements.csv, line 2: expected an id"),
+        ({"measurements": MEASUREMENTS + "3,7,0,1\n"},
+         r"line 6: expected each landmark once per scan, got id 7 again"),
+        ({"odometry": "t,v,omega\n1,1,0\n"}, "expected at least two rows of v and ome"),
+        ({"odometry": "# motion: arc\n" + ODOMETRY}, "line 1: expected turn-last, mid"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_in_a_table_is_named(folder, changes, message):
+    with pytest.raises(LogError, match=message):
+        own(folder, **changes)
+
+
+# True paths
+
+TUM = "0 5 6 0 0 0 0 1\n1 6 6 0 0 0 0 1\n2 7 6 0 0 0 0.6 0.8\n3 8 8 0 0 0 0.6 0.8\n"
+TURN = 2 * math.atan2(0.6, 0.8)
+COS, SIN = math.cos(TURN), math.sin(TURN)
+IN_SPACE = [(5, 6, 0), (6, 6, 0), (7, 6, TURN), (8, 8, TURN)]
+EUROC_HEAD = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], "
+    "q_RS_y [], q_RS_z [], v_RS_R_x [m s^-1]\n"
+)
+EUROC_ROWS = "".join(
+    f"{1403636579758555392 + k * 10**9},{x},{y},0.5,{math.cos(a / 2)},0,0,"
+    f"{math.sin(a / 2)},0.1\n"
+    for k, (x, y, a) in enumerate(IN_SPACE)
+)
+ROS = (
+    "%time,field.header.seq,field.header.stamp,field.header.frame_id,"
+    "field.pose.pose.position.x,field.pose.pose.position.y,field.pose.pose.position.z,"
+    "field.pose.pose.orientation.x,field.pose.pose.orientation.y,"
+    "field.pose.pose.orientation.z,field.pose.pose.orientation.w\n"
+) + "".join(
+    f"{1700000000 * 10**9 + k * 10**9},{k},{1700000000 * 10**9 + k * 10**9},odom,"
+    f"{x},{y},0,0,0,{math.sin(a / 2)},{math.cos(a / 2)}\n"
+    for k, (x, y, a) in enumerate(IN_SPACE)
+)
+
+
+def matrices(camera):
+    rows = []
+    for x, y, a in IN_SPACE:
+        cos, sin = math.cos(a), math.sin(a)
+        if camera:  # z ahead, x to the right, y down
+            rows.append((cos, 0, -sin, -y, 0, 1, 0, 0, sin, 0, cos, x))
+        else:
+            rows.append((cos, -sin, 0, x, sin, cos, 0, y, 0, 0, 1, 0))
+    return "".join(" ".join(map(repr, row)) + "\n" for row in rows)
+
+
+PATHS = {
+    "tum": TUM,
+    "tum, header": "# timestamp tx ty tz qx qy qz qw\n" + TUM,
+    "tum, title": "# ground truth trajectory\n# file: 'x.bag'\n" + TUM,
+    "tum, commas": TUM.replace(" ", ","),
+    "kitti": matrices(camera=True),
+    "kitti, z up": matrices(camera=False),
+    "euroc": EUROC_HEAD + EUROC_ROWS,
+    "euroc, no header": EUROC_ROWS.replace(",0.1\n", ",0.1" + ",0" * 8 + "\n"),
+    "ros": ROS,
+    "csv": f"t,x,y,yaw\n0,5,6,0\n1,6,6,0\n2,7,6,{TURN}\n3,8,8,{TURN}\n",
+    "utias": f"0 5 6 0\n1 6 6 0\n2 7 6 {TURN}\n3 8 8 {TURN}\n",
+    "graph": "".join(
+        f"VERTEX_SE2 {k} {x} {y} {a}\n" for k, (x, y, a) in enumerate(IN_SPACE)
+    ),
+    "slamlog": "# format: slamlog 1\n"
+    + "".join(f"groundtruth,{k},{x},{y},{a}\n" for k, (x, y, a) in enumerate(IN_SPACE)),
+}
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_true_paths_of_all_formats_are_the_same(file, name):
+    path = file(PATHS[name], "path.txt")
+    rows = true_path(path)
+    np.testing.assert_allclose(rows[:, 1:], IN_SPACE, atol=1e-12)
+    np.testing.assert_allclose(np.diff(rows[:, 0]), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["tum", "kitti", "csv", "utias", "graph", "slamlog"])
+@pytest.mark.parametrize("kind", ["csv", "graph"])
+def test_the_truth_of_a_log_may_be_in_any_format(folder, file, name, kind):
+    log = folder(odometry=ODOMETRY, measurements=MEASUREMENTS)
+    if kind == "graph":
+        log = file(
+            "".join(f"EDGE_SE2 {k} {k + 1} 1 0 0\n" for k in range(3))
+            + "EDGE_SE2_XY 0 9 3 1\n",
+            "log.g2o",
+        )
+    truth = read_log(log, truth=file(PATHS[name], "truth.txt"))
+    expected = [(float(k), *pose) for k, pose in enumerate(IN_SPACE)]
+    np.testing.assert_allclose(truth.ground_truth, expected, atol=1e-12)
+    np.testing.assert_allclose(truth.start, IN_SPACE[0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0 1 2 3 0.5 0.5 0.5 0.5\n" * 2, "pose 0 tilted by more than 30°: convert"),
+        ("0 0 1 0 1 0 0 0 0 1 0 0\n" * 2, "pose 0 tilted by more than 30°: convert"),
+        (TUM.replace("\n", "9\n", 1).replace("0 5", "90 5"), "path.txt"),
+        ("# format: slamlog 1\nodometry,1,1,0,1\n", "expected a true path, got a log"),
+        (matrices(camera=True) * 2, "expected a pose for each of the 4 times of the l"),
+        ("".join(f"{k + 50} 1 2 0 0 0 0 1\n" for k in range(3)),
+         "expected times of the log, 0 to 3, got 50 to 52: give both on one clock"),
+    ],
+)  # fmt: skip
+def test_a_truth_that_does_not_fit_is_refused(folder, file, text, message):
+    log = folder(odometry=ODOMETRY, measurements=MEASUREMENTS)
+    with pytest.raises(LogError, match=message):
+        read_log(log, truth=file(text, "path.txt"))
+
+
+# What is no log
+
+
+@pytest.mark.parametrize(
+    ("text", "remedy"),
+    [
+        (TUM, "expected a log of odometry and readings, got a path in the format of T"),
+        (matrices(camera=True), "got a path in the format of KITTI, which --truth rea"),
+        (EUROC_HEAD + EUROC_ROWS, "got a path in the format of EuRoC, which --truth r"),
+        (ROS, "expected odometry, a table with the columns t, d, alpha, got"),
+        ("t,d,alpha\n1,1,0\n", "or give the folder of several such files"),
+        ("odometry,1,1,0,1\n", "line 1: expected # format: slamlog 1, got 'odometry"),
+        ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n", "of a planar graph, got 'VERTEX_SE3:QU"),
+        ("VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1 0 0\nEDGE_SE2 1 2 1 0 0\n"
+         "EDGE_SE2 2 0 -2 0 0\n", "expected readings of landmarks, as a filter has no"),
+        ("1,2,3\n4,5,6\n", "nearest formats are .* csv with named columns"),
+        ("EDG_SE2 0 1 1 0 0\n", "the nearest formats are iSAM or g2o text .* and "),
+        ("ODOMETRIE 0.1 2 0\n", "the nearest formats are .*Freiburg sensor.dat"),
+        ("# only\n% remarks\n", "line 1: expected rows, got comments only"),
+        ('{"t": 1}\n', "line 1: .*nearest formats"),
+    ],
+)  # fmt: skip
+def test_what_is_no_log_is_refused_with_the_remedy(file, text, remedy):
+    with pytest.raises(LogError, match=remedy) as caught:
+        read_log(file(text, "stranger.txt"))
+    assert "stranger.txt" in str(caught.value)
+    assert "\n" not in str(caught.value)
