@@ -147,6 +147,7 @@ def drive_likelihood(
     record = _new_record(len(values), events, keep_beliefs)
     work = partial(_follow, estimator, events, values, gate, record)
     share_out(work, len(values), threads or usable_cores())
+    record.poses[..., :2] += estimator.map.mean[:2]
     record.poses[..., 2] = wrap_angle(record.poses[..., 2])
     return record
 
@@ -227,7 +228,8 @@ def _follow(
         noises[part],
         bool(motion[3] > 0),
         np.array(rules),
-        (first.mean[:3].copy(), first.covariance[:3, :3].copy()),
+        # From (0, 0): far away, rounding would blur the likelihoods of a search.
+        (first.mean[:3] * (0.0, 0.0, 1.0), first.covariance[:3, :3].copy()),
         belief,
         tuple(gain.workspace_for(rules, most, capacity)),
         np.empty(landmarks, dtype=np.int64),

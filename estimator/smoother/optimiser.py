@@ -39,6 +39,7 @@ SLACK = 1e-12  # of the cost, in rounding
 REWEIGHTED = 30  # iterations; from then on the noise is fixed
 SHRINKING = 0.5  # steps that shrink by this factor converge linearly
 NOTHING = 0.02  # of the cost; further steps then move less than a fifth of a σ
+SETTLED = 1e-6  # m and rad that an undamped step moves where nothing more is found
 SEARCHES = 5  # for better places of landmarks
 RELOCATED = 5  # iterations from one to the next
 FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e10
@@ -145,7 +146,8 @@ class Optimiser:
 
         If readings contradict each other, the steps may shrink slowly.  After ``most``
         iterations, the estimate is also a solution if the further decrease of its cost,
-        by the last two decreases, is insignificant, and in any case unless ``strict``.
+        by the last two decreases, is insignificant, or if a step without damping hardly
+        moves it, and in any case unless ``strict``.
 
         Raises
         ------
@@ -163,7 +165,8 @@ class Optimiser:
                 return self._solution(state, first_cost, iteration)
             if self._varies and iteration < REWEIGHTED:
                 self._reweight(state)
-        if state.remaining < NOTHING or not strict:
+        is_settled = state.moved < SETTLED and not state.is_damped
+        if is_settled or state.remaining < NOTHING or not strict:
             return self._solution(state, first_cost, most)
         raise np.linalg.LinAlgError(
             f"smoothing did not converge in {most} iterations: the last one moved a "

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich.table import Table
 from rich.text import Text
 
+from ...suggestions import counted
 from ..noise_study import Variation
 
 if TYPE_CHECKING:
@@ -143,6 +144,11 @@ def _ratio(numbers: dict[str, Any], hint: Sequence[str]) -> str:
     """Rate NEES or NIS per degree of freedom, which is 1 for a consistent filter."""
     ratio = numbers["per_degree"]
     text = f"{significant(ratio)} per degree of freedom; 1 is expected"
+    if singular := numbers.get("singular"):
+        poses = counted(singular, "pose")
+        text = f"{text}; {poses} without it, whose covariance is singular"
+        if ratio is None:
+            return f"none: the covariance of {poses} is singular"
     if ratio is None or ratio > _TOO_LITTLE:
         return f"{text}: {hint[1]}"
     return f"{text}: {hint[0]}" if ratio < _TOO_MUCH else text

@@ -214,13 +214,24 @@ def nees_summary(trace: RunTrace) -> dict[str, Any] | None:
         ``mean`` over the ``steps`` where it is defined, ``final`` at the last step
         (None where undefined), ``degrees_of_freedom`` 3, ``per_degree``, the mean by 3,
         near 1 for a consistent filter, and the ``frame`` of the error, which is the
-        filter's own. None if it is defined nowhere.
+        filter's own; ``singular``, the number of poses without a NEES because their
+        covariance is singular, if there are any besides those known exactly.  None if
+        no pose has a truth, or all are known exactly.
     """
     values = pose_nees(trace)
     table = nees_table(values, trace.frame)
-    if table is None:
+    lost = 0
+    if trace.true_poses is not None:
+        is_uncertain = trace.pose_covariances.any(axis=(1, 2))
+        is_known = np.isfinite(trace.true_poses).all(axis=1)
+        lost = int((is_known & is_uncertain & ~np.isfinite(values)).sum())
+    if table is None and not lost:
         return None
-    return {"mean": table["mean"], "final": finite(values[-1]), **table}
+    if table is None:
+        none = dict.fromkeys(("mean", "per_degree"))
+        table = {"degrees_of_freedom": 3, "steps": 0, "frame": trace.frame, **none}
+    singular = {"singular": lost} if lost else {}
+    return {"mean": table["mean"], "final": finite(values[-1]), **table, **singular}
 
 
 def nees_table(values: Array, frame: ErrorFrame) -> dict[str, Any] | None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from drives import MEASUREMENT_STD, MOTION_STD, drive
+from far_origins import far_origins, rounding
 
 from slamgym.estimator import UnscentedSlam, make_estimator
 from slamgym.estimator.filters.drive_likelihood import DriveEvents, drive_likelihood
@@ -54,6 +55,20 @@ def density(report):
     sign, log_det = np.linalg.slogdet(2 * np.pi * S)
     assert sign > 0
     return -0.5 * (nu @ np.linalg.solve(S, nu) + log_det)
+
+
+@far_origins
+def test_a_drive_far_from_the_origin_is_as_likely_to_the_bit(far):
+    slam, there = filter_of("invariant"), filter_of("invariant")
+    there.reset((1.0 + far[0], -2.0 + far[1], 0.3), (0.1, 0.1, 0.05))
+    records = [
+        drive_likelihood(each, events(), NOISE[None], keep_beliefs=True)
+        for each in (slam, there)
+    ]
+    near, found = records
+    assert (found.log_likelihoods == near.log_likelihoods).all()
+    moved = near.poses + np.array([*far, 0.0])
+    np.testing.assert_allclose(found.poses, moved, rtol=0, atol=2 * rounding(far))
 
 
 def single_reading(slam, copy, reading, i):

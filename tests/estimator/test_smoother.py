@@ -79,6 +79,14 @@ def test_a_drive_far_from_the_origin_has_the_same_solution(kind, far):
     np.testing.assert_allclose(Q, P, rtol=0, atol=P.max() * 12 * rounding(far))
 
 
+@pytest.mark.parametrize("robust", [None, "huber", "cauchy"])
+def test_steps_that_are_only_rounding_have_found_the_solution(robust):
+    made = recorded(seed=24)[0]
+    exact = smooth(made, robust=robust, tolerance=1e-17)
+    found = smooth(made, robust=robust)
+    np.testing.assert_allclose(exact.poses, found.poses, atol=1e-8)
+
+
 @far_origins
 def test_a_start_far_from_the_origin_leads_to_the_same_solution(example, far):
     made, _ = recorded(initial_pose=(*far, 0.0))[:2]
@@ -124,7 +132,7 @@ def test_other_sensors_are_smoothed_as_by_dense_least_squares(sensor, std):
     slam = SmoothingSlam(MOTION_STD, initial_pose_std=START_STD, **noise)
     slam.update(np.empty((0, 2)), [])
     moves, scans = [], [(np.empty((0, 2)), [])]
-    for odometry, readings, _ in drive(3, 12):
+    for odometry, readings, _ in drive(3, 30):
         seen = np.arange(len(readings))
         moves.append(odometry)
         scans.append((sensor.read(*from_bearing_range(*readings.T)), seen))

@@ -4,9 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from far_origins import far_origins, rounding, shifted
+from rich.console import Console
 
 from slamgym.envs.controllers import make_controller
 from slamgym.estimator import Belief, EkfSlam, UpdateReport, make_estimator
+from slamgym.experiments.command_line.tables import key_figures
 from slamgym.experiments.logs.ground_truth import (
     path_accuracy,
     true_poses_of,
@@ -386,6 +389,45 @@ def test_a_start_known_for_certain_has_no_nees():
     assert summary["steps"] == 3
     assert summary["mean"] == pytest.approx(nees[1:].mean())
     assert summary["per_degree"] == pytest.approx(nees[1:].mean() / 3)
+
+
+def test_poses_whose_covariance_is_singular_are_counted():
+    truth = [[float(k), 0.3 * k, 0.0, 0.0] for k in range(4)]
+    noise = {"motion_std": (0.1, 0.0, 0.0), "measurement_std": (0.1, 0.1)}
+    log = short_drive(ground_truth=truth)
+    summary = summarise(replay(log, make_estimator("ekf", **noise)))
+    found = summary["nees"]
+    assert (found["singular"], found["steps"], found["mean"]) == (3, 0, None)
+    table = Console(width=100)
+    with table.capture() as text:
+        table.print(key_figures(summary))
+    assert "none: the covariance of 3 poses is singular" in text.get()
+    assert "singular" not in summarise(replay(log, ekf()))["nees"]
+
+
+@far_origins
+@pytest.mark.parametrize("name", ["ekf", "robocentric", "invariant", "submaps"])
+def test_a_log_far_from_the_origin_has_the_same_summary(name, far):
+    summaries = []
+    for origin in ((0.0, 0.0), far):
+        log = recorded(20)
+        moved = replace(
+            log,
+            start=shifted(log.start, origin),
+            landmarks=log.landmarks + origin,
+            ground_truth=log.ground_truth + np.array([0, *origin, 0]),
+        )
+        slam = make_estimator(
+            name, initial_pose=moved.start, initial_pose_std=(0.1,) * 3, **NOISE
+        )
+        summaries.append(summarise(replay(moved, slam)))
+    near, there = summaries
+    slack = rounding(far, 20) / 0.02  # the least deviation, that of a bearing at 1 m
+    keys = ("nees", "mean"), ("nees", "final"), ("nis", "mean"), ("ate", "aligned")
+    for key, part in keys:
+        one, other = near[key][part], there[key][part]
+        assert other == pytest.approx(one, rel=10 * slack, abs=10 * rounding(far, 20))
+    assert "singular" not in there["nees"]
 
 
 def test_a_summary_holds_plain_finite_numbers_and_null_for_the_unknown():
