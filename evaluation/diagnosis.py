@@ -184,25 +184,43 @@ def diagnose(
         return _of_consistent_errors(before, p_value, nis_ratio or 0.0)
     if _is_of_the_association(blame, errors):
         return _of_the_association(before, blame, errors)
-    shown = p_value if p_value < FILTER_RATE else errors.p_of_one
-    if shown >= FILTER_RATE or (
-        p_value >= FILTER_RATE and 1 / LEAST_RATIO < errors.ratio < LEAST_RATIO
-    ):
-        text = f"{before}a test rejects the filter, although on average {errors.text}"
+    claims = _spurious_text(knowledge, spurious)
+    is_off = errors.p_value < FILTER_RATE
+    shown = errors.p_value if is_off else errors.p_of_one
+    is_near = 1 / LEAST_RATIO < errors.ratio < LEAST_RATIO
+    if shown >= FILTER_RATE or (is_near and not is_off):
+        why = claims or "a test rejects the filter"
+        text = f"{before}{why}, although on average {errors.text}"
         sentence = f"cannot tell: {text} ({p_text(errors.p_of_one)})."
         return Diagnosis(CANNOT_TELL, p_value, sentence, others)
-    what = f"{before}{errors.text} ({p_text(shown)})"
-    what += _also(knowledge, spurious, nis_ratio)
-    if small_noise is None:
-        cause, text = CANNOT_TELL, _WITHOUT_SMALL_NOISE
-    else:
-        cause, text = excess_of(pose, heading, small_noise, nis_ratio or 0.0, most)
-    repeat = runs_to_repeat(pose, heading, small_noise, cause)
+    cause, text, repeat = _of_less_noise(pose, heading, small_noise, nis_ratio, most)
     if cause == WRONG_COVARIANCE and p_value >= FILTER_RATE:
         # The repeated runs have the same random numbers: what is chance stays, too.
         cause, text = CANNOT_TELL, f"{text} It may be chance: try another seed."
-    sentence = f"{cause}: {what}. {text}"
-    return Diagnosis(cause, shown, sentence, others, repeat)
+    what = f"{before}{errors.text} ({p_text(shown)}){_also(claims, nis_ratio)}"
+    return Diagnosis(cause, shown, f"{cause}: {what}. {text}", others, repeat)
+
+
+def _of_less_noise(
+    pose: Array,
+    heading: Array,
+    small: SmallNoise | None,
+    nis_ratio: float | None,
+    most: float,
+) -> tuple[str, str, int]:
+    """Return what runs with less noise show, and how many to repeat with still less."""
+    cause, text = CANNOT_TELL, _WITHOUT_SMALL_NOISE
+    if small is not None:
+        cause, text = excess_of(pose, heading, small, nis_ratio or 0.0, most)
+    return cause, text, runs_to_repeat(pose, heading, small, cause)
+
+
+def _also(claims: str, nis_ratio: float | None) -> str:
+    """Write what else is wrong with a filter."""
+    text = f"; {claims}" if claims else ""
+    if nis_ratio is not None and nis_ratio > LARGEST_NIS:
+        text += f"; the squared innovations are {nis_ratio:.3g} times too large"
+    return text
 
 
 def _blamed(
@@ -217,17 +235,14 @@ def _blamed(
     return blame_association(pose, np.asarray(mistakes, float), paired)
 
 
-def _also(knowledge: Array, spurious: float | None, nis_ratio: float | None) -> str:
-    """Write what else is wrong with an overconfident filter."""
-    text = ""
-    if spurious is not None and spurious < _ERROR_RATE:
-        text += (
-            f"; the filter reports {100 * knowledge.mean():.2g} % of the smallest "
-            "heading variance that any filter can reach"
-        )
-    if nis_ratio is not None and nis_ratio > LARGEST_NIS:
-        text += f"; the squared innovations are {nis_ratio:.3g} times too large"
-    return text
+def _spurious_text(knowledge: Array, spurious: float | None) -> str:
+    """Write that a filter reports to know its heading too well, "" if it does not."""
+    if spurious is None or spurious >= _ERROR_RATE:
+        return ""
+    return (
+        f"the filter reports {100 * knowledge.mean():.2g} % of the smallest heading "
+        f"variance that any filter can reach ({p_text(spurious)})"
+    )
 
 
 def _checked_sums(noise: ArrayLike, runs: int) -> Array:

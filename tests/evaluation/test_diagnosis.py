@@ -1,5 +1,7 @@
 """The noise of a world by its truth, and the cause that it points to."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -416,6 +418,11 @@ def test_spurious_knowledge_of_the_heading_makes_small_errors_suffice():
     knowing = diagnose(**nearly, heading_knowledge=np.full(RUNS, 0.6))
     assert knowing.cause == "cannot tell"
     assert "reports 60 % of the smallest heading variance" in knowing.sentence
+    agreeing = diagnose(**scores, heading_knowledge=np.full(RUNS, 0.6))
+    assert (agreeing.cause, agreeing.repeat) == ("cannot tell", 0)
+    figures = re.findall(r"\(p . ([^)]*)\)", agreeing.sentence)
+    assert float(figures[0]) < 1e-9  # of the knowledge
+    assert float(figures[1]) > 0.02  # of the errors
 
 
 @pytest.mark.parametrize(("factor", "margin"), [(0.5, 1 / 1.1), (2.0, 1.1)])
