@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.text import Text
 
 from .. import figures
@@ -14,7 +15,7 @@ from ..figures.style import sign
 from ..logs.recording import steps_of
 from ..logs.slamlog import SlamLog, write_slamlog
 from ..runs.filter_settings import FilterSettings
-from ..runs.log_replay import replay
+from ..runs.log_replay import Replay, replay
 from ..runs.summary import association_failure, summarise
 from ..runs.trace import RunTrace
 from ..viewers import RunFrames, ViewedRun, write_rerun, write_run_page
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+#: Of a map whose covariance is written: 32 MB.
+_MOST_LANDMARKS = 1000
 _FEW_STEPS = 60  # of a run whose every step is drawn by default
 
 
@@ -57,7 +60,7 @@ def filter_and_write(
     reporter: Reporter,
     walls: Sequence[Sequence[float]] = (),
 ) -> dict[str, Any]:
-    """Filter a log, and write figures, run.html, log.csv and summary.json.
+    """Filter a log, and write figures, run.html, log.csv, belief.npz and summary.json.
 
     The page run.html and comparison.png show all filters side by side; the other files
     are those of the first one.
@@ -118,11 +121,33 @@ def filter_and_write(
     if given.rerun is not None:
         write_rerun(given.rerun, log, viewed, walls=walls)
     write_slamlog(runs[0].log, folder / "log.csv")
+    write_belief(folder / "belief.npz", runs[0])
     summaries = [
         summarise(run, settings, resolution=given.resolution)
         for run, settings in zip(runs, filters.values(), strict=True)
     ]
     return write_summary(folder, {**summaries[0], "others": summaries[1:]})
+
+
+def write_belief(path: Path, run: Replay) -> None:
+    """Write the poses of a run with their covariances, and its final belief.
+
+    The arrays are ``t`` (K + 1,), ``poses`` (K + 1, 3), ``pose_covariances``
+    (K + 1, 3, 3), ``landmark_ids`` (n,), ``mean`` (3 + 2n,) and, for a map of up to
+    1,000 landmarks, ``covariance`` (3 + 2n, 3 + 2n), both of the state (x, y, θ, l1x,
+    l1y, …) [s or steps, m, rad].
+    """
+    trace, belief = run.trace, run.belief
+    arrays: dict[str, Any] = {
+        "t": trace.t,
+        "poses": trace.poses,
+        "pose_covariances": trace.pose_covariances,
+        "landmark_ids": trace.landmark_ids,
+        "mean": belief.mean,
+    }
+    if len(trace.landmark_ids) <= _MOST_LANDMARKS:
+        arrays["covariance"] = belief.covariance
+    np.savez(path, **arrays)
 
 
 def write_figures(

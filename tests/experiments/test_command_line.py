@@ -24,7 +24,8 @@ from slamgym.experiments.command_line import program, run_files, tables
 from slamgym.experiments.command_line.app import main
 from slamgym.experiments.jobs import MANIFEST
 from slamgym.experiments.logs import read_log
-from slamgym.experiments.runs.filter_settings import estimator_choices
+from slamgym.experiments.runs.filter_settings import estimator_choices, settings_for
+from slamgym.experiments.runs.log_replay import replay
 from slamgym.jit import jit
 from slamgym.sim_configs import list_presets, load_scenario
 
@@ -112,7 +113,7 @@ def test_a_run_writes_pictures_log_scenario_and_numbers(finished_run):
     for name in names:
         with Image.open(folder / name) as picture:
             assert min(picture.size) > 300
-    texts = ["log.csv", "run.html", "scenario.toml", "summary.json"]
+    texts = ["belief.npz", "log.csv", "run.html", "scenario.toml", "summary.json"]
     found = [p.relative_to(folder).as_posix() for p in folder.rglob("*.*")]
     assert summary["files"] == sorted(names + texts)
     assert sorted(found) == sorted([MANIFEST, *summary["files"]])
@@ -140,6 +141,18 @@ def test_a_run_without_identities_prints_and_saves_its_scores(here, without_pict
     assert "GOSPA of the map" in text
     again = answered("replay", "out/log.csv", *drive[3:7], "--out", "again")
     assert again["association"]["correct"] > 0.9 * scores["correct"]
+
+
+def test_a_replay_writes_the_covariance_of_the_whole_state(log, without_pictures):
+    answer = answered("replay", log, "--out", "out")
+    drive = read_log(log)
+    run = replay(drive, settings_for(drive).make(drive.start))
+    with np.load("out/belief.npz") as saved:
+        np.testing.assert_array_equal(saved["covariance"], run.belief.covariance)
+        np.testing.assert_array_equal(saved["mean"], run.belief.mean)
+        assert saved["mean"][:3].tolist() == pytest.approx(answer["pose"])
+        assert saved["landmark_ids"].tolist() == [7, 9]
+        assert len(saved["pose_covariances"]) == len(saved["t"]) == answer["steps"] + 1
 
 
 def test_a_log_can_be_replayed_without_its_identities(log, without_pictures):

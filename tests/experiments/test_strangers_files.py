@@ -225,7 +225,9 @@ def test_the_example_of_the_page_runs(folder, monkeypatch, tmp_path):
     ("changes", "message"),
     [
         ({"measurements": "t,tag,angle,far\n1,4,0,1\n"},
-         "expected measurements, a table with the columns t, id, bearing, range, got"),
+         "measurements.csv, line 1: expected a first row with the columns t, id, bea"),
+        ({"measurements": "t,id,x,y\n1,4,0,1\n"},
+         "expected measurements, a table with the columns t, id, bearing, range, one"),
         ({"odometry": "t,d,alpha\n1,1,0\n0.5,1,0\n"},
          r"odometry.csv, line 3: expected t >= 1, the time before, got 0.5"),
         ({"odometry": "t,d,alpha\n1,1,0\n2,1\n"},
@@ -237,6 +239,8 @@ def test_the_example_of_the_page_runs(folder, monkeypatch, tmp_path):
         ({"measurements": MEASUREMENTS + "3,7,0,1\n"},
          r"line 6: expected each landmark once per scan, got id 7 again"),
         ({"odometry": "t,v,omega\n1,1,0\n"}, "expected at least two rows of v and ome"),
+        ({"odometry": "1,1,0\n2,1,0\n"},
+         "odometry.csv, line 1: expected a first row with the columns t, d, alpha or"),
         ({"odometry": "# motion: arc\n" + ODOMETRY}, "line 1: expected turn-last, mid"),
     ],
 )  # fmt: skip
@@ -334,6 +338,7 @@ def test_the_truth_of_a_log_may_be_in_any_format(folder, file, name, kind):
         ("0 0 1 0 1 0 0 0 0 1 0 0\n" * 2, "pose 0 tilted by more than 30°: convert"),
         (TUM.replace("\n", "9\n", 1).replace("0 5", "90 5"), "path.txt"),
         ("# format: slamlog 1\nodometry,1,1,0,1\n", "expected a true path, got a log"),
+        ("t,east,yaw\n0,1,2\n1,1,2\n", "expected truth, a table with the columns t"),
         (matrices(camera=True) * 2, "expected a pose for each of the 4 times of the l"),
         ("".join(f"{k + 50} 1 2 0 0 0 0 1\n" for k in range(3)),
          "expected times of the log, 0 to 3, got 50 to 52: give both on one clock"),
@@ -354,7 +359,7 @@ def test_a_truth_that_does_not_fit_is_refused(folder, file, text, message):
         (TUM, "expected a log of odometry and readings, got a path in the format of T"),
         (matrices(camera=True), "got a path in the format of KITTI, which --truth rea"),
         (EUROC_HEAD + EUROC_ROWS, "got a path in the format of EuRoC, which --truth r"),
-        (ROS, "expected odometry, a table with the columns t, d, alpha, got"),
+        (ROS, "expected odometry, a table with the columns t, d, alpha or t, v,"),
         ("t,d,alpha\n1,1,0\n", "or give the folder of several such files"),
         ("odometry,1,1,0,1\n", "line 1: expected # format: slamlog 1, got 'odometry"),
         ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n", "of a planar graph, got 'VERTEX_SE3:QU"),
@@ -365,6 +370,7 @@ def test_a_truth_that_does_not_fit_is_refused(folder, file, text, message):
         ("ODOMETRIE 0.1 2 0\n", "the nearest formats are .*Freiburg sensor.dat"),
         ("# only\n% remarks\n", "line 1: expected rows, got comments only"),
         ('{"t": 1}\n', "line 1: .*nearest formats"),
+        ("zeit,weg,winkel\n0,1,2\n", "line 1: .* csv with named columns .*, got 'zeit"),
     ],
 )  # fmt: skip
 def test_what_is_no_log_is_refused_with_the_remedy(file, text, remedy):

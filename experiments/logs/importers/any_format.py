@@ -163,6 +163,8 @@ def read_true_path(path: str | PathLike[str]) -> TruePath:
     kind, table = _format_of(source, lines)
     if table is not None and "truth" in table.kinds:
         return TruePath(named_columns.true_path_of(table))
+    if kind == "csv" and table is not None:
+        raise named_columns.lacking("truth", [table], source)
     if kind == "isam":
         return graph.true_path(log_lines.content_of(lines))
     numbers = numeric_rows(log_lines.content_of(lines))
@@ -286,7 +288,7 @@ def _format_of(
         raise lines[0].error(slamlog.FORMAT_LINE, log_lines.shown(lines[0].text))
     if all(map(log_lines.is_number, content[0].text.split())):
         return "course", None
-    raise _unknown(content[0])
+    raise _unknown(next(at for at in lines if log_lines.without_comment(at.text)))
 
 
 def _kind_by_tag(line: log_lines.LogLine) -> str:

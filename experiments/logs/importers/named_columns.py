@@ -78,6 +78,13 @@ _STEMS = {
     "truth": "truth|gt",
     "landmarks": "landmark|map|world|beacon",
 }
+#: Columns of the files that the documentation names.
+_EXAMPLES = {
+    "odometry": "t, d, alpha or t, v, omega",
+    "measurements": "t, id, bearing, range",
+    "groundtruth": "t, x, y, theta",
+    "landmarks": "id, x, y",
+}
 #: Stamps beyond these [s] are in other units: no drive is so long, and epoch times
 #: are near 1.7e9 s.
 _HUGE = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
@@ -246,6 +253,10 @@ def tables_in(folder: Path) -> list[Table]:
             continue
         if table is not None and table.kinds:
             found.append(table)
+        elif file.stem.lower() in _EXAMPLES:
+            first = log_lines.read_lines(file)[0]
+            wanted = f"a first row with the columns {_EXAMPLES[file.stem.lower()]}"
+            raise first.error(wanted, log_lines.shown(first.text))
     return found
 
 
@@ -339,21 +350,23 @@ def _by_kind(tables: Sequence[Table], source: Path) -> dict[str, Table]:
             of[kind] = table
     for kind in ("odometry", "measurements"):
         if kind not in of:
-            raise _lacking(kind, tables, source)
+            raise lacking(kind, tables, source)
     return of
 
 
-def _lacking(kind: str, tables: Sequence[Table], source: Path) -> slamlog.LogError:
+def lacking(kind: str, tables: Sequence[Table], source: Path) -> slamlog.LogError:
     """Return the error that no table has the columns of a kind."""
-    form = ", ".join(FORMS[kind][0]).replace("t, b", "t, id, b")
+    form = _EXAMPLES["groundtruth" if kind == "truth" else kind]
+    if kind == "measurements":
+        form += ", one row per reading"
     got = "; ".join(
         f"{table.file.name} with {log_lines.shown(table.header.text)}"
         for table in tables
     )
     other = "" if source.is_dir() else ", or give the folder of several such files"
     return slamlog.LogError(
-        f"{source}: expected {kind}, a table with the columns {form}, got {got}: "
-        f"rename the columns{other}"
+        f"{source}: expected {kind}, a table with the columns {form}; got {got}: "
+        f"rename or convert the columns{other}"
     )
 
 
