@@ -67,7 +67,7 @@ def exact_circle(laps, *, count=24, seen=6, start_std=(0.1, 0.1, 0.05)):
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"active_bound": 2}, {"sparsify": "prune"}], ids=str
+    "options", [{}, {"active_bound": 6}, {"sparsify": "prune"}], ids=str
 )
 def test_it_keeps_the_contract(options):
     assert check_estimator(partial(SparseInformationSlam, **options)) == ()
