@@ -17,6 +17,8 @@ from ..estimator.models.bearing_range import wrap_angle
 from ..estimator.models.rigid_motion import rotation
 from ..estimator.support.argument_checks import as_floats, shaped
 
+_ROUNDING = 4 * np.finfo(np.float64).eps
+
 
 class Alignment(NamedTuple):
     """A rigid motion of the plane, e ↦ C(φ) e + c."""
@@ -100,7 +102,10 @@ def align_positions(estimate: ArrayLike, truth: ArrayLike) -> Alignment:
     e_mean, g_mean = e.mean(axis=0), g.mean(axis=0)
     e_centred, g_centred = e - e_mean, g - g_mean
     cross = e_centred[:, 0] @ g_centred[:, 1] - e_centred[:, 1] @ g_centred[:, 0]
-    angle = float(np.arctan2(cross, np.sum(e_centred * g_centred)))
+    dot = np.sum(e_centred * g_centred)
+    noise = _ROUNDING * len(e) * (np.abs(e).max() * np.abs(g_centred).max())
+    noise += _ROUNDING * len(e) * (np.abs(g).max() * np.abs(e_centred).max())
+    angle = float(np.arctan2(cross, dot)) if np.hypot(cross, dot) > noise else 0.0
     return Alignment(angle, g_mean - e_mean @ rotation(angle).T)
 
 

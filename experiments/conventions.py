@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import Array
+from ..arrays import Array, IntArray
 from ..estimator.models import rigid_motion
 from ..estimator.models.bearing_range import wrap_angle
 from ..evaluation.nees import pose_nees
@@ -43,6 +43,10 @@ class Reading(NamedTuple):
     poses: Array
     #: Of the additive error.
     covariances: Array
+    #: Whether their error is exactly the additive one, not one to first order.
+    is_additive: bool = False
+    #: True poses of its own times; None if those are the declared ones.
+    truth: Array | None = None
 
 
 class _Fit(NamedTuple):
@@ -58,7 +62,13 @@ class _Fit(NamedTuple):
 
 
 def mistake_in(
-    truth: Array, poses: Array, claims: Array, starts: Array, frame: str = "additive"
+    truth: Array,
+    poses: Array,
+    claims: Array,
+    starts: Array,
+    frame: str = "additive",
+    *,
+    decides: str = "invariant",
 ) -> str:
     """Return the convention that poses of B drives break as a sentence; empty if none.
 
@@ -72,6 +82,8 @@ def mistake_in(
         Poses at which the drives start according to their files.
     frame : {"additive", "invariant", "left"}
         The error whose covariance the file is declared to hold.
+    decides : {"invariant", "additive"}
+        The error whose NEES counts where covariances are of the additive error.
 
     Examples
     --------
@@ -85,20 +97,10 @@ def mistake_in(
     if np.array_equal(truth, poses, equal_nan=True):
         return "the poses are the true ones to the last digit, not estimates."
     drives = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))[:MOST_DRIVES]
-    last = truth.shape[1] - 1
-    reach = min(_SHIFT, (last - 1) // 2)
-    steps = np.unique(np.linspace(1 + reach, last - reach, _STEPS).round().astype(int))
-    if not len(drives) or last < 1:
+    if not len(drives) or truth.shape[1] < 2:
         return ""
-
-    def at(shift: int) -> tuple[Array, Array]:
-        taken = np.ix_(drives, steps + shift)
-        return poses[taken], claims[taken]
-
-    exact = truth[np.ix_(drives, steps)]
-    shifts = [shift for shift in range(-reach, reach + 1) if shift]
-    by_pose = list(_pose_readings(*at(0), starts[drives], {k: at(k) for k in shifts}))
-    read = [list(_readings(*each, frame)) for each in by_pose]
+    posed = truth[drives], poses[drives], claims[drives]
+    exact, read = _all_readings(*posed, starts[drives], _Errors(frame, decides))
     (declared, *its_own), others = read[0], read[1:]
     before = _fit(exact, declared)
     if before.is_honest:
@@ -114,6 +116,34 @@ def mistake_in(
         was = f"{before.nees:.3g}" if np.isfinite(before.nees) else "undefined"
         return f"{reading.name}: read so, NEES / 3 is {fit.nees:.2f}, not {was}."
     return _nearer(exact, [own[0] for own in others], before)
+
+
+class _Errors(NamedTuple):
+    """The error of the covariances in a file, and the one whose NEES counts."""
+
+    frame: str
+    decides: str
+
+
+def _all_readings(
+    truth: Array, poses: Array, claims: Array, starts: Array, errors: _Errors
+) -> tuple[Array, list[list[Reading]]]:
+    """Return true poses at some steps, and all readings by those of the poses."""
+    last = truth.shape[1] - 1
+    reach = min(_SHIFT, (last - 1) // 2)
+    steps = np.unique(np.linspace(1 + reach, last - reach, _STEPS).round().astype(int))
+
+    def at(shift: int) -> tuple[Array, Array]:
+        return poses[:, steps + shift], claims[:, steps + shift]
+
+    exact = truth[:, steps]
+    shifts = [shift for shift in range(-reach, reach + 1) if shift]
+    by_pose = list(_pose_readings(*at(0), starts, {k: at(k) for k in shifts}))
+    by_pose += list(_in_other_units(exact, *at(0)))
+    read = [list(_readings(*each, errors)) for each in by_pose]
+    if reach:
+        read += _between_steps(truth, steps, at(0), reach, errors)
+    return exact, read
 
 
 def swapped_drives(
@@ -211,15 +241,18 @@ def _nearer(truth: Array, readings: Sequence[Reading], before: _Fit) -> str:
 
 
 def _fit(truth: Array, reading: Reading) -> _Fit:
-    """Compare a reading with the truth, by the invariant error of the pose."""
-    there, here = (
-        rigid_motion.seen_from(reading.poses[..., :2], poses)
-        for poses in (truth, reading.poses)
-    )
-    covariances = rigid_motion.invariant_covariance(here, reading.covariances)
-    errors = rigid_motion.invariant_error(there, here)
-    order = [2, 0, 1]  # the heading first: no frame changes it
+    """Compare a reading with the truth, by its own error of the pose."""
+    truth = truth if reading.truth is None else reading.truth
     plain = rigid_motion.additive_error(truth, reading.poses)
+    errors, covariances = plain, reading.covariances
+    if not reading.is_additive:
+        there, here = (
+            rigid_motion.seen_from(reading.poses[..., :2], poses)
+            for poses in (truth, reading.poses)
+        )
+        errors = rigid_motion.invariant_error(there, here)
+        covariances = rigid_motion.invariant_covariance(here, covariances)
+    order = [2, 0, 1]  # the heading first: no frame changes it
     middle = (
         float(np.sqrt(np.nanmedian((plain[..., :2] ** 2).sum(axis=-1)))),
         float(np.sqrt(np.nanmedian(plain[..., 2] ** 2))),
@@ -271,9 +304,12 @@ FRAMES = {
 _LINEAR = {
     "headings in degrees instead of radians": _TURN,
     "headings that grow clockwise": np.diag([1.0, 1.0, -1.0]),
-    "positions in millimetres": np.diag([1e-3, 1e-3, 1.0]),
     **_ORDERS,
 }
+#: Metres.
+_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
+_ALIKE = 0.1  # logarithm of two scales that are the same
+_FINEST = 0.15  # part of a step by which a shift differs from whole steps
 
 
 #: Name, poses, covariances as in the file, and the Jacobian of the poses by its own.
@@ -306,6 +342,76 @@ def _pose_readings(
         yield name, others, theirs, np.eye(3)
 
 
+def _in_other_units(truth: Array, poses: Array, covariances: Array) -> Iterator[_Read]:
+    """Yield the poses in the unit that brings their paths to the size of the true ones.
+
+    The scale is ‖g'‖ / ‖e'‖ of the true positions g' and the estimates e' about the
+    centres of their drives.
+    """
+    spread = [
+        np.square(each[..., :2] - each[..., :2].mean(axis=1, keepdims=True)).sum()
+        for each in (truth, poses)
+    ]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = float(np.sqrt(spread[0] / spread[1]))
+    if not (np.isfinite(scale) and scale > 0 and abs(np.log(scale)) > _ALIKE):
+        return
+    name = f"positions in a unit of {scale:.3g} m"
+    known = {f"positions in {unit}": size for unit, size in _UNITS.items()}
+    known |= {f"a truth in {unit}": 1 / size for unit, size in _UNITS.items()}
+    for words, size in known.items():
+        if abs(np.log(scale / size)) < _ALIKE:
+            scale, name = size, words
+            break
+    matrix = np.diag([scale, scale, 1.0])
+    yield name, poses @ matrix.T, covariances, matrix
+
+
+def _between_steps(
+    truth: Array,
+    steps: IntArray,
+    estimates: tuple[Array, Array],
+    reach: int,
+    of: _Errors,
+) -> list[list[Reading]]:
+    """Read the estimates at the times between steps that fit their positions best."""
+    poses, claims = estimates
+    offsets = np.arange(-10 * reach + 1, 10 * reach) / 10
+    moved = [_truth_at(truth, steps - offset) for offset in offsets]
+    gaps = [np.nanmean(np.square(each - poses)[..., :2]) for each in moved]
+    best = int(np.argmin(gaps))
+    offset = float(offsets[best])
+    if abs(offset - round(offset)) < _FINEST:
+        return []
+    side = "late" if offset > 0 else "early"
+    name = f"time stamps that are {abs(offset):.1f} steps too {side}"
+    found = _readings(name, poses, claims, np.eye(3), of)
+    return [[each._replace(truth=moved[best]) for each in found]]
+
+
+def _truth_at(truth: Array, places: Array) -> Array:
+    """Return true poses (B, K, 3) between steps, on the arcs that join them."""
+    before = np.floor(places).astype(int)
+    start, end = truth[:, before], truth[:, before + 1]
+    error = rigid_motion.invariant_error(end, start) * (places - before)[:, None]
+    turn = error[..., 2]
+    point = np.exp(1j * turn) * (start[..., 0] + 1j * start[..., 1])
+    point += rigid_motion.left_jacobian(turn) * (error[..., 0] + 1j * error[..., 1])
+    heading = start[..., 2] + turn
+    return np.stack([point.real, point.imag, heading], axis=-1)
+
+
+def _transported(claims: Array, poses: Array) -> Iterator[tuple[str, Array, str]]:
+    """Yield covariances P of an error for C = Jᵀ P J, J from that error to another."""
+    kinds = tuple(FRAMES)
+    to_additive = {kind: _jacobian(poses, kind) for kind in kinds}
+    for kind, target in permutations(kinds, 2):
+        back = np.linalg.solve(to_additive[kind], to_additive[target])  # J⁻¹
+        title = FRAMES[kind]
+        name = f"covariances of {title} transported by Jᵀ P J instead of J P Jᵀ"
+        yield name, np.swapaxes(back, -1, -2) @ claims @ back, kind
+
+
 def additive_covariances(poses: Array, covariances: Array, frame: str) -> Array:
     """Return covariances of the additive error for those of another error.
 
@@ -325,10 +431,16 @@ def additive_covariances(poses: Array, covariances: Array, frame: str) -> Array:
     """
     if frame == "additive":
         return covariances
+    jacobian = _jacobian(poses, frame)
+    return np.asarray(jacobian @ covariances @ np.swapaxes(jacobian, -1, -2))
+
+
+def _jacobian(poses: Array, frame: str) -> Array:
+    """Return ∂e/∂ξ of the additive error by that of a frame, shape (..., 3, 3)."""
     jacobian = _rotations(poses[..., 2] * (frame == "left"))
     if frame == "invariant":
         jacobian[..., 0, 2], jacobian[..., 1, 2] = -poses[..., 1], poses[..., 0]
-    return np.asarray(jacobian @ covariances @ np.swapaxes(jacobian, -1, -2))
+    return jacobian
 
 
 def _rotations(angles: Array) -> Array:
@@ -339,7 +451,7 @@ def _rotations(angles: Array) -> Array:
 
 
 def _readings(
-    name: str, poses: Array, claims: Array, jacobian: Array, frame: str
+    name: str, poses: Array, claims: Array, jacobian: Array, of: _Errors
 ) -> Iterator[Reading]:
     """Yield poses with their covariances in all conventions.
 
@@ -348,17 +460,20 @@ def _readings(
     """
     poses = np.concatenate([poses[..., :2], wrap_angle(poses[..., 2:])], axis=-1)
 
-    def read(what: str, matrices: Array, kind: str = frame) -> Reading:
+    def read(what: str, matrices: Array, kind: str = of.frame) -> Reading:
         whole = f"{name}; {what}" if name and what else name or what
-        return Reading(whole, poses, additive_covariances(poses, matrices, kind))
+        claimed = additive_covariances(poses, matrices, kind)
+        return Reading(whole, poses, claimed, kind == of.decides == "additive")
 
     yield read("", claims)
     if name:
         yield read("", jacobian @ claims @ np.swapaxes(jacobian, -1, -2))
     is_diagonal = not np.triu(claims, 1).any()  # as in no covariance of another error
     for kind, title in FRAMES.items():
-        if kind != frame and not is_diagonal:
+        if kind != of.frame and not is_diagonal:
             yield read(f"covariances of {title}", claims, kind)
+    for what, matrices, kind in () if is_diagonal else _transported(claims, poses):
+        yield read(what, matrices, kind)
     yield read("covariances with headings in degrees", _TURN @ claims @ _TURN)
     for order, matrix in _ORDERS.items():
         yield read(f"covariances with {order}", matrix @ claims @ matrix.T)

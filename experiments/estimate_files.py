@@ -37,6 +37,9 @@ class Estimate(NamedTuple):
     #: Of the final map, shape (n, 2) [m].
     landmarks: Array = np.zeros((0, 2))
     landmark_covariances: Array = np.zeros((0, 2, 2))
+    #: Whether the file has covariances of z, roll and pitch, and its poses are not
+    #: those of a plane.
+    is_spatial: bool = False
 
     def at(self, rows: IntArray) -> "Estimate":
         """Return the same file with some of its poses only."""
@@ -46,8 +49,57 @@ class Estimate(NamedTuple):
 
 
 def true_path(path: Path) -> Array:
-    """Read rows (t, x, y, θ); without times, t counts the poses."""
-    return read_true_path(path).rows
+def true_path(path: Path) -> Array:
+    """Read rows (t, x, y, θ); without times, t counts the poses.
+
+    Times grow: rows that repeat the one before them are left out.
+    """
+    if is_tum(path):
+        lines = content_lines(path)
+        rows = np.array([tum_row(line)[:8] for line in lines])
+        headings = planar_headings(rows[:, 4:8], lines)
+        found = np.column_stack([rows[:, :3], headings])
+        places = [f"{line.file}, line {line.number}" for line in lines]
+    else:
+        found = read_true_path(path).rows
+        places = [f"{path}, pose {row}" for row in range(len(found))]
+    return found[growing_rows(found, places)]
+
+
+def is_tum(path: Path) -> bool:
+    """Whether the first line that is no comment has the numbers of a row of TUM."""
+    lines = content_lines(path) if path.is_file() else []
+    fields = lines[0].text.split() if lines else []
+    return len(fields) in (8, *(8 + size for size in _TUM_SIZES))
+
+
+def growing_rows(rows: Array, places: Sequence[str]) -> IntArray:
+    """Return which rows (t, …) to keep so that times grow; refuse others.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (n, m)
+        The time comes first.
+    places : sequence of str
+        File and line of each row.
+    """
+    same = (np.diff(rows, axis=0) == 0).all(axis=1)
+    kept = np.flatnonzero(np.append(True, ~same))
+    times = rows[kept, 0]
+    if len(kept) > 1 and (times == times[0]).all():
+        raise LogError(
+            f"{places[0]}: expected time stamps that grow, got {times[0]:.17g} in all "
+            f"{len(kept)} rows; write them with more digits"
+        )
+    wrong = np.flatnonzero(np.diff(times) <= 0)
+    if not len(wrong):
+        return kept
+    before, late = times[wrong[0]], times[wrong[0] + 1]
+    remedy = "write all digits" if late == before else "sort the rows by time"
+    raise LogError(
+        f"{places[kept[wrong[0] + 1]]}: expected a time stamp after {before:.17g}, got "
+        f"{late:.17g}; {remedy}"
+    )
 
 
 _CSV = (
@@ -56,6 +108,9 @@ _CSV = (
 )
 _TUM = "t x y z qx qy qz qw and 6, 9, 21 or 36 entries of a covariance"
 _ENDINGS = (".csv", ".tum", ".txt", ".npz")
+_UNIT = 0.1  # by which the length of a quaternion may differ from 1
+_TILT = np.pi / 6  # of a robot that has a heading
+_CLIMB = 0.05  # of a path, and tilt, that are not of a plane
 _POSE_SIZES, _TUM_SIZES = (6, 9), (6, 9, 21, 36)
 
 
@@ -206,14 +261,15 @@ def _of_npz(file: Path) -> Iterator[tuple[Any, Estimate]]:
         yield seed, _of_arrays(str(file), each)
 
 
-def _content(path: Path) -> list[LogLine]:
+def content_lines(path: Path) -> list[LogLine]:
+    """Read the lines of a file that are no comments."""
     return [line for line in read_lines(path) if not line.text.startswith("#")]
 
 
 def _of_csv(path: Path) -> Estimate:
     poses: list[list[float]] = []
     places: dict[int, list[float]] = {}
-    for line in _content(path):
+    for line in content_lines(path):
         kind, *fields = (field.strip() for field in line.text.split(","))
         if kind == "pose":
             line.check_count(fields, (10, 13), _CSV)
@@ -231,38 +287,78 @@ def _of_csv(path: Path) -> Estimate:
     return Estimate(
         str(path),
         table[:, 1:4],
-        _square(table[:, 4:], 3),
+        square(table[:, 4:], 3),
         times=table[:, 0],
         landmark_ids=np.array(list(places), np.int64),
         landmarks=of_map[:, :2],
-        landmark_covariances=_square(of_map[:, 2:], 2),
+        landmark_covariances=square(of_map[:, 2:], 2),
     )
 
 
-def _tum_row(line: LogLine) -> list[float]:
+def tum_row(line: LogLine) -> list[float]:
+    """Read the numbers of a row of TUM; its quaternion has length 1."""
     fields = line.text.split()
     line.check_count(fields, (8, *(8 + size for size in _TUM_SIZES)), _TUM)
-    return [line.to_real(field) for field in fields]
+    numbers = [line.to_real(field) for field in fields]
+    if abs((length := float(np.linalg.norm(numbers[4:8]))) - 1) > _UNIT:
+        wanted = "a rotation qx qy qz qw of length 1 in the fields 5 to 8"
+        raise line.error(wanted, f"one of length {length:.3g}")
+    return numbers
+
+
+def tum_table(path: Path) -> tuple[Array, list[LogLine]]:
+    """Read the rows of a TUM file with covariances, and their lines."""
+    lines, rows = content_lines(path), []
+    for line in lines:
+        rows.append(tum_row(line))
+        if len(rows[-1]) == 8:
+            raise line.error(_TUM, "no covariance")
+    return _even(path, rows, _TUM), lines
 
 
 def _of_tum(path: Path) -> Estimate:
-    rows = []
-    for line in _content(path):
-        rows.append(_tum_row(line))
-        if len(rows[-1]) == 8:
-            raise line.error(_TUM, "no covariance")
-    table = _even(path, rows, _TUM)
-    headings = [_heading(*q) for q in table[:, 4:8].tolist()]
+    table, lines = tum_table(path)
+    headings = planar_headings(table[:, 4:8], lines)
     entries = table[:, 8:]
+    is_spatial = False
     if entries.shape[1] in (21, 36):  # of x, y, z, roll, pitch, yaw
-        entries = _square(entries, 6)[:, [0, 1, 5]][:, :, [0, 1, 5]].reshape(-1, 9)
+        whole = square(entries, 6)
+        is_spatial = bool((whole[:, [2, 3, 4], [2, 3, 4]] > 0).all(axis=1).any())
+        is_spatial &= _leaves_its_plane(table[:, 1:8])
+        entries = whole[:, [0, 1, 5]][:, :, [0, 1, 5]].reshape(-1, 9)
     poses = np.column_stack([table[:, 1:3], headings])
-    return Estimate(str(path), poses, _square(entries, 3), table[:, 0], in_seconds=True)
+    return Estimate(
+        str(path),
+        poses,
+        square(entries, 3),
+        table[:, 0],
+        in_seconds=True,
+        is_spatial=is_spatial,
+    )
 
 
-def _heading(qx: float, qy: float, qz: float, qw: float) -> float:
-    """Return the yaw of a unit quaternion, whatever its length."""
-    return float(
+def _leaves_its_plane(rows: Array) -> bool:
+    """Whether poses (x, y, z, qx, qy, qz, qw) climb or tilt."""
+    extent = np.ptp(rows[:, :3], axis=0)
+    climbs = extent[2] > _CLIMB * max(extent[:2].max(), 1e-9)
+    return bool(climbs or abs(rows[:, 3:5]).max() > _CLIMB / 2)
+
+
+def planar_headings(quaternions: Array, lines: Sequence[LogLine]) -> Array:
+    """Return the yaws of rotations (n, 4) that are nearly about z; refuse others."""
+    q = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    tilts = 2 * np.arcsin(np.minimum(np.hypot(q[:, 0], q[:, 1]), 1))
+    if len(q) and tilts.max() > _TILT:
+        line, degrees = lines[int(tilts.argmax())], np.degrees(tilts.max())
+        wanted = "a rotation about z, qx and qy near 0"
+        got = f"qx qy qz qw = {' '.join(f'{x:.3g}' for x in q[tilts.argmax()])}"
+        if (2 * np.arcsin(np.minimum(np.hypot(q[:, 1], q[:, 2]), 1)) < _TILT).all():
+            raise line.error(wanted, f"{got}: qw comes first; write it last")
+        raise line.error(
+            wanted, f"{got}, tilted by {degrees:.0f}°; --space judges poses in space"
+        )
+    qx, qy, qz, qw = quaternions.T
+    return np.asarray(
         np.arctan2(2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
     )
 
@@ -274,7 +370,7 @@ def _even(path: Path, rows: list[list[float]], form: str) -> Array:
     return np.array(rows)
 
 
-def _square(entries: Array, size: int) -> Array:
+def square(entries: Array, size: int) -> Array:
     """Return matrices (T, n, n) of all entries by rows, or of the upper triangle."""
     if entries.shape[1] == size**2:
         return entries.reshape(-1, size, size)

@@ -8,7 +8,8 @@ and the report are those of a Monte Carlo. `read_estimates` reads the files.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby, islice
 from os import PathLike
 from pathlib import Path
@@ -30,6 +31,7 @@ from .estimate_files import (
     Estimate,
     beliefs_of,
     files_in,
+    growing_rows,
     name_of,
     paths_by_label,
     read_estimates,
@@ -65,6 +67,12 @@ NO_FILE = "there is no file of estimates"
 _AT_ONCE = 100  # drives in memory
 _ON_TIME = 0.01  # of a step
 _SYMMETRIC = 1e-6  # relative difference of two entries
+_INDEFINITE = -1e-9  # eigenvalue of correlations
+_NEAR = 1.5  # a mean NEES / 3 that an honest study may have
+_GAP = 3.0  # of the truth, in rows of it that are usual
+_TIME_UNITS = {"nanoseconds": 1e9, "microseconds": 1e6, "milliseconds": 1e3}
+_ROUNDED = 1e-6  # of a time stamp in nanoseconds since 1970 [s]
+_ASIDE, _ASIDE_GAIN = 0.01, 4.0  # of intervals of time, and of errors
 
 
 def judge(
@@ -72,7 +80,7 @@ def judge(
     drives: Place | None = None,
     *,
     truth: Place | Sequence[Place] | None = None,
-    covariances: str = "additive",
+    covariances: str | None = None,
     align: str | Sequence[float] | None = None,
     command: str = "",
 ) -> xr.Dataset:
@@ -88,8 +96,12 @@ def judge(
         estimates, if they are such a folder with the beliefs of a filter.
     truth : path or sequence of paths, optional
         True paths of drives from elsewhere, instead of ``drives``.
-    covariances : {"additive", "invariant", "right", "left"}
-        The error whose covariances the files hold; "right" is "invariant".
+    covariances : {"additive", "invariant", "right", "left"}, optional
+        The error whose covariances the files hold; "right" is "invariant". Its NEES
+        decides; for "left" that of the invariant error, which is the same. By default
+        covariances are read as additive, and the invariant error decides, or the
+        additive one if its mean NEES is nearer to 3 and at most 1.5 times off. For
+        beliefs of filters in a data set, it is the invariant one.
     align : "fit" or (x, y, θ), optional
         A motion [m, m, rad] of all estimates, covariances included, into the frame of
         the truth. "fit" finds the one that brings each path closest to the truth; NEES
@@ -122,8 +134,9 @@ def judge(
     >>> float(judge(folder).pose_nees_invariant.mean() / 3) < 2
     True
     """
-    argument_checks.one_of("covariances", covariances, tuple(FRAMES))
-    frame = FRAMES[covariances]
+    if covariances is not None:
+        argument_checks.one_of("covariances", covariances, tuple(FRAMES))
+    frame = FRAMES[covariances or "additive"]
     if align not in (None, "fit"):
         align = argument_checks.finite_vector("align", align, 3).tolist()
     if truth is not None and drives is not None:
@@ -134,7 +147,12 @@ def judge(
     for chunk in task.chunks:
         for label, files in chunk.estimates.items():
             parts[label].append(_measured(chunk, files, frame, align))
-    mistakes = {label: _mistakes(each, task, frame) for label, each in parts.items()}
+    decides = "additive" if covariances == "additive" else "invariant"
+    if covariances is None and not task.is_own:
+        decides = _nearest([part for each in parts.values() for part in each])
+    mistakes = {
+        label: _mistakes(each, task, frame, decides) for label, each in parts.items()
+    }
     about = {
         "title": f"Estimates of {len(task.names)} drives of {task.title}",
         "scenario_name": task.title,
@@ -143,6 +161,8 @@ def judge(
         "seed": task.seed,
         "mistakes": json.dumps(mistakes),
         "alignment": "fitted" if align == "fit" else "given" if align else "",
+        "frame": decides,
+        "notes": json.dumps(task.notes),
         **provenance(command or f"judge({estimates!r}, {drives!r}, truth={truth!r})"),
     }
     blocks = {k: [part.block for part in each] for k, each in parts.items()}
@@ -171,6 +191,10 @@ class _Task(NamedTuple):
     #: Seeds, or names of files.
     names: list[Any]
     chunks: Iterator[_Chunk]
+    #: What was left out or converted, as sentences.
+    notes: tuple[str, ...] = ()
+    #: Whether all estimates are the beliefs in data sets.
+    is_own: bool = False
 
 
 class _Part(NamedTuple):
@@ -212,7 +236,12 @@ def _drives(place: Place | None, sources: dict[str, list[Path]]) -> _Task:
                 f"{next(iter(files.values())).file}"
             )
     text = scenario_text(job.scenario)
-    return _Task(job.scenario.name, text, job.seed, seeds, _chunks(data, found))
+    own = [
+        found[label] is None or all((path / MANIFEST).is_file() for path in paths)
+        for label, paths in sources.items()
+    ]
+    chunks = _chunks(data, found)
+    return _Task(job.scenario.name, text, job.seed, seeds, chunks, is_own=all(own))
 
 
 def _chunks(
@@ -285,13 +314,10 @@ def _paths(truth: Place | Sequence[Place], sources: dict[str, list[Path]]) -> _T
     true = {name_of(path): true_path(path) for path in files_in(places)}
     if not true:
         raise ValueError(f"truth must be at least one file, got none in {places[0]}")
-    found = {label: read_estimates(paths) for label, paths in sources.items()}
-    if len(true) == 1:
-        (name,) = true
-        found = {
-            label: {name: next(iter(each.values()))} if len(each) == 1 else each
-            for label, each in found.items()
-        }
+    found = {
+        label: _paired(read_estimates(paths), list(true))
+        for label, paths in sources.items()
+    }
     names = sorted(true, key=lambda name: (isinstance(name, str), name))
     inside = {
         (label, name): _within(each[name], true[name])
@@ -299,13 +325,13 @@ def _paths(truth: Place | Sequence[Place], sources: dict[str, list[Path]]) -> _T
         for name in names
         if name in each
     }
-    count = min((len(poses.poses) for poses, _ in inside.values()), default=0)
-    if count < 2:
+    if not inside:
         raise ValueError(
-            "estimates and truth must share their names and at least two times, got "
-            f"truth named {names[0]}, and estimates named "
+            "estimates and truth must share their names, such as run_1.tum in one "
+            f"folder each, got truth named {names[0]}, and estimates named "
             f"{next((n for each in found.values() for n in each), 'nothing')}"
         )
+    count = min(len(each.truth) for each in inside.values())
 
     def chunks() -> Iterator[_Chunk]:
         for label in found:
@@ -315,7 +341,7 @@ def _paths(truth: Place | Sequence[Place], sources: dict[str, list[Path]]) -> _T
                 if (label, name) not in inside:
                     files.append(NO_FILE)
                     continue
-                estimate, exact = inside[label, name]
+                estimate, exact, *_ = inside[label, name]
                 few = np.linspace(0, len(exact) - 1, count).round().astype(int)
                 poses[row] = exact[few]
                 files.append(estimate.at(few)._replace(times=None))
@@ -331,21 +357,136 @@ def _paths(truth: Place | Sequence[Place], sources: dict[str, list[Path]]) -> _T
             noise = np.zeros((len(names), len(CHANNELS), len(MOMENTS)))
             yield _Chunk(runs, {label: files}, _NO_BOUND, noise)
 
-    return _Task(Path(places[0]).stem, "", 0, names, chunks())
+    notes = _notes(inside.values())
+    return _Task(Path(places[0]).stem, "", 0, names, chunks(), notes)
 
 
-def _within(estimate: Estimate, path: Array) -> tuple[Estimate, Array]:
-    """Return the estimates at times of a true path (n, 4), and the truth there."""
+def _paired(estimates: dict[Any, Estimate], names: Sequence[Any]) -> dict[Any, Any]:
+    """Name estimates after their truths: alike, or by what differs between the names.
+
+    ``run1_est`` and ``run2_est`` belong to ``run1_gt`` and ``run2_gt``.
+    """
+    if set(estimates) & set(names):
+        return estimates
+    if len(names) == len(estimates) == 1:
+        return dict(zip(names, estimates.values(), strict=True))
+    true, theirs = _keys(names), _keys(list(estimates))
+    by_key = dict(zip(theirs, estimates.values(), strict=True))
+    if len(set(true)) < len(true) or len(by_key) < len(estimates):
+        return estimates
+    pairs = zip(names, true, strict=True)
+    return {name: by_key[key] for name, key in pairs if key in by_key} or estimates
+
+
+def _keys(names: Sequence[Any]) -> list[tuple[str, ...]]:
+    """Return the words and numbers of each name that not all of the names have."""
+    parts = [re.findall(r"\d+|[^\W\d_]+", str(name).lower()) for name in names]
+    plain = [[part.lstrip("0") or "0" for part in each] for each in parts]
+    common = set.intersection(*map(set, plain))
+    return [tuple(part for part in each if part not in common) for each in plain]
+
+
+class _Inside(NamedTuple):
+    """The estimates of a file that have a truth, and the truth there."""
+
+    estimate: Estimate
+    truth: Array
+    #: Poses of the file that have none.
+    left_out: int = 0
+    #: Of the time stamps, where they were converted.
+    unit: str = ""
+
+
+def _within(estimate: Estimate, path: Array) -> _Inside:
+    """Return the estimates at times of a true path (n, 4), and the truth there.
+
+    A pose in a gap of the truth, where a straight line would be no truth, has none.
+    """
     if estimate.times is None:
         if len(estimate.poses) != len(path):
             raise ValueError(
                 f"{estimate.file} has no times and must have as many poses as its "
                 f"truth, {len(path)}, got {len(estimate.poses)}"
             )
-        return estimate, path[:, 1:]
-    exact = poses_at(estimate.times, path)
-    inside = np.flatnonzero(np.isfinite(exact).all(axis=1))
-    return estimate.at(inside), exact[inside]
+        return _Inside(estimate, path[:, 1:])
+    places = [f"{estimate.file}, pose {k}" for k in range(len(estimate.poses))]
+    rows = np.column_stack([estimate.times, estimate.poses])
+    estimate = estimate.at(growing_rows(rows, places))
+    times, due = estimate.times, path[:, 0]
+    assert times is not None
+    times, unit = _in_seconds(times, estimate.poses, path)
+    exact = poses_at(times, path)
+    after = np.clip(np.searchsorted(due, times), 1, len(due) - 1)
+    spacing = np.median(np.diff(due))
+    nearest = np.minimum(abs(times - due[after - 1]), abs(due[after] - times))
+    is_gap = (due[after] - due[after - 1] > _GAP * spacing) & (nearest > 0.05 * spacing)
+    inside = np.flatnonzero(np.isfinite(exact).all(axis=1) & ~is_gap)
+    if len(inside) < 2:
+        raise ValueError(
+            f"{estimate.file} and its truth must share at least two times, got "
+            f"{times[0]:.10g} to {times[-1]:.10g} s, and {due[0]:.10g} to "
+            f"{due[-1]:.10g} s with a row every {spacing:.3g} s; write both with the "
+            "same clock"
+        )
+    left_out = len(times) - len(inside)
+    return _Inside(estimate.at(inside), exact[inside], left_out, unit)
+
+
+def _in_seconds(times: Array, poses: Array, path: Array) -> tuple[Array, str]:
+    """Return times in the unit of a true path, and which unit had to be converted.
+
+    They are converted if the intervals then coincide and did not before, and if the
+    poses are then far nearer to the truth.
+    """
+
+    def overlap(found: Array) -> float:
+        low, high = max(found[0], due[0]), min(found[-1], due[-1])
+        whole = max(found[-1], due[-1]) - min(found[0], due[0])
+        return max(float((high - low) / whole), 0.0)
+
+    def distance(found: Array) -> float:
+        gaps = np.linalg.norm(poses_at(found, path)[:, :2] - poses[:, :2], axis=1)
+        known = gaps[np.isfinite(gaps)]
+        return float(np.median(known)) if len(known) > 1 else np.inf
+
+    due = path[:, 0]
+    if overlap(times) > _ASIDE:
+        return times, ""
+    for name, size in _TIME_UNITS.items():
+        for read, whose in ((times / size, ""), (times * size, "of the truth ")):
+            ends = np.clip(read, due[0], due[-1])
+            is_end = abs(ends - read) < _ROUNDED * (size if whose else 1.0)
+            found = np.where(is_end, ends, read)
+            if overlap(found) > 0.5 and distance(found) < distance(times) / _ASIDE_GAIN:
+                return found, f"{whose}are {name}"
+    return times, ""
+
+
+def _notes(found: Iterable[_Inside]) -> tuple[str, ...]:
+    """Write what was left out or converted, once for all files."""
+    notes, every = [], list(found)
+    units = [each for each in every if each.unit]
+    if units:
+        others = f", as in {len(units)} files" if len(units) > 1 else ""
+        notes.append(
+            f"{units[0].estimate.file}: the time stamps {units[0].unit}{others}; they "
+            "are converted to seconds."
+        )
+    short = [each for each in every if each.left_out]
+    if short:
+        poses = sum(each.left_out + len(each.truth) for each in every)
+        notes.append(
+            f"{sum(each.left_out for each in short)} of {poses} poses have no truth "
+            f"near their times and are left out; the first file is "
+            f"{short[0].estimate.file}, with {short[0].left_out}."
+        )
+    flat = [each for each in every if each.estimate.is_spatial]
+    if flat:
+        notes.append(
+            f"{flat[0].estimate.file} holds poses in space: only x, y and yaw are "
+            "judged; --space judges all six coordinates."
+        )
+    return tuple(notes)
 
 
 # --------------------------------------------------------------------------------------
@@ -418,12 +559,18 @@ def _invalid(
     """Find runs with something else than covariances."""
     gaps = abs(claims - np.swapaxes(claims, -1, -2)).max(axis=(2, 3))
     sizes = abs(claims).max(axis=(1, 2, 3))[:, None]
-    negative = (np.einsum("rsii->rsi", additive) < 0).any(axis=2)
+    variances = np.einsum("rsii->rsi", additive)
+    negative = (variances < 0).any(axis=2)
+    deviations = np.sqrt(np.where(variances > 0, variances, np.inf))
+    correlations = np.nan_to_num(additive / deviations[..., None])
+    correlations = correlations / deviations[:, :, None]
+    indefinite = np.linalg.eigvalsh(correlations)[..., 0] < _INDEFINITE
     found: dict[int, Failure] = {}
     for reason, wrong in (
         ("an entry of the covariance is not finite", ~np.isfinite(gaps)),
         ("the covariance is not symmetric", gaps > _SYMMETRIC * sizes),
         ("a variance is negative", negative),
+        ("the covariance is indefinite: a correlation is too large", indefinite),
     ):
         for run in set(np.flatnonzero(wrong.any(axis=1)).tolist()) - set(failures):
             found.setdefault(run, Failure(int(wrong[run].argmax()), reason))
@@ -445,12 +592,21 @@ def _aligned(
         if align != "fit":
             motion = Alignment(align[2], np.array(align[:2]))
         elif np.isfinite(poses[run]).all():
-            motion = align_positions(poses[run, :, :2], truth[run, :, :2])
+            motion = _fitted(poses[run, :, :2], truth[run, :, :2])
         poses[run, :, :2] = motion.apply(poses[run, :, :2])
         poses[run, :, 2] += motion.angle
         turn = pose_rotation(motion.angle)
         covariances[run] = turn @ covariances[run] @ turn.T
     return poses, covariances
+
+
+def _fitted(positions: Array, truth: Array) -> Alignment:
+    """Return the motion onto the truth, without a turn where the robot rests."""
+    motion = align_positions(positions, truth)
+    gaps = np.square(motion.apply(positions) - truth).sum()
+    if gaps * 4 < np.square(truth - truth.mean(axis=0)).sum():
+        return motion
+    return Alignment(0.0, truth.mean(axis=0) - positions.mean(axis=0))
 
 
 def _add_map(
@@ -474,7 +630,19 @@ def _add_map(
     return ""
 
 
-def _mistakes(parts: Sequence[_Part], task: _Task, frame: str) -> str:
+def _nearest(parts: Sequence[_Part]) -> str:
+    """Return the error whose mean NEES is nearer to 3; invariant if neither is near."""
+    found = {}
+    for frame in ("invariant", "additive"):
+        nees = np.concatenate([part.block[f"pose_nees_{frame}"] for part in parts])
+        ratios = nees[:, 1:][np.isfinite(nees[:, 1:])] / 3
+        mean = ratios.mean() if len(ratios) else 1.0
+        found[frame] = abs(np.log(max(float(mean), 1e-300)))
+    is_additive = found["additive"] < min(found["invariant"], np.log(_NEAR))
+    return "additive" if is_additive else "invariant"
+
+
+def _mistakes(parts: Sequence[_Part], task: _Task, frame: str, decides: str) -> str:
     """Name the convention that an estimator breaks, if any."""
     last = parts[0].arrays[0].shape[1] - 1
     steps = np.unique(np.linspace(1, last, 25).astype(int))
@@ -489,7 +657,9 @@ def _mistakes(parts: Sequence[_Part], task: _Task, frame: str) -> str:
     ratios = np.concatenate([p.block["pose_nees_invariant"] for p in parts]) / 3
     return (
         conventions.swapped_drives(truth, poses, additive, task.names)
-        or conventions.mistake_in(first[0], first[1], first[2], first[3], frame)
+        or conventions.mistake_in(
+            first[0], first[1], first[2], first[3], frame, decides=decides
+        )
         or conventions.stray_poses(ratios, task.names)
     )
 

@@ -38,8 +38,12 @@ class JudgeOptions(Options):
     truths: list[Path] | None = declared(
         None, "--truth FILE", "the truth in the drives"
     )
-    covariances: str = declared("additive", "additive|invariant|right|left")
-    frame: str = declared("invariant", "invariant|additive")
+    covariances: str | None = declared(
+        None, "additive|invariant|right|left", "additive"
+    )
+    frame: str | None = declared(
+        None, "invariant|additive", "that of --covariances, or the nearer to 1"
+    )
     align: str | None = declared(None, "fit|X,Y,THETA", "none")
     out: Path | None = declared(None, "DIR", "results/judge-<scenario>")
 
@@ -69,8 +73,8 @@ def judge(files: FilesOfEstimates, *, given: JudgeOptions) -> int:
     from ..monte_carlo.results import REPORT, RESULTS
     from .output_folder import default_folder, output_folder, write_summary
 
-    if given.frame not in ERROR_FRAMES:
-        raise BadInputError(unknown_choice("--frame", given.frame, ERROR_FRAMES))
+    if given.frame not in (None, *ERROR_FRAMES):
+        raise BadInputError(unknown_choice("--frame", str(given.frame), ERROR_FRAMES))
     error: Any = given.frame
     reporter = given.reporter()
     with reporter.warnings():

@@ -58,7 +58,7 @@ _FRAMES: tuple[ErrorFrame, ...] = ("invariant", "additive")
 
 
 def summarise_monte_carlo(
-    dataset: xr.Dataset, *, frame: ErrorFrame = "invariant"
+    dataset: xr.Dataset, *, frame: ErrorFrame | None = None
 ) -> dict[str, Any]:
     """Summarise the results of many runs.
 
@@ -70,8 +70,9 @@ def summarise_monte_carlo(
     ----------
     dataset : xarray.Dataset
         Results of ``monte_carlo``.
-    frame : {"invariant", "additive"}
-        Error coordinates of the decisions.
+    frame : {"invariant", "additive"}, optional
+        Error coordinates of the decisions. By default "additive" for files that
+        ``judge`` read as such, and "invariant" for all others.
 
     Returns
     -------
@@ -86,6 +87,7 @@ def summarise_monte_carlo(
         warnings of `run_warnings`.
     """
     attrs = dataset.attrs
+    frame = frame or attrs.get("frame", "invariant")
     assumed = attrs.get("assumed", attrs["scenario"])
     known = estimators_of(dataset)
     knowable = start_heading_std(dataset)
@@ -110,7 +112,10 @@ def summarise_monte_carlo(
         "frame": frame,
         "knowable_heading_std": knowable,
         "estimators": entries,
-        "notes": run_warnings(entries, dataset.sizes["run"]),
+        "notes": [
+            *json.loads(attrs.get("notes", "[]")),
+            *run_warnings(entries, dataset.sizes["run"]),
+        ],
     }
 
 

@@ -219,3 +219,11 @@ def test_a_true_path_must_have_a_time_and_a_pose_in_each_row(path):
 
 def test_an_ellipse_of_three_deviations_has_the_area_of_its_axes():
     assert ellipse_areas(np.diag([4.0, 9.0])[None])[0] == pytest.approx(54 * math.pi)
+
+
+def test_positions_at_rest_determine_no_rotation():
+    rng = np.random.default_rng(0)
+    noise = rng.normal(0, 0.02, (30, 2))
+    for place in [0.1, 0.2], [451234.5, 4412345.25]:
+        still = np.broadcast_to(place, (30, 2))
+        assert align_positions(still + noise, still).angle == 0

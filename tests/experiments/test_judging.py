@@ -210,6 +210,13 @@ def relative(poses):
     return np.stack([cos * x + sin * y, cos * y - sin * x, poses[..., 2] - 1], axis=-1)
 
 
+def transposed(poses, covariances):
+    """Transport of the additive error to the right-invariant one by Jᵀ P J."""
+    jacobian = np.broadcast_to(np.eye(3), covariances.shape).copy()
+    jacobian[..., 0, 2], jacobian[..., 1, 2] = poses[..., 1], -poses[..., 0]
+    return jacobian.mT @ covariances @ jacobian
+
+
 SWAPPED = (
     "estimates or truths of 2 drives are swapped: the estimate of drive "
     f"{SEED} fits the truth of drive {SEED + 1} and the estimate of drive "
@@ -257,6 +264,16 @@ WRONG = {
     ),
     "clockwise": (lambda x, P: (x * [1, 1, -1], P), "headings that grow clockwise: "),
     "millimetres": (lambda x, P: (x * [1e3, 1e3, 1], P), "positions in millimetres: "),
+    "centimetres": (lambda x, P: (x * [100, 100, 1], P), "positions in centimetres: "),
+    "feet": (lambda x, P: (x / [0.3048, 0.3048, 1], P), "positions in feet: "),
+    "another scale": (
+        lambda x, P: (x * [0.4, 0.4, 1], P),
+        "positions in a unit of 2.5 m: ",
+    ),
+    "transposed transport": (
+        lambda x, P: (x, transposed(x, P)),
+        "covariances of the additive error transported by Jᵀ P J instead of J P Jᵀ: ",
+    ),
     "swapped": (lambda x, P: (swapped(x), swapped(P)), SWAPPED),
     "rows": (lambda x, P: (x[:, ROWS], P[:, ROWS]), STRAY),
 }
@@ -561,6 +578,185 @@ def test_true_paths_from_elsewhere_give_the_same_nees(elsewhere, study):
     assert found["efficiency"] is None
 
 
+BAD_TRUTH = {
+    "w first": (
+        lambda rows: rows[:, [0, 1, 2, 3, 7, 4, 5, 6]],
+        "line 3: expected a rotation about z, qx and qy near 0, got qx qy qz qw = "
+        "1 0 0 0.00788: qw comes first; write it last",
+    ),
+    "camera axes": (
+        lambda rows: np.column_stack([rows[:, :4], np.full((30, 4), -0.5)]),
+        "line 1: expected a rotation about z, qx and qy near 0, got qx qy qz qw = "
+        "-0.5 -0.5 -0.5 -0.5, tilted by 90°; --space judges poses in space",
+    ),
+    "no rotation": (
+        lambda rows: rows * [1, 1, 1, 1, 0, 0, 0, 0],
+        "line 1: expected a rotation qx qy qz qw of length 1 in the fields 5 to 8, got "
+        "one of length 0",
+    ),
+    "equal times": (
+        lambda rows: rows * [0, *7 * [1]] + [1.6e9, *7 * [0]],
+        "line 1: expected time stamps that grow, got 1600000000 in all 30 rows; write "
+        "them with more digits",
+    ),
+    "whole seconds": (
+        lambda rows: np.column_stack([rows[:, 0].round(), rows[:, 1:]]),
+        "line 2: expected a time stamp after 0, got 0; write all digits",
+    ),
+    "rows not in order": (
+        lambda rows: rows[[*range(7), 9, 8, 7, *range(10, 30)]],
+        "line 9: expected a time stamp after 0.90000000000000002, got "
+        "0.80000000000000004; sort the rows by time",
+    ),
+    "another clock": (
+        lambda rows: rows + np.array([50, *7 * [0]]),
+        "and its truth must share at least two times, got 0 to 2.9 s, and 50 to 52.9 s",
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", BAD_TRUTH)
+def test_a_wrong_true_path_is_refused_with_its_line(wrong, elsewhere):
+    mine, truth = elsewhere
+    change, message = BAD_TRUTH[wrong]
+    path = truth / f"drive_{SEED}.tum"
+    np.savetxt(path, change(np.loadtxt(path)), fmt="%.17g")
+    with pytest.raises(ValueError, match=re.escape(message)) as refusal:
+        judge(mine / path.name, truth=path)
+    assert f"drive_{SEED}.tum" in str(refusal.value)
+
+
+def test_comments_above_a_true_path_are_ignored(elsewhere):
+    mine, truth = elsewhere
+    before = judge(mine, truth=truth)
+    for path in truth.iterdir():
+        path.write_text(f"# ground truth trajectory\n#\n{path.read_text()}")
+    after = judge(mine, truth=truth)
+    assert after.pose_nees_invariant.equals(before.pose_nees_invariant)
+
+
+def test_poses_in_a_gap_of_the_truth_are_left_out_and_counted(elsewhere):
+    mine, truth = elsewhere
+    before = judge(mine, truth=truth).pose_nees_invariant
+    for path in truth.iterdir():
+        lines = path.read_text().splitlines()
+        path.write_text("\n".join(lines[:9] + lines[21:]))
+    results = judge(mine, truth=truth)
+    there = [*range(9), *range(21, 30)]
+    np.testing.assert_allclose(results.pose_nees_invariant, before[:, :, there])
+    (note,) = (n for n in summarise_monte_carlo(results)["notes"] if "truth" in n)
+    assert note.startswith(f"{12 * RUNS} of {30 * RUNS} poses have no truth near their")
+
+
+@pytest.mark.parametrize("start", [0, 1_600_000_000])
+def test_nanoseconds_beside_seconds_are_converted_with_a_word(start, elsewhere):
+    mine, truth = elsewhere
+    for path in [*mine.iterdir(), *truth.iterdir()]:
+        rows = np.loadtxt(path)
+        rows[:, 0] += start
+        np.savetxt(path, rows, fmt="%.17g")
+    before = judge(mine, truth=truth)
+    for folder, what in ((truth, "of the truth are"), (mine, "")):
+        for path in folder.iterdir():
+            fields = [line.split() for line in path.read_text().splitlines()]
+            for row in fields:
+                row[0] = str(round(float(row[0]) * 1e9))
+            path.write_text("\n".join(map(" ".join, fields)))
+        results = judge(mine, truth=truth)
+        np.testing.assert_allclose(
+            results.pose_nees_invariant, before.pose_nees_invariant, rtol=1e-3
+        )
+        notes = summarise_monte_carlo(results)["notes"]
+        assert (f"the time stamps {what} nanoseconds" in "".join(notes)) == bool(what)
+
+
+def test_names_are_paired_by_what_differs(elsewhere):
+    mine, truth = elsewhere
+    before = judge(mine, truth=truth)
+    for folder, form in ((mine, "est_run{}"), (truth, "run{:02d}_gt")):
+        for k, path in enumerate(sorted(folder.iterdir())):
+            path.rename(folder / f"{form.format(k)}.tum")
+    results = judge(mine, truth=truth)
+    assert not results.failed.any()
+    assert results.position_error.sum() == pytest.approx(before.position_error.sum())
+
+
+def test_a_robot_at_rest_is_not_turned_by_a_fit(elsewhere):
+    mine, truth = elsewhere
+    rng = np.random.default_rng(3)
+    for path in truth.iterdir():
+        rows = np.loadtxt(path)
+        still = rows.copy()
+        still[:, 1:] = [0.1, 0.2, 0, 0, 0, np.sin(0.15), np.cos(0.15)]
+        still[:, 1:3] += rng.normal(0, 1e-4, (30, 2))
+        np.savetxt(path, still, fmt="%.17g")
+        theirs = np.loadtxt(mine / path.name)
+        theirs[:, 1:8] = still[:, 1:]
+        theirs[:, 1:3] += rng.normal(0, 0.1, (30, 2))
+        np.savetxt(mine / path.name, theirs, fmt="%.17g")
+    assert abs(judge(mine, truth=truth, align="fit").heading_error).max() < 1e-9
+
+
+def test_an_indefinite_covariance_is_a_failed_run(elsewhere):
+    mine, truth = elsewhere
+    path = mine / f"drive_{SEED}.tum"
+    rows = np.loadtxt(path)
+    rows[7, 8:] = np.array([[1, 0.9, 0.9], [0.9, 1, -0.9], [0.9, -0.9, 1]]).ravel()
+    np.savetxt(path, rows, fmt="%.17g")
+    (failed,) = entry_of(judge(mine, truth=truth))["failed_runs"]
+    assert "the covariance is indefinite" in failed["message"]
+    assert failed["step"] == 7
+
+
+def additive_studies(rng, runs, steps=30):
+    """Return truth, estimates and covariances: errors are exactly additive."""
+    turns = rng.normal(0, 0.1, (runs, steps))
+    heading = np.cumsum(turns, axis=1)
+    place = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], -1), axis=1)
+    truth = np.concatenate([place, heading[..., None]], axis=-1)
+    std = np.array([0.05, 0.05, 0.04])
+    errors = np.cumsum(std * rng.normal(size=truth.shape), axis=1)
+    k = np.arange(1, steps + 1)[:, None, None]
+    claims = np.broadcast_to(k * np.diag(std**2), (runs, steps, 3, 3))
+    return truth, truth - errors, claims
+
+
+@pytest.fixture
+def additive(tmp_path):
+    """Return a function that writes additive studies: estimates, and truth as TUM."""
+
+    def write(rng, late=0.0):
+        for k, (path, poses, P) in enumerate(
+            zip(*additive_studies(rng, 60), strict=True)
+        ):
+            half, zero = path[:, 2] / 2, np.zeros(30)
+            columns = [np.arange(30) - late, *path[:, :2].T, zero, zero, zero]
+            columns += [np.sin(half), np.cos(half)]
+            for name in "te":
+                (tmp_path / name).mkdir(exist_ok=True)
+            np.savetxt(tmp_path / "t" / f"seed_{k}.tum", np.column_stack(columns))
+            (tmp_path / "e" / f"seed_{k}.csv").write_text(rows(poses, P))
+        return tmp_path / "e", tmp_path / "t"
+
+    return write
+
+
+def test_additive_errors_are_decided_in_the_additive_frame(additive):
+    """Where the heading is uncertain, an arc is no ellipse of the invariant error."""
+    estimates, truth = additive(np.random.default_rng(8))
+    for covariances in "additive", None:
+        results = judge(estimates, truth=truth, covariances=covariances)
+        summary = summarise_monte_carlo(results)
+        assert summary["frame"] == "additive"
+        assert summary["estimators"]["e"]["verdict"] != "not consistent"
+
+
+def test_a_clock_that_is_half_a_step_off_is_named(additive):
+    estimates, truth = additive(np.random.default_rng(9), late=0.5)
+    said = entry_of(judge(estimates, truth=truth))["diagnosis"]["sentence"]
+    assert said.startswith("convention: time stamps that are 0.5 steps too late: ")
+
+
 def test_one_estimate_and_one_truth_need_no_common_name(elsewhere, tmp_path):
     mine, truth = elsewhere
     path = tmp_path / "path.tum"
@@ -628,7 +824,8 @@ def test_an_alignment_transforms_the_covariance_with_the_error(
         results = judge(folder, drives, covariances=frame, align=(x, y, turn))
         for name in ("pose_nees_invariant", "pose_nees_additive"):
             np.testing.assert_allclose(results[name], study[name], rtol=1e-6)
-        assert entry_of(results)["verdict"] == entry_of(study)["verdict"]
+        found = entry_of(results, frame="invariant")
+        assert found["verdict"] == entry_of(study)["verdict"]
 
 
 def test_a_fitted_alignment_leaves_no_verdict(drives):
