@@ -9,16 +9,18 @@ import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from ..arrays import AnyArray, Array, IntArray
+from ..arrays import AnyArray, Array, BoolArray, IntArray
 from .logs.importers.any_format import read_true_path
 from .logs.log_lines import LogLine, read_lines
 from .logs.slamlog import LogError
 from .trajectories.manifest import MANIFEST, load_trajectories
 from .trajectories.trajectory import BELIEFS, Trajectory, array_of
+
+T = TypeVar("T")
 
 
 class Estimate(NamedTuple):
@@ -48,7 +50,6 @@ class Estimate(NamedTuple):
         return self._replace(poses=poses, covariances=covariances, times=times)
 
 
-def true_path(path: Path) -> Array:
 def true_path(path: Path) -> Array:
     """Read rows (t, x, y, θ); without times, t counts the poses.
 
@@ -110,6 +111,7 @@ _TUM = "t x y z qx qy qz qw and 6, 9, 21 or 36 entries of a covariance"
 _ENDINGS = (".csv", ".tum", ".txt", ".npz")
 _UNIT = 0.1  # by which the length of a quaternion may differ from 1
 _TILT = np.pi / 6  # of a robot that has a heading
+_GAP = 3.0  # of the truth, in rows of it that are usual
 _CLIMB = 0.05  # of a path, and tilt, that are not of a plane
 _POSE_SIZES, _TUM_SIZES = (6, 9), (6, 9, 21, 36)
 
@@ -201,6 +203,40 @@ def name_of(path: Path) -> Any:
     """Return the seed in the name of a file, or the name."""
     found = re.search(r"seed_?(\d{1,18})", path.stem)
     return int(found[1]) if found else path.stem
+
+
+def near_truth(times: Array, due: Array) -> BoolArray:
+    """Whether times (n,) lie within those of a true path, and in none of its gaps."""
+    after = np.clip(np.searchsorted(due, times), 1, len(due) - 1)
+    spacing = np.median(np.diff(due))
+    nearest = np.minimum(abs(times - due[after - 1]), abs(due[after] - times))
+    is_gap = (due[after] - due[after - 1] > _GAP * spacing) & (nearest > 0.05 * spacing)
+    return np.asarray((times >= due[0]) & (times <= due[-1]) & ~is_gap)
+
+
+def paired(estimates: dict[Any, T], names: Sequence[Any]) -> dict[Any, T]:
+    """Name estimates after their truths: alike, or by what differs between the names.
+
+    ``run1_est`` and ``run2_est`` belong to ``run1_gt`` and ``run2_gt``.
+    """
+    if set(estimates) & set(names):
+        return estimates
+    if len(names) == len(estimates) == 1:
+        return dict(zip(names, estimates.values(), strict=True))
+    true, theirs = _keys(names), _keys(list(estimates))
+    by_key = dict(zip(theirs, estimates.values(), strict=True))
+    if len(set(true)) < len(true) or len(by_key) < len(estimates):
+        return estimates
+    pairs = zip(names, true, strict=True)
+    return {name: by_key[key] for name, key in pairs if key in by_key} or estimates
+
+
+def _keys(names: Sequence[Any]) -> list[tuple[str, ...]]:
+    """Return the words and numbers of each name that not all of the names have."""
+    parts = [re.findall(r"\d+|[^\W\d_]+", str(name).lower()) for name in names]
+    plain = [[part.lstrip("0") or "0" for part in each] for each in parts]
+    common = set.intersection(*map(set, plain))
+    return [tuple(part for part in each if part not in common) for each in plain]
 
 
 def beliefs_of(drive: Trajectory, file: str) -> Estimate:

@@ -8,7 +8,6 @@ and the report are those of a Monte Carlo. `read_estimates` reads the files.
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby, islice
 from os import PathLike
@@ -33,6 +32,8 @@ from .estimate_files import (
     files_in,
     growing_rows,
     name_of,
+    near_truth,
+    paired,
     paths_by_label,
     read_estimates,
     true_path,
@@ -69,7 +70,6 @@ _ON_TIME = 0.01  # of a step
 _SYMMETRIC = 1e-6  # relative difference of two entries
 _INDEFINITE = -1e-9  # eigenvalue of correlations
 _NEAR = 1.5  # a mean NEES / 3 that an honest study may have
-_GAP = 3.0  # of the truth, in rows of it that are usual
 _TIME_UNITS = {"nanoseconds": 1e9, "microseconds": 1e6, "milliseconds": 1e3}
 _ROUNDED = 1e-6  # of a time stamp in nanoseconds since 1970 [s]
 _ASIDE, _ASIDE_GAIN = 0.01, 4.0  # of intervals of time, and of errors
@@ -315,7 +315,7 @@ def _paths(truth: Place | Sequence[Place], sources: dict[str, list[Path]]) -> _T
     if not true:
         raise ValueError(f"truth must be at least one file, got none in {places[0]}")
     found = {
-        label: _paired(read_estimates(paths), list(true))
+        label: paired(read_estimates(paths), list(true))
         for label, paths in sources.items()
     }
     names = sorted(true, key=lambda name: (isinstance(name, str), name))
@@ -361,31 +361,6 @@ def _paths(truth: Place | Sequence[Place], sources: dict[str, list[Path]]) -> _T
     return _Task(Path(places[0]).stem, "", 0, names, chunks(), notes)
 
 
-def _paired(estimates: dict[Any, Estimate], names: Sequence[Any]) -> dict[Any, Any]:
-    """Name estimates after their truths: alike, or by what differs between the names.
-
-    ``run1_est`` and ``run2_est`` belong to ``run1_gt`` and ``run2_gt``.
-    """
-    if set(estimates) & set(names):
-        return estimates
-    if len(names) == len(estimates) == 1:
-        return dict(zip(names, estimates.values(), strict=True))
-    true, theirs = _keys(names), _keys(list(estimates))
-    by_key = dict(zip(theirs, estimates.values(), strict=True))
-    if len(set(true)) < len(true) or len(by_key) < len(estimates):
-        return estimates
-    pairs = zip(names, true, strict=True)
-    return {name: by_key[key] for name, key in pairs if key in by_key} or estimates
-
-
-def _keys(names: Sequence[Any]) -> list[tuple[str, ...]]:
-    """Return the words and numbers of each name that not all of the names have."""
-    parts = [re.findall(r"\d+|[^\W\d_]+", str(name).lower()) for name in names]
-    plain = [[part.lstrip("0") or "0" for part in each] for each in parts]
-    common = set.intersection(*map(set, plain))
-    return [tuple(part for part in each if part not in common) for each in plain]
-
-
 class _Inside(NamedTuple):
     """The estimates of a file that have a truth, and the truth there."""
 
@@ -416,17 +391,13 @@ def _within(estimate: Estimate, path: Array) -> _Inside:
     assert times is not None
     times, unit = _in_seconds(times, estimate.poses, path)
     exact = poses_at(times, path)
-    after = np.clip(np.searchsorted(due, times), 1, len(due) - 1)
-    spacing = np.median(np.diff(due))
-    nearest = np.minimum(abs(times - due[after - 1]), abs(due[after] - times))
-    is_gap = (due[after] - due[after - 1] > _GAP * spacing) & (nearest > 0.05 * spacing)
-    inside = np.flatnonzero(np.isfinite(exact).all(axis=1) & ~is_gap)
+    known = np.isfinite(exact).all(axis=1) & near_truth(times, due)
+    inside = np.flatnonzero(known)
     if len(inside) < 2:
         raise ValueError(
             f"{estimate.file} and its truth must share at least two times, got "
             f"{times[0]:.10g} to {times[-1]:.10g} s, and {due[0]:.10g} to "
-            f"{due[-1]:.10g} s with a row every {spacing:.3g} s; write both with the "
-            "same clock"
+            f"{due[-1]:.10g} s; write both in seconds of one clock"
         )
     left_out = len(times) - len(inside)
     return _Inside(estimate.at(inside), exact[inside], left_out, unit)

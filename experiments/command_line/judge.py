@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rich.text import Text
+
 from ...sim_configs.field_types import unknown_choice
 from .monte_carlo import show_study
 from .options import FilesOfEstimates, Options, declared, takes
@@ -27,6 +29,9 @@ class JudgeOptions(Options):
         The error whose covariances the files hold.
     frame
         The error whose NEES decides.
+    space
+        Judge poses in space, with covariances of this error in six coordinates, the
+        translation first, or the rotation first, as in left,rotation-first.
     align
         Move all estimates by this motion. fit moves each path as close to its truth as
         possible, so there is no verdict.
@@ -44,12 +49,15 @@ class JudgeOptions(Options):
     frame: str | None = declared(
         None, "invariant|additive", "that of --covariances, or the nearer to 1"
     )
+    space: str | None = declared(
+        None, "left|right|decoupled[,rotation-first]", "poses in the plane"
+    )
     align: str | None = declared(None, "fit|X,Y,THETA", "none")
     out: Path | None = declared(None, "DIR", "results/judge-<scenario>")
 
 
 @command
-@takes("drives truths covariances frame align out as_json")
+@takes("drives truths covariances frame space align out as_json")
 def judge(files: FilesOfEstimates, *, given: JudgeOptions) -> int:
     """Judge estimates of any program.
 
@@ -77,6 +85,8 @@ def judge(files: FilesOfEstimates, *, given: JudgeOptions) -> int:
         raise BadInputError(unknown_choice("--frame", str(given.frame), ERROR_FRAMES))
     error: Any = given.frame
     reporter = given.reporter()
+    if given.space is not None:
+        return _judge_in_space(files, given, given.space)
     with reporter.warnings():
         results = judging.judge(
             files,
@@ -93,6 +103,35 @@ def judge(files: FilesOfEstimates, *, given: JudgeOptions) -> int:
         write_html_report(results, summary, folder / REPORT)
         summary = write_summary(folder, summary)
     return show_study(reporter, summary, place)
+
+
+def _judge_in_space(files: FilesOfEstimates, given: JudgeOptions, space: str) -> int:
+    """Print the verdict on poses in space."""
+    from ..space_poses import ERRORS, ORDERS, judge_in_space
+
+    kind, _, order = space.partition(",")
+    if kind not in ERRORS or (order and order not in ORDERS):
+        raise BadInputError(unknown_choice("--space", space, ERRORS))
+    others = (given.drives, given.covariances, given.frame, given.align, given.out)
+    if given.truths is None or any(each is not None for each in others):
+        raise BadInputError("--space needs --truth, and takes no other option but it")
+    found = judge_in_space(
+        files, given.truths, covariances=kind, order=order or ORDERS[0]
+    )
+    reporter, nees = given.reporter(), found["nees"]
+    lines = [
+        found["sentence"],
+        f"{found['runs']} drives of {found['steps']} poses: NEES per degree of freedom "
+        f"{nees['pose']:.3g}, position {nees['position']:.3g}, rotation "
+        f"{nees['rotation']:.3g}.",
+    ]
+    if found["cause"]:
+        lines.append(f"cause: {found['cause']}")
+    if found["left_out"]:
+        lines.append(f"{found['left_out']} poses without truth are left out.")
+    reporter.show(*map(Text, lines))
+    reporter.finish(found)
+    return 0
 
 
 def _motion(text: str | None) -> str | list[float] | None:

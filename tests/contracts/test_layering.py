@@ -57,7 +57,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         noise_study noise_fitting
         trajectories
         conventions estimate_files
-        judging
+        judging space_poses
         command_line
     """,
     "experiments.monte_carlo": """

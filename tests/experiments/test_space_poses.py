@@ -1,0 +1,213 @@
+"""Poses in space: SE(3), the verdict on six coordinates, and its conventions."""
+
+import json
+
+import numpy as np
+import pytest
+from commands import slamgym
+from scipy.linalg import expm, logm
+from scipy.spatial.transform import Rotation
+
+from slamgym.evaluation.nees import normalised_squared_error
+from slamgym.experiments.space_poses import (
+    Pose,
+    adjoint,
+    between,
+    composed,
+    exponential,
+    hat,
+    judge_in_space,
+    logarithm,
+)
+
+RUNS, STEPS = 40, 25
+SWAP = np.eye(6)[[3, 4, 5, 0, 1, 2]]
+
+
+def twist_matrix(twist):
+    matrix = np.zeros((4, 4))
+    matrix[:3, :3], matrix[:3, 3] = hat(twist[3:]), twist[:3]
+    return matrix
+
+
+def whole(pose):
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = pose.rotations, pose.positions
+    return matrix
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 1e-3, 0.5, 3.0, np.pi - 1e-6])
+def test_exponential_and_logarithm_are_those_of_matrices(angle):
+    rng = np.random.default_rng(1)
+    axis = rng.normal(size=3)
+    twist = np.append(rng.normal(size=3), angle * axis / np.linalg.norm(axis))
+    pose = exponential(twist)
+    np.testing.assert_allclose(whole(pose), expm(twist_matrix(twist)), atol=1e-12)
+    np.testing.assert_allclose(logarithm(pose), twist, rtol=1e-7, atol=1e-9)
+    if angle < 3.1:
+        matrix = logm(whole(pose)).real
+        np.testing.assert_allclose(twist_matrix(logarithm(pose)), matrix, atol=1e-7)
+
+
+def test_the_adjoint_moves_a_twist_to_the_other_side():
+    rng = np.random.default_rng(2)
+    pose, twist = exponential(rng.normal(size=6)), 0.3 * rng.normal(size=6)
+    right = exponential((adjoint(pose) @ twist[:, None])[:, 0])
+    one, other = composed(pose, exponential(twist)), composed(right, pose)
+    np.testing.assert_allclose(whole(one), whole(other), atol=1e-12)
+
+
+def drives(seed, runs=RUNS, tilt=0.0):
+    """Dead reckoning with an honest covariance of the left error."""
+    rng = np.random.default_rng(seed)
+    std = np.array([0.02, 0.02, 0.02, 0.01, 0.01, 0.01])
+    step = exponential(np.array([0.5, 0, 0.05, 0.02, -0.05, 0.12]))
+    back = adjoint(between(step, Pose(np.zeros(3), np.eye(3))))
+    for _ in range(runs):
+        true = estimate = exponential(np.array([1, 2, 0, tilt, 0, 0.0]))
+        P, rows = 1e-4 * np.eye(6), []
+        true = composed(true, exponential(1e-2 * rng.normal(size=6)))
+        for _ in range(STEPS):
+            rows.append((true, estimate, P))
+            noise = exponential(std * rng.normal(size=6))
+            true = composed(composed(true, step), noise)
+            estimate = composed(estimate, step)
+            P = back @ P @ back.T + np.diag(std**2)
+        yield rows
+
+
+def body_to_world(pose):
+    matrix = np.eye(6)
+    matrix[:3, :3] = pose.rotations
+    return matrix
+
+
+WRITTEN = {
+    "left": lambda X, P: P,
+    "right": lambda X, P: adjoint(X) @ P @ adjoint(X).T,
+    "decoupled": lambda X, P: body_to_world(X) @ P @ body_to_world(X).T,
+    "left, rotation first": lambda X, P: SWAP @ P @ SWAP.T,
+    "left, transported to the right error by Jᵀ P J instead of J P Jᵀ": (
+        lambda X, P: adjoint(X).T @ P @ adjoint(X)
+    ),
+}
+
+
+def write(folder, seed, change, runs=RUNS, tilt=0.0, start=0.0):
+    for k, rows in enumerate(drives(seed, runs, tilt)):
+        for name in "et":
+            (folder / name).mkdir(exist_ok=True)
+            lines = []
+            for step, (true, estimate, P) in enumerate(rows):
+                pose = true if name == "t" else estimate
+                quaternion = Rotation.from_matrix(pose.rotations).as_quat()
+                line = [start + step, *pose.positions, *quaternion]
+                lines.append(line + list(change(estimate, P).flat) * (name == "e"))
+            np.savetxt(folder / name / f"seed_{k}.tum", lines, fmt="%.17g")
+    return folder / "e", folder / "t"
+
+
+def said_of(written):
+    kind, comma, rest = written.partition(", ")
+    return f"convention: covariances of the {kind} error{comma}{rest}: read so, NEES"
+
+
+@pytest.mark.parametrize("written", list(WRITTEN)[1:])
+@pytest.mark.parametrize("tilt", [0.0, 3.1])
+def test_a_convention_of_poses_in_space_is_named(written, tilt, tmp_path):
+    estimates, truth = write(tmp_path, 5, WRITTEN[written], tilt=tilt)
+    found = judge_in_space(estimates, truth)
+    assert found["verdict"] == "not consistent"
+    assert found["cause"].startswith(said_of(written))
+
+
+@pytest.mark.parametrize("kind", ["left", "right", "decoupled"])
+@pytest.mark.parametrize("order", ["translation-first", "rotation-first"])
+def test_honest_poses_in_space_are_not_rejected(kind, order, tmp_path):
+    swap = SWAP if order == "rotation-first" else np.eye(6)
+    estimates, truth = write(
+        tmp_path, 6, lambda X, P: swap @ WRITTEN[kind](X, P) @ swap.T
+    )
+    found = judge_in_space(estimates, truth, covariances=kind, order=order)
+    assert found["verdict"] != "not consistent"
+    assert not found["cause"]
+    assert all(0.8 < ratio < 1.25 for ratio in found["nees"].values())
+
+
+def test_left_and_right_error_in_space_have_the_same_nees(tmp_path):
+    found = []
+    for kind in "left", "right":
+        (tmp_path / kind).mkdir()
+        places = write(tmp_path / kind, 7, WRITTEN[kind], runs=4)
+        found.append(judge_in_space(*places, covariances=kind)["nees"]["pose"])
+    assert found[0] == pytest.approx(found[1], rel=1e-9)
+
+
+def test_the_truth_in_space_is_interpolated_along_its_twist(tmp_path):
+    """A helix of a constant twist, known at half steps, is exact between them."""
+    twist = np.array([0.5, 0, 0.2, 0.1, 0, 0.6])
+    for name, times in (("t", np.arange(9) + 0.5), ("e", np.arange(9.0))):
+        (tmp_path / name).mkdir()
+        poses = exponential(times[:, None] * twist)
+        quaternions = Rotation.from_matrix(poses.rotations).as_quat()
+        columns = [times[:, None], poses.positions, quaternions]
+        if name == "e":
+            columns.append(np.tile(np.eye(6).ravel(), (9, 1)))
+        for k in range(2):
+            np.savetxt(tmp_path / name / f"seed_{k}.tum", np.hstack(columns))
+    found = judge_in_space(tmp_path / "e", tmp_path / "t")
+    assert (found["left_out"], found["steps"]) == (2, 8)
+    assert found["nees"]["pose"] < 1e-25
+
+
+def test_an_npz_of_poses_in_space_is_judged_like_tum(tmp_path):
+    estimates, truth = write(tmp_path, 9, WRITTEN["left"], runs=3)
+    tables = [np.loadtxt(path) for path in sorted(estimates.iterdir())]
+    poses = [table[:, 1:8] for table in tables]
+    claims = [table[:, 8:].reshape(-1, 6, 6) for table in tables]
+    arrays = {"belief_poses": poses, "belief_pose_covariances": claims}
+    np.savez(tmp_path / "all.npz", seed=[0, 1, 2], **arrays)
+    found = judge_in_space(tmp_path / "all.npz", truth)
+    same = judge_in_space(estimates, truth)["nees"]
+    assert found["nees"] == pytest.approx(same, rel=1e-12)
+    np.savez(tmp_path / "all.npz", seed=[0, 1, 2], belief_poses=poses)
+    with pytest.raises(ValueError, match=r"all\.npz must hold belief_poses and"):
+        judge_in_space(tmp_path / "all.npz", truth)
+
+
+def test_what_is_no_pose_in_space_is_refused(tmp_path):
+    estimates, truth = write(tmp_path, 10, WRITTEN["left"], runs=2)
+    path = estimates / "seed_1.tum"
+    rows = np.loadtxt(path)
+    for wrong, message in (
+        (rows[:, :17], "line 1: expected 36 or 21 entries of a covariance"),
+        (rows * [*4 * [1], *4 * [0], *36 * [1]], "line 1: expected a rotation qx qy"),
+        (rows[::-1], "line 2: expected a time stamp after 24, got 23; sort the rows"),
+        (rows + np.eye(44)[9], "the covariance of pose 0 must be finite and symmetric"),
+        (rows + 99 * np.eye(44)[0], "must share at least two times"),
+    ):
+        np.savetxt(path, wrong, fmt="%.17g")
+        with pytest.raises(ValueError, match=message):
+            judge_in_space(estimates, truth)
+
+
+def test_the_command_judges_poses_in_space(tmp_path):
+    estimates, truth = write(tmp_path, 11, WRITTEN["right"])
+    done = slamgym("judge", estimates, "--truth", truth, "--space", "left", "--json")
+    found = json.loads(done.stdout)
+    assert found["cause"].startswith(said_of("right"))
+    done = slamgym("judge", estimates, "--truth", truth, "--space", "left")
+    printed = " ".join(done.stdout.split())
+    assert "e: not consistent: the squared errors of the pose" in printed
+    assert f"cause: {said_of('right')}" in printed
+    done = slamgym("judge", estimates, "--truth", truth, "--space", "up")
+    assert "--space must be one of left, right, decoupled, got 'up'" in done.stderr
+
+
+def test_left_errors_are_normalised_by_their_own_covariance():
+    rng = np.random.default_rng(12)
+    pose = exponential(np.array([1.0, 2, 3, 3.1, 0, 0]))
+    twists = 0.1 * rng.normal(size=(200, 6))
+    left = logarithm(between(pose, composed(pose, exponential(twists))))
+    nees = normalised_squared_error(left, np.broadcast_to(np.eye(6) / 100, (200, 6, 6)))
+    assert nees.mean() == pytest.approx((100 * twists**2).sum(axis=1).mean())
