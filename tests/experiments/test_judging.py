@@ -732,7 +732,7 @@ def additive(tmp_path):
             half, zero = path[:, 2] / 2, np.zeros(30)
             columns = [np.arange(30) - late, *path[:, :2].T, zero, zero, zero]
             columns += [np.sin(half), np.cos(half)]
-            for name in "te":
+            for name in ("t", "e"):
                 (tmp_path / name).mkdir(exist_ok=True)
             np.savetxt(tmp_path / "t" / f"seed_{k}.tum", np.column_stack(columns))
             (tmp_path / "e" / f"seed_{k}.csv").write_text(rows(poses, P))
