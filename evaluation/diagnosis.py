@@ -310,7 +310,9 @@ def _of_the_noise(
     others = dict.fromkeys(f.cause for f in guilty if f.cause != first.cause)
     also = f"; also {', '.join(others)}" if others else ""
     found = f"{first.cause}: {first.text} ({p_text(first.p_value)})"
-    sentence = f"{found}{also}; {errors.text}."
+    unseen = errors.p_value >= FILTER_RATE
+    shown = f"the errors do not show it: {errors.text}" if unseen else errors.text
+    sentence = f"{found}{also}; {shown}."
     return Diagnosis(first.cause, first.p_value, sentence, tuple(others))
 
 

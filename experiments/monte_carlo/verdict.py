@@ -425,7 +425,8 @@ def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
     """
     found, lines = entry.get("diagnosis"), []
     if found is not None and found["cause"] != HONEST:
-        lines.append(f"cause: {found['sentence']}")
+        word = "note" if entry.get("verdict") == CONSISTENT else "cause"
+        lines.append(f"{word}: {found['sentence']}")
     lines += [f"check_estimator finds: {text}" for text in entry.get("check", ())]
     if seeds := entry.get("seeds_sentence"):
         lines.append(seeds)

@@ -174,6 +174,7 @@ def test_each_fault_of_the_noise_is_named(channel, change, cause):
     assert found.cause == cause
     assert found.p_value < 0.025
     assert found.sentence.startswith(f"{cause}: ")
+    assert "; the errors do not show it: the squared" in found.sentence
     assert found.cause in CAUSES
 
 

@@ -91,17 +91,19 @@ def refutations(entry):
     cause, text = entry["diagnosis"]["cause"], entry["diagnosis"]["sentence"]
     if cause in ("honest", "cannot tell"):
         return []
-    found = ["the verdict is consistent"] * (entry["verdict"] == "consistent")
+    is_unseen = "the errors do not show it" in text
+    is_good = entry["verdict"] == "consistent"
+    found = ["the verdict is consistent"] * (is_good and not is_unseen)
     before = float(re.search(rf"are {NUMBER} times what the cov", text)[1])
     chance = [float(p) for p in re.findall(rf"\(p [=<] {NUMBER}\)", text)]
     found += ["it may be chance"] * (min(chance) > 0.05)
     sizes = [float(size) for size in re.findall(rf"σ\w is {NUMBER} times", text)]
     if cause.endswith("too small"):
         found += ["the noise is smaller"] * (sizes[0] <= 1)
-        found += ["the errors are smaller"] * (before < 0.9)
+        found += ["the errors are smaller"] * (before < 0.9 and not is_unseen)
     if cause.endswith("too large"):
         found += ["the noise is larger"] * (sizes[0] >= 1)
-        found += ["the errors are larger"] * (before > 1.1)
+        found += ["the errors are larger"] * (before > 1.1 and not is_unseen)
     if (less := re.search(rf"of the noise, .*? are {NUMBER} times", text)) is None:
         return found
     after, tenth = float(less[1]), re.search(rf"for {NUMBER} times with a tenth", text)

@@ -529,6 +529,10 @@ def test_warnings_name_unused_readings_and_innovations_of_another_size():
     assert first.startswith("ekf: 12% of the readings corrected nothing")
     assert "NIS is 3 per degree of freedom" in second
     assert "assumes too little noise" in second
+    noted = {"diagnosis": {"cause": "heavy tails", "sentence": "heavy tails: …"}}
+    assert diagnosis_lines("a", noted) == ("a: cause: heavy tails: …",)
+    noted["verdict"] = "consistent"
+    assert diagnosis_lines("a", noted) == ("a: note: heavy tails: …",)
     *_, third = run_warnings({"ekf": entry | {"verdict": "consistent"}}, 40)
     assert "its errors agree with its covariances" in third
     assert "noise" not in third
