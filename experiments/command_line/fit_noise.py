@@ -1,10 +1,16 @@
 """``slamgym fit-noise``: the noise of a log, by maximum likelihood."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from rich.text import Text
 
 from .. import figures, noise_fitting
 from .options import LogFile, Options, declared, takes
-from .program import command
+from .program import Reporter, command
+
+if TYPE_CHECKING:
+    from ..log_conventions import Mistake
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +40,8 @@ def fit_noise(log: LogFile, *, given: FitNoiseOptions) -> None:
     are not white, it suggests a factor for the noise of the sensor. Prints the options
     to paste, and compares the filter with the noise before and after. The search begins
     at the given noise, or at that of the log, which is also used to associate readings
-    without identity.
+    without identity. If the log breaks a convention, such as degrees or clockwise
+    bearings, the command names it and suggests no noise.
 
     Examples
     --------
@@ -42,10 +49,11 @@ def fit_noise(log: LogFile, *, given: FitNoiseOptions) -> None:
     slamgym fit-noise log.csv --write
     slamgym fit-noise MRCLAM_Dataset6 --robot 3 --estimator ekf
     """
+    from ..log_conventions import explaining, mistake_in
     from ..noise_fitting.fit import refuse_other_formats, write_noise
     from ..runs.filter_settings import noise_or_assumed, settings_for
     from .output_folder import default_folder, output_folder, write_summary
-    from .tables import advice, heading, noise_comparison_table, noise_table, written
+    from .tables import written
 
     reporter = given.reporter()
     drive = given.read(log, reporter)
@@ -62,20 +70,40 @@ def fit_noise(log: LogFile, *, given: FitNoiseOptions) -> None:
         with (
             reporter.progress("fitting") as tick,
             reporter.note_if_compiling("the likelihood"),
+            explaining(drive, settings),
         ):
+            mistake = mistake_in(drive, settings)
             fit = noise_fitting.fit_noise(drive, settings, progress=tick)
         with reporter.progress("replaying") as tick:
             summary = noise_fitting.summarise_fit(fit, progress=tick)
         innovations = noise_fitting.noise_fit_figure(fit)
         figures.save_figure(innovations, folder / "innovations.png")
+        if mistake is not None:
+            summary |= {"mistake": mistake.as_dict(), "options": None}
         summary = write_summary(folder, summary)
-    if given.write:
+    is_written = given.write and mistake is None
+    if is_written:
         write_noise(log, fit.suggested.settings)
-    title = heading("Noise of ", summary["log"], ", by ", summary["estimator"])
-    compared = noise_comparison_table(summary)
-    reporter.show(title, noise_table(summary), "", compared, "", advice(summary), "")
-    reporter.show_verbatim(summary["options"])
+    _show_fit(summary, mistake, reporter)
     reporter.show("", written(str(place), summary["files"]))
-    if given.write:
+    if is_written:
         reporter.show(f"Wrote the suggested noise into the header of {log}")
-    reporter.finish({**summary, "out": str(place), "written": given.write})
+    reporter.finish({**summary, "out": str(place), "written": is_written})
+
+
+def _show_fit(
+    summary: dict[str, Any], mistake: "Mistake | None", reporter: Reporter
+) -> None:
+    """Print a fit; of a log with a mistake, that first, and no noise to use."""
+    from .tables import advice, heading, noise_comparison_table, noise_table
+
+    title = heading("Noise of ", summary["log"], ", by ", summary["estimator"])
+    if mistake is not None:
+        no_noise = "No noise is suggested, because it would hide the mistake."
+        reporter.show(title, Text(f"Warning: {mistake} {no_noise}", "yellow"), "")
+        title = Text("What the fit makes of the log as it is:", "dim")
+    compared = noise_comparison_table(summary)
+    reporter.show(title, noise_table(summary), "", compared, "")
+    if mistake is None:
+        reporter.show(advice(summary), "")
+        reporter.show_verbatim(summary["options"])

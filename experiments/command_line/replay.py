@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.text import Text
 
 from .. import figures, runs
 from . import options, program
@@ -113,6 +114,7 @@ def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
     slamgym smooth log.csv --associate
     """
     from ...estimator.registry import read_label
+    from ..log_conventions import explaining, mistake_in
     from ..runs.filter_settings import SMOOTHER, noise_or_assumed, settings_for
     from .output_folder import default_folder, output_folder, write_summary
     from .tables import heading, smoothing_figures, smoothing_table, written
@@ -131,6 +133,7 @@ def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
         with (
             reporter.progress("filtering") as tick,
             reporter.note_if_compiling("the smoother"),
+            explaining(drive, settings),
         ):
             smoothed = runs.smooth_log(
                 drive,
@@ -140,11 +143,17 @@ def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
                 repairing=tick,
             )
         figures.save_figure(figures.smoothed_figure(smoothed), folder / "map.png")
-        summary = write_summary(folder, runs.summarise_smoothing(smoothed, settings))
+        mistake = mistake_in(drive, settings)
+        summary = {
+            **runs.summarise_smoothing(smoothed, settings),
+            "mistake": None if mistake is None else mistake.as_dict(),
+        }
+        summary = write_summary(folder, summary)
     options.note_noise(drive, settings, {*stds, *chosen}, reporter)
     title = heading("", summary["log"], " smoothed, following ", given.estimator)
     files = written(str(place), summary["files"])
     is_compared = any(summary[key]["filter"] for key in ("ate", "landmark_rmse"))
     compared = (smoothing_table(summary), "") if is_compared else ()
-    reporter.show(title, *compared, smoothing_figures(summary), "", files)
+    warned = () if mistake is None else (Text(f"Warning: {mistake}", "yellow"), "")
+    reporter.show(title, *compared, smoothing_figures(summary), "", *warned, files)
     reporter.finish({**summary, "out": str(place)})

@@ -12,6 +12,7 @@ from rich.text import Text
 
 from .. import figures
 from ..figures.style import sign
+from ..log_conventions import explaining, mistake_in
 from ..logs.recording import steps_of
 from ..logs.slamlog import SlamLog, write_slamlog
 from ..runs.filter_settings import FilterSettings
@@ -92,7 +93,7 @@ def filter_and_write(
     for label, settings in filters.items():
         frames = RunFrames(log)
         warm_up(settings, reporter)
-        with reporter.progress("filtering") as tick:
+        with reporter.progress("filtering") as tick, explaining(log, settings):
             run = replay(
                 log,
                 settings.make(log.start),
@@ -126,7 +127,12 @@ def filter_and_write(
         summarise(run, settings, resolution=given.resolution)
         for run, settings in zip(runs, filters.values(), strict=True)
     ]
-    return write_summary(folder, {**summaries[0], "others": summaries[1:]})
+    mistake = mistake_in(log, next(iter(filters.values())))
+    if mistake is not None:  # which is no matter of noise
+        for summary in summaries:
+            summary["warnings"] = [str(mistake)]
+    named = {"mistake": None if mistake is None else mistake.as_dict()}
+    return write_summary(folder, {**summaries[0], **named, "others": summaries[1:]})
 
 
 def write_belief(path: Path, run: Replay) -> None:

@@ -10,6 +10,7 @@ from rich.text import Text
 
 from ...suggestions import counted
 from ..noise_study import Variation
+from ..runs.summary import MOST_REJECTED
 
 if TYPE_CHECKING:
     from ..noise_study import NoiseEffect, NoiseRun
@@ -116,7 +117,10 @@ def key_figures(summary: dict[str, Any]) -> Table:
         ("NIS", "nis", [f"the filter assumes too {w} noise" for w in _MUCH]),
     ):
         if summary[key] is not None:
-            rows.append((name, _ratio(summary[key], hint)))
+            text = _ratio(summary[key], hint)
+            if summary.get("mistake"):  # and not the noise
+                text = text.partition(":")[0]
+            rows.append((name, text))
     return named_rows(rows)
 
 
@@ -426,10 +430,19 @@ def advice(summary: dict[str, Any]) -> Table:
         for sigma, name in (("σβ", "bearing"), ("σr", "range"))
         if factors[name] > 1
     ]
+    lost, count = summary["runs"]["fitted"]["rejected"], summary["readings"]
     text = "none needed"
     if inflated:
         text = f"{', '.join(inflated)}: the errors of readings are correlated in time"
+    elif lost > MOST_REJECTED * count:
+        text = "not known"
     rows = [("inflation", text)]
+    if lost > MOST_REJECTED * count:
+        text = (
+            f"{lost} of {count} readings ({lost / count:.0%}), which fit no noise: the "
+            "noise is that of the others alone"
+        )
+        rows.append(("given up", text))
     if summary["calibration"] is not None:
         rows.append(("with the true path", _calibration(**summary["calibration"])))
     nees = _at(summary["runs"]["suggested"], ("nees", "per_degree"))

@@ -56,7 +56,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         monte_carlo
         noise_study noise_fitting
         trajectories
-        conventions estimate_files
+        conventions estimate_files log_conventions
         judging space_poses
         command_line
     """,

@@ -164,7 +164,11 @@ def test_the_advice_states_open_ends_and_what_remains(found, text):
     summary = {
         "inflation": {"bearing": 1.0, "range": 1.0},
         "calibration": calibration | {"tried": [0.25, 16.0]},
-        "runs": {"suggested": {"nees": {"per_degree": 1.4}}},
+        "readings": 269,
+        "runs": {
+            "fitted": {"rejected": 13},
+            "suggested": {"nees": {"per_degree": 1.4}},
+        },
     }
 
     def shown():
@@ -174,6 +178,10 @@ def test_the_advice_states_open_ends_and_what_remains(found, text):
     assert "stays overconfident" not in shown()
     summary["runs"]["suggested"]["nees"]["per_degree"] = 1.6
     assert "the pose NEES is 1.6 per degree with the suggested noise" in shown()
+    assert "none needed" in shown()
+    summary["runs"]["fitted"]["rejected"] = 125
+    assert "none needed" not in shown()
+    assert "125 of 269 readings (46%), which fit no noise" in shown()
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.9, 0.98])

@@ -1,0 +1,561 @@
+"""Name the convention that a log breaks: `mistake_in`.
+
+A log with clockwise bearings, degrees or shifted rows looks like a log with much noise.
+`mistake_in` reads a part of the log in each of the conventions that people mix up, and
+names the one in which its readings agree with its odometry. A log that agrees in its
+own convention, or in none, has nothing to name. No truth is needed.
+
+Symbols
+-------
+d, α   odometry: distance driven, and turn [m, rad]
+β, r   bearing and range of a reading [rad, m]
+θ      heading by the odometry alone [rad]
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import islice, product
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..arrays import Array, BoolArray, IntArray
+from ..estimator.filters.drive_likelihood import GATE, DriveEvents, drive_likelihood
+from ..estimator.filters.ekf import EkfSlam
+from ..estimator.models.bearing_range import wrap_angle
+from ..evaluation.trajectory_error import position_accuracy
+from .logs import ground_truth, recording, slamlog
+from .noise_fitting import search
+from .runs.filter_settings import NOISE_KEYS, FilterSettings, one_blas_thread
+from .runs.summary import MOST_REJECTED
+
+#: Size of the part of a log that is read in other conventions: its first landmarks and
+#: rows of odometry, and blocks of scans spread over them.
+_LANDMARKS, _ROWS, _READINGS, _BLOCK = 40, 8000, 800, 12
+_FEWEST = 30  # readings that are enough to recognise a convention
+#: Gain in log likelihood per reading [nats], and in all, that names a mistake; and by
+#: how much it leads over the next one.
+_GAIN, _TOTAL, _LEAD = 0.2, 20.0, 0.05
+#: NIS per degree of freedom that is no reason to look at other conventions.
+_USUAL = (0.6, 1.4)
+#: The same gain for a mistake with little effect on a consistent log, and how near NIS
+#: must be to 1.
+_SMALL_GAIN, _NEAR = 0.05, 0.2
+#: Loss by the noise as given that is no reason to look at other conventions [nats].
+_LOSS = 0.1
+_SKIPPED = 10.0  # loss by a reading without use, such as one of range ≤ 0 [nats]
+_TWIN = 1e-3  # by which two readings differ that are mirror images [nats]
+_NEARER = 2.0  # by which the truth tells mirror images apart
+#: Factors of the noise as given, of motion and of sensor; of `_FEW`, a few of them.
+_SIZES = (1 / 16, 1 / 4, 1.0, 4.0, 16.0)
+_FACTORS = np.array(list(product(_SIZES, _SIZES)))
+_FEW = np.array([(1, 1), (4, 4), (0.25, 0.25), (1, 0.25), (4, 1), (0.25, 0.0625)])
+_FINALISTS = 3
+_LARGEST = 4.0  # factor of the noise with which a mistake explains a log
+_DEGREE = np.pi / 180
+#: Durations of a step that turn velocities into increments where rows hold none [s].
+_DURATIONS = (0.5, 0.25, 0.2, 0.1, 0.05, 0.04, 1 / 30, 0.02, 0.01)
+
+
+class Mistake(NamedTuple):
+    """A convention of a log other than the documented one, and its remedy."""
+
+    #: What the log has, as a sentence without an end.
+    name: str
+    #: What to change in the log.
+    remedy: str
+    #: Rise of the log likelihood per reading, each with its best noise [nats].
+    gain: float
+    #: NIS per degree of freedom as read in this convention, and as given; that of a
+    #: rejected reading counts as the gate.
+    nis: tuple[float, float]
+    #: Share of the readings that the gate rejects, likewise.
+    rejected: tuple[float, float]
+    #: Factors of the noise of motion and sensor under which both are so.
+    factors: tuple[float, float] = (1.0, 1.0)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the mistake as plain JSON types; each pair is of it, and as given."""
+        return {**self._asdict(), "text": str(self)}
+
+    def __str__(self) -> str:
+        noise = ""
+        if self.factors != (1, 1):
+            noise = (
+                " and with {:g} × the noise of the motion, {:g} × that of the sensor"
+            )
+        (nis, was), (lost, were) = self.nis, self.rejected
+        return (
+            f"The log breaks a convention: {self.name}. Without this mistake"
+            f"{noise.format(*self.factors)}, NIS is {nis:.2g} per degree of freedom, "
+            f"not {was:.3g}, {lost:.0%} of the readings are rejected, not {were:.0%}, "
+            f"and the log likelihood rises by {self.gain:.2g} per reading. "
+            f"Remedy: {self.remedy}."
+        )
+
+
+class Reading(NamedTuple):
+    """A part of a log, as read in some convention."""
+
+    #: Rows (d, α, dt) of odometry, (K, 3), and the step of each, (K,).
+    rows: Array
+    row_steps: IntArray
+    #: Rows (β, r), (M, 2), the landmark of each (M,), and its step (M,).
+    measurements: Array
+    landmarks: IntArray
+    steps: IntArray
+    #: Steps whose scans are read.
+    is_read: BoolArray
+    #: Where a row turns: "turn-last", "midpoint" or "turn-first".
+    motion: str
+    #: Heading at the start.
+    start: float
+    #: Logarithm of the volume of a measurement as read, by that in the file.
+    log_volume: float = 0.0
+
+
+def mistake_in(log: slamlog.SlamLog, settings: FilterSettings) -> Mistake | None:
+    """Return the convention that a log breaks, or None if it is not known.
+
+    The log is compared by the likelihood of its readings, each with the best of several
+    noises. Another convention is named only if it explains the log: the likelihood
+    rises far, few readings are rejected, and no other convention does the same.
+
+    Parameters
+    ----------
+    log : SlamLog
+        Bearings and ranges with identities; nothing is named of other logs.
+    settings : FilterSettings
+        Of a filter of the log, for its noise.
+
+    Examples
+    --------
+    >>> from slamgym.envs.controllers import OpenLoop
+    >>> from slamgym.experiments.logs import record_episode
+    >>> from slamgym.experiments.runs import settings_for
+    >>> from slamgym.sim_configs import action_sequence, load_scenario
+    >>> world = load_scenario("loop").with_changes(steps=60)
+    >>> driver = OpenLoop(action_sequence(world), world.robot)
+    >>> log = record_episode(world, driver, seed=0)
+    >>> mistake_in(log, settings_for(log)) is None
+    True
+    >>> for scan in log.scans:
+    ...     scan.measurements[:] = scan.measurements[:, ::-1]  # range first
+    >>> mistake_in(log, settings_for(log)).name
+    'the range stands before the bearing'
+    """
+    is_usual = log.motion in slamlog.UNICYCLES and "sensor" not in log.header
+    if not is_usual or ground_truth.hides_identities(log) or not log.scans:
+        return None
+    given = part_of(log)
+    if len(given.measurements) < _FEWEST or not len(given.rows):
+        return None
+    with one_blas_thread():
+        return _Comparison(log, settings, given).mistake()
+
+
+@contextlib.contextmanager
+def explaining(log: slamlog.SlamLog, settings: FilterSettings) -> Iterator[None]:
+    """Name the mistake of a log beside the numerical failure that it causes."""
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        mistake = mistake_in(log, settings)
+        if mistake is None:
+            raise
+        raise np.linalg.LinAlgError(f"{error}. {mistake}") from error
+
+
+def part_of(log: slamlog.SlamLog) -> Reading:
+    """Return the part of a log that is read in other conventions, as it is given."""
+    rows: list[tuple[float, float, float]] = []
+    row_steps, scans, steps, seen = [], [], [], set[int]()
+    count = 0
+    for step in recording.steps_of(log):
+        scan = step.scan
+        ids = None if scan is None else scan.landmark_ids
+        named = [] if ids is None else ids.tolist()
+        if len(rows) > _ROWS or len(seen | set(named)) > _LANDMARKS:
+            break
+        seen |= set(named)
+        rows += [(row.d, row.alpha, row.dt) for row in step.motions]
+        row_steps += [count] * len(step.motions)
+        if scan is not None:
+            scans.append(scan)
+            steps.append(count)
+        count += 1
+    sizes = [len(scan.measurements) for scan in scans]
+    every = -(-sum(sizes) // _READINGS)
+    is_read = np.zeros(count, dtype=bool)
+    is_read[np.array(steps)[np.arange(len(steps)) // _BLOCK % max(every, 1) == 0]] = (
+        True
+    )
+    return Reading(
+        np.array(rows, dtype=np.float64).reshape(-1, 3),
+        np.array(row_steps, dtype=np.int64),
+        np.concatenate([scan.measurements for scan in scans]),
+        np.concatenate([scan.landmark_ids for scan in scans]),
+        np.repeat(np.array(steps, dtype=np.int64), sizes),
+        is_read,
+        log.motion,
+        float(log.start[2]),
+    )
+
+
+def events_of(reading: Reading) -> DriveEvents:
+    """Return what a filter takes of a part of a log."""
+    d, alpha, dt = reading.rows.T
+    zero = np.zeros_like(d)
+    motions = {
+        "turn-last": [(d, alpha, dt)],
+        "turn-first": [(zero, alpha, zero), (d, zero, dt)],
+        "midpoint": [(zero, alpha / 2, zero), (d, alpha / 2, dt)],
+    }[reading.motion]
+    table = np.stack([np.column_stack(motion) for motion in motions], axis=1)
+    kept, until = is_used(reading), np.arange(len(reading.is_read) + 1)
+    return DriveEvents(
+        np.ascontiguousarray(table.reshape(-1, 3)),
+        np.searchsorted(reading.row_steps, until) * len(motions),
+        reading.measurements[kept],
+        np.unique(reading.landmarks[kept], return_inverse=True)[1].astype(np.int64),
+        np.searchsorted(reading.steps[kept], until),
+    )
+
+
+def is_used(reading: Reading) -> BoolArray:
+    """Return which measurements are read, each landmark once in a scan, (M,)."""
+    steps = reading.steps
+    used = (steps >= 0) & (steps < len(reading.is_read))
+    used[used] = reading.is_read[steps[used]]
+    named = np.column_stack([steps, reading.landmarks])
+    is_first = np.zeros(len(used), dtype=bool)
+    is_first[np.unique(named, axis=0, return_index=True)[1]] = True
+    return np.asarray(used & is_first)
+
+
+# --------------------------------------------------------------------------------------
+# How well readings and odometry agree.
+
+
+class _Fit(NamedTuple):
+    """How well a part of a log agrees with itself under several noises."""
+
+    #: Mean log likelihood of a reading under each noise.
+    likelihoods: Array
+    #: NIS per degree of freedom; that of a rejected reading is the gate.
+    nis: Array
+    #: Share of the readings.
+    rejected: Array
+
+    @property
+    def best(self) -> int:
+        """The noise of the largest likelihood."""
+        return int(np.argmax(self.likelihoods))
+
+    @property
+    def most(self) -> float:
+        """The largest likelihood."""
+        return float(self.likelihoods.max())
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """The readings of a part of a log in several conventions."""
+
+    log: slamlog.SlamLog
+    settings: FilterSettings
+    given: Reading
+
+    def mistake(self) -> Mistake | None:
+        """Return the mistake that explains the log, or None."""
+        before = self.fit(self.given, _FACTORS)
+        if not _is_far_off(before):
+            return self.small_mistake()
+        screened = [(self.fit(it.reading, _FEW).most, it) for it in others(self.given)]
+        screened.sort(key=lambda pair: -pair[0])
+        fits = [(self.fit(it.reading, _FACTORS), it) for _, it in screened[:_FINALISTS]]
+        best = max(fit.most for fit, _ in fits)
+        near = self.told_apart([pair for pair in fits if pair[0].most > best - _LEAD])
+        after, k = near[0][0], near[0][0].best
+        explains = after.rejected[k] <= max(MOST_REJECTED, before.rejected[k] / 2)
+        if not explains or _FACTORS[k].max() > _LARGEST:
+            return None
+        return self.named(near, before, _GAIN)
+
+    def small_mistake(self) -> Mistake | None:
+        """Return the order of turn and drive that suits a consistent log better."""
+        as_given = np.ones((1, 2))
+        fits = [(self.fit(it.reading, as_given), it) for it in _of_motion(self.given)]
+        (after, found) = max(fits, key=lambda pair: pair[0].most, default=(None, None))
+        if after is None or found is None or abs(after.nis[0] - 1) > _NEAR:
+            return None
+        return self.named([(after, found)], self.fit(self.given, as_given), _SMALL_GAIN)
+
+    def named(
+        self, found: list[tuple[_Fit, Other]], before: _Fit, least: float
+    ) -> Mistake | None:
+        """Return mistakes that have the same effect, if the likelihood rises enough."""
+        after = found[0][0]
+        k, gain = after.best, after.most - before.most
+        if gain < max(least, _TOTAL / len(self.given.measurements)):
+            return None
+        factors = _FACTORS[k] if len(after.nis) == len(_FACTORS) else np.ones(2)
+        return Mistake(
+            " or ".join(it.name for _, it in found),
+            ", or ".join(it.remedy for _, it in found),
+            gain,
+            (float(after.nis[k]), float(before.nis[k])),
+            (float(after.rejected[k]), float(before.rejected[k])),
+            (float(factors[0]), float(factors[1])),
+        )
+
+    def fit(self, reading: Reading, factors: Array) -> _Fit:
+        """Compare the readings with the odometry, under multiples of the noise."""
+        events = events_of(reading)
+        record = drive_likelihood(self.filter, events, self.noises(factors))
+        count = max(len(events.readings) - int(events.landmarks.max(initial=0)) - 1, 1)
+        used = record.used.sum(axis=1)
+        lost = np.maximum(count - used, record.rejected)
+        skipped = lost - record.rejected
+        total = record.log_likelihoods.sum(axis=1) - _SKIPPED * skipped
+        return _Fit(
+            np.where(np.isnan(total), -np.inf, total / count + reading.log_volume),
+            (record.nis.sum(axis=1) + GATE * lost) / (2 * count),
+            lost / count,
+        )
+
+    @cached_property
+    def filter(self) -> EkfSlam:
+        """A filter at the start of the log, without a gate and options of its own."""
+        options = {k: v for k, v in self.settings.options.items() if k in NOISE_KEYS}
+        slam = replace(self.settings, estimator="invariant", options=options).make(
+            self.log.start
+        )
+        assert isinstance(slam, EkfSlam)
+        return slam
+
+    def noises(self, factors: Array) -> Array:
+        """Return multiples (B, 2) of the noise of motion and sensor, (B, 7)."""
+        away = float(np.median(np.abs(self.given.measurements[:, 1])))
+        noise = search.positive_start(search.noise_of(self.settings), away)
+        return noise * np.repeat(
+            factors, (search.BEARING, len(noise) - search.BEARING), axis=1
+        )
+
+    def told_apart(self, near: list[tuple[_Fit, Other]]) -> list[tuple[_Fit, Other]]:
+        """Return the mistakes that agree with the truth, where it is known.
+
+        A log with clockwise bearings is the mirror image of one with clockwise turns.
+        """
+        if len(near) < 2:
+            return near
+        errors = [self.error(it.reading, _FACTORS[fit.best]) for fit, it in near]
+        least = min(errors)
+        return [
+            pair
+            for pair, error in zip(near, errors, strict=True)
+            if not error > _NEARER * least
+        ]
+
+    def error(self, reading: Reading, factors: Array) -> float:
+        """Return the aligned error of landmarks, or path [m]; nan if not known."""
+        events = events_of(reading)
+        record = drive_likelihood(
+            self.filter, events, self.noises(factors[None]), keep_beliefs=True
+        )
+        poses = record.poses[0]
+        steps = np.repeat(np.arange(len(poses)), np.diff(events.first_readings))
+        (x, y, heading), (bearing, distance) = poses[steps].T, events.readings.T
+        angle = heading + bearing
+        seen = x + distance * np.cos(angle), y + distance * np.sin(angle)
+        ids = reading.landmarks[is_used(reading)].tolist()
+        truth = ground_truth.TrueLandmarks(self.log.landmark_ids, self.log.landmarks)
+        times = [step.t for step in islice(recording.steps_of(self.log), len(poses))]
+        true_path = ground_truth.true_poses_of(self.log, np.array(times))
+        true_seen = truth.of(ids)
+        pairs = [(np.column_stack(seen), true_seen), (poses[:, :2], true_path)]
+        known = [(each, true[:, :2]) for each, true in pairs if true is not None]
+        if not known:
+            return np.nan
+        estimate, true = (np.concatenate(side) for side in zip(*known, strict=True))
+        finite = np.isfinite(true).all(axis=1) & np.isfinite(estimate).all(axis=1)
+        if not finite.any():
+            return np.nan
+        return position_accuracy(estimate[finite], true[finite]).aligned_rmse
+
+
+def _is_far_off(fit: _Fit) -> bool:
+    """Return whether a log as given disagrees with its noise."""
+    at = int(np.flatnonzero((_FACTORS == 1).all(axis=1))[0])
+    low, high = _USUAL
+    is_usual = low <= fit.nis[at] <= high and fit.rejected[at] <= MOST_REJECTED
+    return not (is_usual and fit.most - fit.likelihoods[at] <= _LOSS)
+
+
+# --------------------------------------------------------------------------------------
+# The conventions.
+
+
+class Other(NamedTuple):
+    """A log as read in another convention."""
+
+    #: What the log has, where this is the right one.
+    name: str
+    remedy: str
+    reading: Reading
+
+
+def others(given: Reading) -> Iterator[Other]:
+    """Yield a part of a log as read in the conventions that people mix up."""
+    yield from _of_measurements(given)
+    yield from _of_odometry(given)
+    yield from _shifted(given)
+
+
+def _of_measurements(given: Reading) -> Iterator[Other]:
+    bearing, distance = given.measurements.T
+
+    def read(b: Array, r: Array = distance, volume: float = 1.0) -> Reading:
+        measured = np.column_stack([wrap_angle(b), r])
+        return given._replace(measurements=measured, log_volume=float(np.log(volume)))
+
+    in_radians = read(bearing * _DEGREE, volume=_DEGREE)
+    right = np.pi / 2
+    yield Other(
+        "the bearings are clockwise", "multiply the bearings by -1", read(-bearing)
+    )
+    remedy = "multiply the bearings by π / 180"
+    yield Other("the bearings are in degrees", remedy, in_radians)
+    remedy = "multiply bearings and turns by π / 180"
+    yield Other(
+        "bearings and turns are in degrees",
+        remedy,
+        in_radians._replace(rows=given.rows * (1, _DEGREE, 1)),
+    )
+    name = "the range stands before the bearing"
+    yield Other(name, "exchange the two fields", read(distance, bearing))
+    for name, remedy, b in (
+        (
+            "are measured from the left of the robot",
+            "add π/2 to the bearings",
+            bearing + right,
+        ),
+        (
+            "are measured from the right of the robot",
+            "subtract π/2 from the bearings",
+            bearing - right,
+        ),
+        (
+            "are measured from the rear of the robot",
+            "add π to the bearings",
+            bearing + np.pi,
+        ),
+        (
+            "are clockwise from the left of the robot, its y axis",
+            "replace each bearing β by π/2 - β",
+            right - bearing,
+        ),
+        (
+            "are measured from the x axis of the world",
+            "subtract the heading of the robot from the bearings",
+            bearing - _headings(given)[given.steps],
+        ),
+    ):
+        yield Other(f"the bearings {name}", remedy, read(b))
+    for unit, size in (("centimetres", 0.01), ("millimetres", 0.001)):
+        remedy = f"multiply the lengths by {size:g}"
+        metres = read(bearing, distance * size, size)
+        yield Other(f"the ranges are in {unit}", remedy, metres)
+        driven = given._replace(rows=given.rows * (size, 1, 1))
+        yield Other(f"the distances driven are in {unit}", remedy, driven)
+
+
+def _headings(given: Reading) -> Array:
+    """Return the heading after each step, by the odometry alone."""
+    turned = np.concatenate([[0.0], np.cumsum(given.rows[:, 1])])
+    ends = np.searchsorted(given.row_steps, np.arange(len(given.is_read)), "right")
+    return np.asarray(given.start + turned[ends])
+
+
+_MOTIONS = {
+    "turn-last": ("the robot turns after it has driven", "set motion: turn-last"),
+    "midpoint": ("the robot drives arcs", "set motion: midpoint"),
+    "turn-first": (
+        "the robot turns before it drives",
+        "write each row of odometry as two, (0, alpha) with dt = 0, and (d, 0)",
+    ),
+}
+
+
+def _of_odometry(given: Reading) -> Iterator[Other]:
+    d, alpha, dt = given.rows.T
+
+    def read(distance: Array = d, turn: Array = alpha) -> Reading:
+        return given._replace(rows=np.column_stack([distance, turn, dt]))
+
+    name = "the turns of the odometry are clockwise"
+    yield Other(name, "multiply alpha by -1", read(turn=-alpha))
+    name = "the turns of the odometry are in degrees"
+    yield Other(name, "multiply alpha by π / 180", read(turn=alpha * _DEGREE))
+    name = "the odometry holds headings in place of turns"
+    turns = wrap_angle(np.diff(alpha, prepend=given.start))
+    yield Other(name, "write alpha as the difference of headings", read(turn=turns))
+    name = "the odometry holds velocities in place of increments"
+    if np.isin(dt, (0, 1)).all():
+        for s in _DURATIONS:
+            remedy = f"multiply d and alpha by {s:.3g}, the duration of a step"
+            yield Other(name, remedy, read(d * s, alpha * s))
+    else:
+        yield Other(name, "multiply d and alpha by dt", read(d * dt, alpha * dt))
+    yield from _of_motion(given)
+    is_first = (d[::2] == 0) & (dt[::2] == 0)
+    if len(d) % 2 or not is_first.all() or not dt[1::2].all():
+        return
+    before = given.start + np.cumsum(alpha[::2] + alpha[1::2])
+    before = np.concatenate([[given.start], before[:-1]])
+    seen = alpha + np.column_stack([-before, before]).ravel()
+    name = "the increments are in the frame of the world"
+    remedy = "rotate each increment by minus the heading before it"
+    yield Other(name, remedy, read(turn=wrap_angle(seen)))
+    name = "the rows of a turn stand before those of the drive that it follows"
+    swapped = given.rows.reshape(-1, 2, 3)[:, ::-1].reshape(-1, 3)
+    yield Other(name, "exchange the two rows", given._replace(rows=swapped))
+
+
+def _of_motion(given: Reading) -> Iterator[Other]:
+    """Yield a part of a log with turns at other places of its rows.
+
+    Rows that turn alone state the order of turn and drive themselves.
+    """
+    d, _, dt = given.rows.T
+    if ((d == 0) & (dt == 0)).any():
+        return
+    for motion, (name, remedy) in _MOTIONS.items():
+        if motion != given.motion:
+            yield Other(name, remedy, given._replace(motion=motion))
+
+
+def _shifted(given: Reading) -> Iterator[Other]:
+    """Yield a part of a log with the ids, or the scans, of the rows beside them."""
+    early, late = slice(None, -1), slice(1, None)
+    for word, back, of, to in (
+        ("late", "up", early, late),
+        ("early", "down", late, early),
+    ):
+        moved = given._replace(
+            measurements=given.measurements[of],
+            steps=given.steps[of],
+            landmarks=given.landmarks[to],
+        )
+        name = f"the ids stand one row too {word}"
+        yield Other(name, f"move the ids of the measurements one row {back}", moved)
+        by = -1 if word == "late" else 1
+        moved = given._replace(
+            steps=given.steps + by, is_read=np.roll(given.is_read, by)
+        )
+        name = f"the measurements stand one row of odometry too {word}"
+        yield Other(name, f"move the scans one row of odometry {back}", moved)

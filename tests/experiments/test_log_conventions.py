@@ -1,0 +1,232 @@
+"""Mistakes in the conventions of a log are named, and nothing else is."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import slamgym
+
+from slamgym.envs.controllers import OpenLoop
+from slamgym.estimator.models.bearing_range import wrap_angle
+from slamgym.experiments.log_conventions import mistake_in
+from slamgym.experiments.logs import (
+    OdometryRow,
+    Scan,
+    read_slamlog,
+    record_episode,
+    write_slamlog,
+)
+from slamgym.experiments.runs.filter_settings import noise_or_assumed, settings_for
+from slamgym.sim_configs import action_sequence, load_scenario
+
+DATA = os.environ.get("SLAMGYM_DATA")
+PUBLIC = ("cmu16833", "utias_d6_r3")
+HALF = np.pi / 2
+
+
+def simulated(name, seed, steps=200):
+    world = load_scenario(name)
+    world = world.with_changes(steps=min(steps, world.steps))
+    driver = OpenLoop(action_sequence(world), world.robot)
+    return record_episode(world, driver, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def corridor():
+    return simulated("corridor", seed=0)
+
+
+@pytest.fixture(scope="module", params=PUBLIC)
+def public(request):
+    if DATA is None:
+        pytest.skip("SLAMGYM_DATA does not name the folder of the public logs")
+    return read_slamlog(Path(DATA) / f"{request.param}.csv")
+
+
+def of_rows(change):
+    """Return the change of a log whose rows (d, α, dt) change together."""
+
+    def changed(log):
+        rows = [event for event in log.events if isinstance(event, OdometryRow)]
+        table = np.array([(row.d, row.alpha, row.dt) for row in rows])
+        new = dict(zip(map(id, rows), change(*table.T, log), strict=True))
+        events = [
+            OdometryRow(event.t, *map(float, new[id(event)]), event.dt)
+            if id(event) in new
+            else event
+            for event in log.events
+        ]
+        return replace(log, events=events)
+
+    return changed
+
+
+def of_scans(change):
+    """Return the change of a log whose rows (β, r) change one by one."""
+
+    def changed(log):
+        events = [
+            replace(event, measurements=np.column_stack(change(*event.measurements.T)))
+            if isinstance(event, Scan)
+            else event
+            for event in log.events
+        ]
+        return replace(log, events=events)
+
+    return changed
+
+
+def velocities(d, alpha, dt, log):
+    seconds = 0.1 if (dt == 1).all() else np.where(dt > 0, dt, 1)
+    return np.column_stack([d / seconds, alpha / seconds])
+
+
+def headings(d, alpha, dt, log):
+    return np.column_stack([d, wrap_angle(log.start[2] + np.cumsum(alpha))])
+
+
+def turned_first(log):
+    """Write the drive of a robot that turns first: its scans come before the turn."""
+    last, events = 0.0, []
+    for event in log.events:
+        if isinstance(event, OdometryRow):
+            events.append(replace(event, alpha=last))
+            last = event.alpha
+        else:
+            readings = event.measurements + np.array([last, 0.0])
+            events.append(replace(event, measurements=readings))
+    return replace(log, events=events)
+
+
+def with_the_ids_of_the_row_before(log):
+    ids = np.roll(np.concatenate([scan.landmark_ids for scan in log.scans]), 1)
+    events, done = [], 0
+    for event in log.events:
+        if isinstance(event, Scan):
+            named = ids[done : done + len(event.landmark_ids)]
+            done += len(named)
+            first = np.sort(np.unique(named, return_index=True)[1])
+            events.append(Scan(event.t, event.measurements[first], named[first]))
+        else:
+            events.append(event)
+    return replace(log, events=events)
+
+
+def with_scans_a_row_late(log):
+    late, waiting = [], []
+    for event in log.events:
+        if isinstance(event, OdometryRow):
+            late.append(event)
+            late += [replace(scan, t=event.t) for scan in waiting]
+            waiting = []
+        else:
+            waiting.append(event)
+    return replace(log, events=late)
+
+
+FAR = {  # a mistake, and the words that name it
+    "clockwise": (of_scans(lambda b, r: (-b, r)), "bearings are clockwise"),
+    "degrees": (of_scans(lambda b, r: (np.degrees(b), r)), "bearings are in degrees"),
+    "turned degrees": (
+        of_rows(lambda d, a, dt, log: np.column_stack([d, np.degrees(a)])),
+        "turns of the odometry are in degrees",
+    ),
+    "exchanged": (of_scans(lambda b, r: (r, b)), "the range stands before"),
+    "velocities": (of_rows(velocities), "holds velocities"),
+    "headings": (of_rows(headings), "holds headings"),
+    "clockwise turns": (
+        of_rows(lambda d, a, dt, log: np.column_stack([d, -a])),
+        "turns of the odometry are clockwise",
+    ),
+    "left": (of_scans(lambda b, r: (b - HALF, r)), "from the left of the robot"),
+    "right": (of_scans(lambda b, r: (b + HALF, r)), "from the right of the robot"),
+    "compass": (of_scans(lambda b, r: (HALF - b, r)), "clockwise from the left"),
+}
+SHIFTED = {  # and a world whose motions differ enough to show it
+    "turn first": (turned_first, "turns before it drives", "six_landmarks"),
+    "ids": (with_the_ids_of_the_row_before, "ids stand one row too late", "dense"),
+    "stamps": (with_scans_a_row_late, "odometry too late", "six_landmarks"),
+}
+
+
+def mistake_of(log):
+    return mistake_in(log, settings_for(log, **noise_or_assumed(log, {})))
+
+
+@pytest.mark.parametrize("name", FAR)
+def test_a_mistake_in_a_simulated_log_is_named(corridor, name):
+    change, words = FAR[name]
+    assert words in mistake_of(change(corridor)).name
+
+
+@pytest.mark.parametrize("name", SHIFTED)
+def test_a_shift_in_a_simulated_log_is_named(name):
+    change, words, world = SHIFTED[name]
+    assert words in mistake_of(change(simulated(world, seed=1, steps=60))).name
+
+
+@pytest.mark.parametrize("name", FAR)
+@pytest.mark.filterwarnings("ignore:.*does not specify")
+def test_a_mistake_in_a_public_log_is_named(public, name):
+    change, words = FAR[name]
+    assert words in mistake_of(change(public)).name
+
+
+@pytest.mark.filterwarnings("ignore:.*does not specify")
+def test_nothing_is_named_of_a_public_log(public):
+    assert mistake_of(public) is None
+
+
+@pytest.mark.parametrize("factor", [1 / 3, 1, 3])
+@pytest.mark.parametrize("name", ["corridor", "loop", "six_landmarks"])
+def test_a_wrong_noise_is_no_mistake_of_conventions(name, factor):
+    log = simulated(name, seed=3)
+    right = settings_for(log)
+    motion, sensor = (
+        tuple(factor * s for s in std)
+        for std in (right.motion_std, right.measurement_std)
+    )
+    settings = replace(right, motion_std=motion, measurement_std=sensor)
+    assert mistake_in(log, settings) is None
+
+
+def test_outliers_are_no_mistake_of_conventions(corridor):
+    rng = np.random.default_rng(4)
+
+    def spoilt(b, r):
+        is_wrong = rng.random(len(b)) < 0.15
+        return np.where(is_wrong, rng.uniform(-3, 3, len(b)), b), r
+
+    assert mistake_of(of_scans(spoilt)(corridor)) is None
+
+
+def test_a_mirrored_log_is_consistent(corridor):
+    both = of_rows(lambda d, a, dt, log: np.column_stack([d, -a]))(corridor)
+    assert mistake_of(of_scans(lambda b, r: (-b, r))(both)) is None
+
+
+def test_mirror_images_are_both_named_where_no_truth_tells_them_apart(corridor):
+    log = FAR["clockwise"][0](corridor)
+    nothing = {"landmark_ids": [], "landmarks": np.empty((0, 2))}
+    blind = replace(log, ground_truth=np.empty((0, 4)), **nothing)
+    found = mistake_of(blind)
+    assert FAR["clockwise"][1] in found.name
+    assert FAR["clockwise turns"][1] in found.name
+
+
+def test_commands_name_the_mistake_and_suggest_no_noise(corridor, tmp_path):
+    file = tmp_path / "log.csv"
+    write_slamlog(FAR["clockwise"][0](corridor), file)
+    text = file.read_text()
+    for command in ("replay", "smooth", "fit-noise"):
+        write = ["--write"] if command == "fit-noise" else []
+        shown = slamgym(command, file, *write, "--out", tmp_path / command).output
+        told = " ".join(shown.split())
+        assert "the bearings are clockwise" in told
+        assert "Remedy: multiply the bearings by -1." in told
+        assert "too little noise" not in told
+        assert "--motion-std" not in told or command != "fit-noise"
+        assert "inflation" not in told
+    assert file.read_text() == text
