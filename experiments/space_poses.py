@@ -49,7 +49,7 @@ ORDERS = ("translation-first", "rotation-first")
 _SMALL = 1e-4  # angle of a rotation below which series are exact [rad]
 _SYMMETRIC = 1e-6  # relative difference of two entries
 _NEAR, _FAR, _ERRORS = 1.5, 2.5, 3.0  # as for poses in the plane, see conventions
-_GAIN = 1.0  # of log-likelihood of a pose [nats]
+_GAIN = 0.25  # of log-likelihood of a pose [nats]
 _DEGREES = np.diag([1.0] * 3 + [np.pi / 180] * 3)
 _SWAP = np.eye(6)[[3, 4, 5, 0, 1, 2]]
 
@@ -276,10 +276,12 @@ def _cause(
     fits = {name: _fit(*reading) for name, reading in readings.items()}
     before = next(fits[name] for name, it in readings.items() if it[0] is error)
     honest = {name: fit for name, fit in fits.items() if fit[0]}
-    if before[0] or not honest:
+    if not honest:
         return ""
-    best = max(honest, key=lambda name: honest[name][1])
-    if honest[best][1] < before[1] + _GAIN:
+    best = max(honest, key=lambda name: honest[name][1].mean())
+    gains = honest[best][1] - before[1]
+    noise = np.nan_to_num(gains.std()) / np.sqrt(len(gains))
+    if gains.mean() < max(_GAIN, _ERRORS * noise):
         return ""
     return (
         f"convention: {best}: read so, NEES / 6 is {honest[best][2]:.2f}, not "
@@ -287,21 +289,21 @@ def _cause(
     )
 
 
-def _fit(errors: Array, covariances: Array) -> tuple[bool, float, float]:
-    """Return whether errors are honest, their mean log-likelihood, and NEES / 6."""
+def _fit(errors: Array, covariances: Array) -> tuple[bool, Array, float]:
+    """Return whether errors are honest, log-likelihoods of runs, and NEES / 6."""
     order = [3, 4, 5, 0, 1, 2]  # rotations first: fewer frames change them
     ordered = covariances[..., order, :][..., order]
     try:
         factor = np.linalg.cholesky(ordered[:, 1:])
     except np.linalg.LinAlgError:
-        return False, -np.inf, np.nan
+        return False, np.full(len(errors), -1e300), np.nan
     white = np.linalg.solve(factor, errors[:, 1:, order, None])[..., 0]
     sizes = np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum(axis=-1)
     squares = (white**2).mean(axis=1)
     mean = squares.mean(axis=0)
     spread = squares.std(axis=0) / np.sqrt(len(squares)) / mean
     limit = np.minimum(np.log(_NEAR) + _ERRORS * spread, np.log(_FAR))
-    likelihood = float((-0.5 * (white**2).sum(axis=-1) - sizes).mean())
+    likelihood = (-0.5 * (white**2).sum(axis=-1) - sizes).mean(axis=1)
     return bool((abs(np.log(mean)) <= limit).all()), likelihood, float(mean.mean())
 
 
