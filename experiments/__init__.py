@@ -4,7 +4,8 @@
 * :mod:`~slamgym.experiments.runs` filters a log or simulated runs, and summarises them.
 * :mod:`~slamgym.experiments.figures` draws a run: map, errors, covariance.
 * :mod:`~slamgym.experiments.monte_carlo` tests the consistency of filters in many runs.
-* :mod:`~slamgym.experiments.judging` judges the estimates of other programs.
+* :mod:`~slamgym.experiments.judging` judges the estimates of other programs, and
+  :mod:`~slamgym.experiments.space_poses` those of poses in space.
 * :mod:`~slamgym.experiments.noise_study` scales each noise, in one run or in many.
 * :mod:`~slamgym.experiments.noise_fitting` fits the noise of logs.
 * :mod:`~slamgym.experiments.trajectories` generates data sets of trajectories.
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
     from .noise_study import study_log as study_log
     from .noise_study import study_scenario as study_scenario
     from .runs import *
+    from .space_poses import judge_in_space as judge_in_space
     from .trajectories import *
     from .viewers import *
 else:
