@@ -331,6 +331,15 @@ def test_the_truth_of_a_log_may_be_in_any_format(folder, file, name, kind):
     np.testing.assert_allclose(truth.start, IN_SPACE[0], atol=1e-12)
 
 
+def test_a_truth_with_epoch_stamps_is_set_to_the_clock_of_the_log(folder, file):
+    epoch = 1700000000
+    odometry = "t,d,alpha\n" + "".join(f"{epoch + k},1,0\n" for k in range(4))
+    readings = f"t,id,bearing,range\n{epoch + 2},7,0,1\n"
+    truth = file("".join(f"{epoch + k} {k} 0 0 0 0 0 1\n" for k in range(4)))
+    log = read_log(folder(odometry=odometry, measurements=readings), truth=truth)
+    assert log.ground_truth[:, 0].tolist() == [0, 1, 2, 3]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
