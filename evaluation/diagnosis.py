@@ -95,6 +95,8 @@ class SmallNoise(NamedTuple):
     #: The same runs with more noise than this but less than in the world, if they were
     #: repeated before.
     larger: SmallNoise | None = None
+    #: Time average of the position error in each run, (M,) [m].
+    position_error: ArrayLike | None = None
 
 
 def diagnose(
@@ -574,10 +576,7 @@ def excess_of(
         share = _share(small.larger.factor)
         found += f", for {np.nanmean(many):.3g} times with {share}"
     if _change(many, after[errors.of], diverged, sign, 1 / factor) == "grows":
-        return WRONG_MODEL, (
-            f"{found}, and thus do not shrink with it: a model of the filter is wrong, "
-            "such as a bias, a sign, an offset or a delay."
-        )
+        return _of_growth(found, _shrunk_errors(small), factor)
     is_off = rest.remains or (rest.low > 1 if sign > 0 else rest.high < 1)
     is_left = rest.remains and small.factor <= SMALLEST_NOISE
     if (of_all == "stays" and is_off) or (of_all == "shrinks" and is_left):
@@ -597,6 +596,31 @@ def excess_of(
             "angle not wrapped?"
         )
     return LINEARISATION, f"{found}, so the excess vanishes with the noise."
+
+
+def _of_growth(found: str, shrunk: float, factor: float) -> tuple[str, str]:
+    """Return the answer for a NEES that grows as the noise falls by a factor."""
+    if shrunk < np.sqrt(factor):
+        return WRONG_COVARIANCE, (
+            f"{found}, but the errors themselves shrink to {shrunk:.3g} times: the "
+            "claimed variance shrinks even faster, so a Jacobian or a covariance "
+            "is wrong."
+        )
+    return WRONG_MODEL, (
+        f"{found}, and thus do not shrink with it: a model of the filter is wrong, "
+        "such as a bias, a sign, an offset or a delay."
+    )
+
+
+def _shrunk_errors(small: SmallNoise) -> float:
+    """Return the factor of the position error when the noise falls, or inf."""
+    larger = small.larger
+    if larger is None or larger.position_error is None or small.position_error is None:
+        return math.inf
+    before = np.asarray(larger.position_error, float)
+    after = np.asarray(small.position_error, float)
+    both = np.isfinite(before) & np.isfinite(after) & (before > 0)
+    return float(np.median(after[both] / before[both])) if both.any() else math.inf
 
 
 class _Rest(NamedTuple):

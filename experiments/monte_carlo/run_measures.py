@@ -151,6 +151,7 @@ SMALL_NOISE: dict[str, Variable] = {
         for frame in ERROR_FRAMES
     },
     "small_noise_heading_nees": Variable(RUN, "f8", "mean NEES of the heading"),
+    "small_noise_position_error": Variable(RUN, "f8", "mean distance to the truth [m]"),
     "small_noise_factor": Variable(RUN, "f8", "of all noise, nan if not repeated"),
 }
 #: The same of runs with more noise than these, but less than in the world.

@@ -499,7 +499,10 @@ def _small_noise(scores: EstimatorScores, frame: ErrorFrame) -> SmallNoise | Non
         if name in scores.results and not np.isnan(scores.per_run(name)).all():
             factor = float(np.nanmin(scores.per_run(f"{prefix}small_noise_factor")))
             heading = scores.per_run(f"{prefix}small_noise_heading_nees")
-            found = SmallNoise(scores.per_run(name), heading, factor, found)
+            distance = f"{prefix}small_noise_position_error"
+            known = distance in scores.results  # not in results of before
+            errors = scores.per_run(distance) if known else None
+            found = SmallNoise(scores.per_run(name), heading, factor, found, errors)
     return found
 
 

@@ -333,6 +333,19 @@ def test_an_excess_that_grows_because_a_filter_diverges_is_compared_twice(
     assert (found.cause, found.repeat) == (cause, 0)
 
 
+@pytest.mark.parametrize(
+    ("shrunk", "cause"), [(0.1, "wrong covariance"), (1.0, "wrong model")]
+)
+def test_errors_that_shrink_with_the_noise_are_of_no_wrong_model(shrunk, cause):
+    scores, error = wrong(11, 20.0), np.linspace(0.1, 0.2, RUNS)
+    larger = less_noise(scores, 100.0)._replace(position_error=error)
+    small = less_noise(scores, 10000.0, factor=0.01)
+    small = small._replace(larger=larger, position_error=shrunk * error)
+    found = diagnose(**scores, small_noise=small)
+    assert (found.cause, found.repeat) == (cause, 0)
+    assert ("shrink to 0.1 times" in found.sentence) == (cause == "wrong covariance")
+
+
 def test_an_average_that_may_be_one_has_no_cause():
     scores = honest(14)
     scores["nees"][::6] *= 1.8
