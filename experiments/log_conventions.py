@@ -42,9 +42,6 @@ _FEWEST = 30  # readings that are enough to recognise a convention
 _GAIN, _TOTAL, _LEAD = 0.2, 20.0, 0.05
 #: NIS per degree of freedom that is no reason to look at other conventions.
 _USUAL = (0.6, 1.4)
-#: The same gain for a mistake with little effect on a consistent log, and how near NIS
-#: must be to 1.
-_SMALL_GAIN, _NEAR = 0.05, 0.2
 #: Loss by the noise as given that is no reason to look at other conventions [nats].
 _LOSS = 0.1
 _SKIPPED = 10.0  # loss by a reading without use, such as one of range ≤ 0 [nats]
@@ -274,7 +271,7 @@ class _Comparison:
         """Return the mistake that explains the log, or None."""
         before = self.fit(self.given, _FACTORS)
         if not _is_far_off(before):
-            return self.small_mistake()
+            return None
         screened = [(self.fit(it.reading, _FEW).most, it) for it in others(self.given)]
         screened.sort(key=lambda pair: -pair[0])
         fits = [(self.fit(it.reading, _FACTORS), it) for _, it in screened[:_FINALISTS]]
@@ -284,26 +281,15 @@ class _Comparison:
         explains = after.rejected[k] <= max(MOST_REJECTED, before.rejected[k] / 2)
         if not explains or _FACTORS[k].max() > _LARGEST:
             return None
-        return self.named(near, before, _GAIN)
+        return self.named(near, before)
 
-    def small_mistake(self) -> Mistake | None:
-        """Return the order of turn and drive that suits a consistent log better."""
-        as_given = np.ones((1, 2))
-        fits = [(self.fit(it.reading, as_given), it) for it in _of_motion(self.given)]
-        (after, found) = max(fits, key=lambda pair: pair[0].most, default=(None, None))
-        if after is None or found is None or abs(after.nis[0] - 1) > _NEAR:
-            return None
-        return self.named([(after, found)], self.fit(self.given, as_given), _SMALL_GAIN)
-
-    def named(
-        self, found: list[tuple[_Fit, Other]], before: _Fit, least: float
-    ) -> Mistake | None:
+    def named(self, found: list[tuple[_Fit, Other]], before: _Fit) -> Mistake | None:
         """Return mistakes that have the same effect, if the likelihood rises enough."""
         after = found[0][0]
         k, gain = after.best, after.most - before.most
-        if gain < max(least, _TOTAL / len(self.given.measurements)):
+        if gain < max(_GAIN, _TOTAL / len(self.given.measurements)):
             return None
-        factors = _FACTORS[k] if len(after.nis) == len(_FACTORS) else np.ones(2)
+        factors = _FACTORS[k]
         return Mistake(
             " or ".join(it.name for _, it in found),
             ", or ".join(it.remedy for _, it in found),
