@@ -1,17 +1,25 @@
 """How often decisions reject a filter that is exactly consistent; nominal 5 %.
 
-    python benchmarks/false_alarms.py
+    python benchmarks/false_alarms.py          # tests with 50 runs
+    python benchmarks/false_alarms.py looks    # tests at every look up to 400 runs
 
 Two linear Kalman filters, 50 runs. One forgets its errors within a few steps. The other
 estimates three constants and never forgets. All figures are shares of 2000 repetitions,
 with a statistical error of half a percentage point.
+
+With ``looks``, the same filters are watched after every run; a ratio is what squared
+errors are multiplied by. "extended" is a study whose verdict is read after 50, 100,
+200, 400 runs. A second table shows how many runs real filters need.
 """
 
+import sys
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slamgym import monte_carlo
+from slamgym.evaluation import evaluate_consistency
 from slamgym.evaluation.hypothesis_tests import (
     average_band,
     bootstrap_test,
@@ -21,6 +29,7 @@ from slamgym.evaluation.hypothesis_tests import (
     time_average_test,
     whiteness_test,
 )
+from slamgym.experiments.monte_carlo.looks import Look, Watch, error_rate_after
 
 Array = NDArray[np.float64]
 Accepts = Callable[[Array, Array], bool]
@@ -30,9 +39,11 @@ ONES = np.ones((RUNS, STEPS), dtype=np.int64)
 BAND = average_band(RUNS, DOF)
 
 
-def scores(rng: np.random.Generator, noise: float) -> tuple[Array, Array]:
-    """NEES and NIS of three random walks, read in turn: (REPETITIONS, RUNS, STEPS)."""
-    runs = REPETITIONS * RUNS
+def scores(
+    rng: np.random.Generator, noise: float, shape: tuple[int, int] = (REPETITIONS, RUNS)
+) -> tuple[Array, Array]:
+    """NEES and NIS of three random walks, read in turn: (repetitions, runs, STEPS)."""
+    runs = shape[0] * shape[1]
     variance = np.ones(3)
     error = rng.standard_normal((runs, 3))
     nees, nis = np.empty((runs, STEPS)), np.empty((runs, STEPS))
@@ -46,8 +57,7 @@ def scores(rng: np.random.Generator, noise: float) -> tuple[Array, Array]:
         error[:, read] -= variance[read] / total * innovation
         variance[read] /= total
         nees[:, step] = (error**2 / variance).sum(axis=1)
-    shape = (REPETITIONS, RUNS, STEPS)
-    return nees.reshape(shape), nis.reshape(shape)
+    return nees.reshape(*shape, STEPS), nis.reshape(*shape, STEPS)
 
 
 def inside(nees: Array) -> float:
@@ -88,5 +98,102 @@ def main() -> None:
         print(f"| {name} | " + " | ".join(f"{rate:.1%}" for rate in rates) + " |")
 
 
+MOST, LOOKS, CHUNK, FEW = 400, (50, 100, 200, 400), 50, 400
+RATIOS = 1.0, 0.8, 1.25, 0.5, 1.5, 2.0
+
+
+def watched(nees: Array) -> Watch:
+    """Look after every run at NEES of shape (runs, STEPS)."""
+    watch, good = Watch(), np.ones(len(nees), dtype=np.bool_)
+    watch.update(np.insert(nees, 0, np.nan, axis=1), good, 1)
+    return watch
+
+
+def p_value(nees: Array, nis: Array, runs: int) -> float:
+    """p-value of a verdict on a number of runs that was chosen beforehand."""
+    return evaluate_consistency(
+        nees[:runs],
+        nis[:runs],
+        ONES[:1].repeat(runs, axis=0),
+        frame="invariant",
+        rng=np.random.default_rng(0),
+    ).p_value
+
+
+def looks(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    columns = [column(rng, noise) for noise in (1.0, 0.0)]
+    print("| | forgets | never forgets |\n|---|---|---|")
+    for name in columns[0]:
+        print(f"| {name} | " + " | ".join(each[name] for each in columns) + " |")
+    print(
+        "\n| filter | studies | decision | runs, median | 90 % |\n|---|---|---|---|---|"
+    )
+    runs_needed("loop", "ekf", 32, 40, seed)
+    runs_needed("six_landmarks", "invariant", MOST, 40, seed)
+
+
+def column(rng: np.random.Generator, noise: float) -> dict[str, str]:
+    watches: dict[float, list[Watch]] = {ratio: [] for ratio in RATIOS}
+    first: list[bool] = []
+    later: list[bool] = []
+    plain: list[bool] = []
+    for _ in range(REPETITIONS // CHUNK):
+        for nees, nis in zip(*scores(rng, noise, (CHUNK, MOST)), strict=True):
+            for ratio in RATIOS[: 3 if len(first) >= FEW else None]:
+                watches[ratio].append(watched(ratio * nees))
+            verdicts = [
+                p_value(nees, nis, n) for n in LOOKS[: 1 if len(first) >= FEW else None]
+            ]
+            first.append(verdicts[0] < 0.05)
+            left = -np.log(error_rate_after([Look(0, LOOKS[0], "")]))
+            rejected = watches[1.0][-1].log_evidence >= left
+            later.append(verdicts[0] < 0.04 or rejected)
+            if len(plain) < FEW:
+                plain.append(min(verdicts) < 0.05)
+    cells = {
+        f"ratio {r:g}: {key}": cell for r in RATIOS for key, cell in decided(watches[r])
+    }
+    for name, rejections in {
+        "first verdict, 50 runs": first,
+        "extended to 400 runs": later,
+        "extended, each verdict as if it was the first": plain,
+    }.items():
+        cells[f"ratio 1: rejected, {name}"] = f"{np.mean(rejections):.1%}"
+    return cells
+
+
+def decided(watches: list[Watch]) -> list[tuple[str, str]]:
+    rejected = np.array([watch.rejected_after or np.inf for watch in watches])
+    shown = np.array([watch.shown_after or np.inf for watch in watches])
+    accepted = np.where(shown < rejected, shown, np.inf)
+    found = []
+    for what, after in ("rejected", rejected), ("accepted", accepted):
+        cell = f"{np.isfinite(after).mean():.1%}"
+        median, high = np.quantile(after, [0.5, 0.9], method="higher")
+        if np.isfinite(high):
+            cell += f", after {median:.0f} (90 %: {high:.0f})"
+        found.append((what, cell))
+    return found
+
+
+def runs_needed(world: str, name: str, most: int, studies: int, seed: int) -> None:
+    results = monte_carlo(world, name, runs=most * studies, seed=10**6 * seed)
+    nees = results.pose_nees_invariant.values[0, :, 1:]
+    found = [watched(part) for part in nees.reshape(studies, most, -1)]
+    rejected = [watch.rejected_after for watch in found if watch.rejected_after]
+    shown = [watch.shown_after for watch in found if not watch.rejected_after]
+    for what, after in ("rejected", rejected), ("consistent", [n for n in shown if n]):
+        if after:
+            median, high = np.quantile(after, [0.5, 0.9])
+            print(
+                f"| {name} in {world} | {len(after)} of {studies} | {what} "
+                f"| {median:.0f} | {high:.0f} |"
+            )
+
+
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:2] == ["looks"]:
+        looks(int((sys.argv[2:] or ["1"])[0]))
+    else:
+        main()

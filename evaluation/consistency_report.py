@@ -93,8 +93,13 @@ class ConsistencyReport:
         thousandths, which say nothing about the errors.  The bootstrap does not count,
         because it repeats the t-test.
         """
+        return not self.failed_runs and self.p_value >= _ERROR_RATE
+
+    @property
+    def p_value(self) -> float:
+        """p-value of final step, time averages and grid together (Bonferroni)."""
         p = (self.final_step.p_value, self.average_p_value, self.family.p_value)
-        return not self.failed_runs and min(p) * len(p) >= _ERROR_RATE
+        return min(p) * len(p)
 
     @property
     def used_runs(self) -> int:

@@ -30,6 +30,7 @@ from typing import Any, NamedTuple, TypeVar
 import psutil
 from filelock import FileLock, Timeout
 
+from ..estimator.support.argument_checks import usable_cores
 from ..sim_configs.field_types import unknown_choice
 from ..sim_configs.scenario_files import replace_when_written
 from .runs.filter_settings import integer, one_blas_thread
@@ -173,6 +174,18 @@ def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
             return_as="generator_unordered", pre_dispatch="2*n_jobs", **begin
         )
         return workers
+
+
+def blocks_at_once(jobs: int | None, backend: str | None) -> int:
+    """Return how many blocks the workers of these arguments compute at a time."""
+    if backend == "ray":
+        return usable_cores() if jobs in (None, -1) else int(jobs or 1)
+    from joblib import effective_n_jobs, parallel_config  # noqa: PLC0415
+
+    if backend is None:
+        return max(int(effective_n_jobs(jobs)), 1)
+    with parallel_config(backend, n_jobs=jobs or -1):
+        return max(int(effective_n_jobs(jobs or -1)), 1)
 
 
 def _end_with(engaging: int) -> None:

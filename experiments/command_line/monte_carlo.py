@@ -32,6 +32,9 @@ class MonteCarloOptions(options.Options):
     runs
         Number of runs. Run i is the world of seed SEED + i, so studies with overlapping
         seed ranges share worlds.
+    until
+        "decided": run until there is a verdict on every filter, which holds 5 % at
+        all looks together; at most RUNS.
     assume
         A change of the scenario that only the filters assume, such as
         motion.std=[0.1,0.1,0.1]. May be repeated.
@@ -53,6 +56,7 @@ class MonteCarloOptions(options.Options):
 
     estimators: str = options.declared("ekf,invariant", "--estimators -e NAMES")
     runs: int = options.declared(200, "")
+    until: str | None = options.declared(None, "decided")
     assume: list[str] | None = options.declared(None, "KEY=VALUE")
     block_size: int = options.declared(64, "N")
     first_run: int = options.declared(0, "N")
@@ -64,7 +68,7 @@ class MonteCarloOptions(options.Options):
 
 @command
 @options.takes(
-    "estimators runs seed steps set_ assume resolution jobs backend scheduler "
+    "estimators runs until seed steps set_ assume resolution jobs backend scheduler "
     "block_size first_run merge fresh figures out as_json"
 )
 def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> int:
@@ -78,6 +82,7 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
     Examples
     --------
     slamgym monte-carlo loop --estimators ekf,invariant --runs 200 --out loop
+    slamgym monte-carlo loop --until decided --runs 1000
     slamgym monte-carlo six_landmarks -e mine:MyFilter --runs 100 --jobs 4
     slamgym monte-carlo loop --assume motion.std=[0.1,0.1,0.1]
     slamgym monte-carlo loop --figures pdf
@@ -116,6 +121,7 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
             given.estimators,
             given.runs,
             given.seed,
+            until=given.until,
             assumed=told,
             out=place,
             jobs=given.jobs,

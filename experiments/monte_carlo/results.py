@@ -48,7 +48,13 @@ _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pymunk", "xarray")
 _FROM_TRUTH = "for a consistent filter, NEES and NIS are χ² with the stated degrees"
 
 
-def dataset_of(job: Job, blocks: Blocks, runs: range, command: str = "") -> xr.Dataset:
+def dataset_of(
+    job: Job,
+    blocks: Blocks,
+    runs: range,
+    command: str = "",
+    more: Mapping[str, str] | None = None,
+) -> xr.Dataset:
     """Combine the blocks of a job into a dataset in memory.
 
     Parameters
@@ -61,6 +67,8 @@ def dataset_of(job: Job, blocks: Blocks, runs: range, command: str = "") -> xr.D
         Their runs.
     command : str
         Command that reproduces the results.
+    more : mapping, optional
+        Further attributes.
     """
     import xarray as xr  # noqa: PLC0415
 
@@ -79,12 +87,17 @@ def dataset_of(job: Job, blocks: Blocks, runs: range, command: str = "") -> xr.D
             for name, variable in job.variables.items()
         },
         {dim: (dim, values) for dim, values in _coordinates(job, runs).items()},
-        attributes(job, runs, command),
+        attributes(job, runs, command) | dict(more or {}),
     )
 
 
 def write_results(
-    path: Path, job: Job, blocks: Blocks, runs: range, command: str = ""
+    path: Path,
+    job: Job,
+    blocks: Blocks,
+    runs: range,
+    command: str = "",
+    more: Mapping[str, str] | None = None,
 ) -> None:
     """Write the blocks of a job as one netCDF file, one block in memory at a time.
 
@@ -92,12 +105,21 @@ def write_results(
     ----------
     path : Path
         The file; after an error it stays as it was.
-    job, blocks, runs, command
+    job, blocks, runs, command, more
         As in :func:`dataset_of`.
     """
     kept, full = "; its blocks stay, to continue from", RuntimeError  # of netCDF
     with jobs.naming(path, kept, full), jobs.replace_own(path) as partial:
         _write(partial, job, blocks, runs, command)
+        if more:
+            _add_attributes(partial, more)
+
+
+def _add_attributes(path: Path, more: Mapping[str, str]) -> None:
+    import netCDF4  # noqa: PLC0415
+
+    with netCDF4.Dataset(path, "a") as file:
+        file.setncatts(more)
 
 
 def add_to_results(path: Path, added: Mapping[str, Array]) -> None:
@@ -245,6 +267,10 @@ JOB, BLOCKS, RESULTS = "job.json", "blocks", "results.nc"
 REPORT, SUMMARY = "report.html", "summary.json"
 
 
+#: Key in ``job.json`` of the looks: the verdicts that were given so far.
+LOOKS = "looks"
+
+
 class BlockFolder(NamedTuple):
     """The blocks of a job in its folder, which `opened` makes, checks and locks."""
 
@@ -291,6 +317,16 @@ class BlockFolder(NamedTuple):
                     for number in range(len(job.estimators))
                 ]
             yield runs, parts
+
+    def looks(self) -> list[tuple[int, int, str]]:
+        """Return first run, end of the runs and ``until`` of each verdict so far."""
+        return _looks_in(self.path)
+
+    def keep_look(self, look: tuple[int, int, str]) -> None:
+        """Record that there is a verdict on some runs."""
+        looks = self.looks()
+        if look not in looks:
+            _write_job(self.path, identity_in(self.path), [*looks, look])
 
     def copy(self, file: Path) -> None:
         """Add a block of another folder, if it is not there."""
@@ -340,11 +376,18 @@ def opened(
             jobs.remove_leftovers(path, path / BLOCKS)
             if found and fresh:
                 _clear(path, found)
-            with replace_when_written(path / JOB) as partial:
-                text = json.dumps(identity, indent=2, ensure_ascii=False)
-                partial.write_text(text + "\n", encoding="utf-8")
+            _write_job(path, identity, _looks_in(path) if found and not fresh else [])
             (path / BLOCKS).mkdir(exist_ok=True)
         yield BlockFolder(path, digest_of(identity))
+
+
+def _write_job(
+    path: Path, identity: dict[str, Any], looks: Sequence[tuple[int, int, str]]
+) -> None:
+    table = identity | ({LOOKS: looks} if looks else {})
+    with replace_when_written(path / JOB) as partial:
+        text = json.dumps(table, indent=2, ensure_ascii=False)
+        partial.write_text(text + "\n", encoding="utf-8")
 
 
 def _clear(path: Path, identity: dict[str, Any]) -> None:
@@ -404,6 +447,29 @@ def identity_in(path: Path) -> dict[str, Any]:
     ValueError
         If there is none.
     """
+    identity = _job_in(path)
+    identity.pop(LOOKS, None)
+    return identity
+
+
+def _looks_in(path: Path) -> list[tuple[int, int, str]]:
+    """Read the looks of a folder.
+
+    Raises
+    ------
+    ValueError
+        If they are damaged.
+    """
+    found = _job_in(path).get(LOOKS, [])
+    with contextlib.suppress(TypeError, ValueError):
+        return [(int(first), int(stop), str(until)) for first, stop, until in found]
+    raise ValueError(
+        f"{path / JOB} is damaged: {LOOKS} must be triples of first run, end and "
+        f"until, got {found!r}"
+    )
+
+
+def _job_in(path: Path) -> dict[str, Any]:
     file = path / JOB
     if not file.exists():
         raise ValueError(f"{path} holds no Monte Carlo of slamgym: there is no {JOB}")

@@ -8,13 +8,14 @@ simulates, filters and measures runs in blocks; a worker computes one block at a
 
 from __future__ import annotations
 
+import json
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -22,10 +23,10 @@ from ...arrays import Array
 from ...envs.spaces import count_rows
 from ...estimator import registry
 from ...estimator.interface import SupportsTruth
-from ...estimator.support.argument_checks import usable_cores
+from ...estimator.support.argument_checks import one_of, usable_cores
 from ...evaluation.diagnosis import SMALLEST_NOISE
 from ...sim_configs import Scenario, load_scenario
-from ..jobs import Progress, blocks_of, engage_workers, resume
+from ..jobs import Progress, blocks_at_once, blocks_of, engage_workers, resume
 from ..runs.filter_settings import (
     EstimatorChoice,
     FilterSettings,
@@ -35,8 +36,11 @@ from ..runs.filter_settings import (
 )
 from ..runs.simulated_runs import simulate_runs
 from .filtered_runs import bound_runs, filter_runs, noise_of_runs
+from .looks import DECIDED, Look, Watch, earlier_looks, error_rate_after, verdict_of
 from .results import (
     RESULTS,
+    BlockFolder,
+    Blocks,
     Job,
     add_to_results,
     dataset_of,
@@ -54,6 +58,7 @@ from .run_measures import (
     oracle_of_runs,
     with_known_ids,
 )
+from .verdict import averages_of, runs_to_repeat, scores_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -75,6 +80,7 @@ def monte_carlo(
     runs: int,
     seed: int = 0,
     *,
+    until: str | None = None,
     assumed: Scenario | Mapping[str, object] | str | Path | None = None,
     out: str | Path | None = None,
     jobs: int | None = None,
@@ -102,6 +108,11 @@ def monte_carlo(
     seed : int
         Seed of run 0; run i has ``seed + i``, so seeds closer than ``runs`` share
         worlds.
+    until : "decided", optional
+        Run until there is a verdict on every estimator, at most `runs`. Results end
+        with the block that decides, whatever the number of workers, and equal those of
+        a study with that number of runs. Tests that hold 5 % at all looks together
+        decide; see :mod:`slamgym.evaluation.sequential_tests`.
     assumed : Scenario, mapping, str or Path, optional
         The scenario whose noise the estimators assume; the world's by default.
     out : str or Path, optional
@@ -167,6 +178,8 @@ def monte_carlo(
     seed = integer("seed", seed, 0)
     if not 0 <= resolution < float("inf"):
         raise ValueError(f"resolution must be a number >= 0, got {resolution!r}")
+    if until is not None:
+        one_of("until", until, (DECIDED,))
     job = Job(world, assumed_world, choices, seed, size, float(resolution))
     workers = engage_workers(jobs, backend)
     work = _Work(
@@ -175,38 +188,133 @@ def monte_carlo(
         {choice.name: registry.find_estimator(choice.name) for choice in choices},
         threads=None if workers is None else 1,
     )
-    blocks = blocks_of(asked, size)
-    compute = partial(resume, work, workers=workers, runs=len(asked), progress=progress)
+    study = _Study(
+        job,
+        blocks_of(asked, size),
+        partial(resume, work, workers=workers),
+        until,
+        wave=blocks_at_once(jobs, backend),
+        progress=progress,
+    )
+    factors = LESS_NOISE if small_noise else ()
+    repeat = partial(_repeated, job, factors, jobs=jobs, backend=backend)
     with one_blas_thread():
-        begun = perf_counter()
-        factors = LESS_NOISE if small_noise else ()
-        repeat = partial(_repeated, job, asked, factors, jobs=jobs, backend=backend)
         if out is None:
-            found: dict[range, list[Block]] = {}
-            kept = "nothing is kept without a folder for the results"
-            compute(blocks, found.__setitem__, kept=kept)
-            parts = ((block, found.pop(block)) for block in blocks)
-            whole = dataset_of(job, parts, asked, command)
-            added, told = repeat(perf_counter() - begun, whole)
-            variables = {name: (EACH_RUN, values) for name, values in added.items()}
-            return whole.assign(variables).assign_attrs(told)
-        out = Path(out)
-        with opened(out, job.identity(), fresh=fresh) as folder:
-            kept = f"the finished runs are in {out}, and the same command continues"
-            compute(folder.missing(blocks), folder.add, kept=kept)
-            results = out / RESULTS
-            write_results(results, job, folder.read(blocks, job), asked, command)
-            with load_results(results) as whole:
-                added, told = repeat(perf_counter() - begun, whole)
-            if added:
-                add_to_results(results, added)
-            return load_results(results).assign_attrs(told)
+            return study.in_memory(command, repeat)
+        with opened(Path(out), job.identity(), fresh=fresh) as folder:
+            return study.in_folder(folder, command, repeat)
+
+
+class _Study(NamedTuple):
+    """A job with its runs, computed at once or until it is decided."""
+
+    job: Job
+    blocks: list[range]
+    #: `resume` of the work.
+    compute: Callable[..., None]
+    until: str | None
+    #: How many blocks to compute between looks.
+    wave: int
+    progress: Progress | None
+
+    def in_memory(self, command: str, repeat: Callable[..., Any]) -> xr.Dataset:
+        """Compute the results, and repeat some runs with less noise."""
+        begun = perf_counter()
+        found: dict[range, list[Block]] = {}
+        kept = "nothing is kept without a folder for the results"
+        compute = partial(self.compute, keep=found.__setitem__, kept=kept)
+
+        def stored(span: Sequence[range]) -> Blocks:
+            return ((block, found[block]) for block in span)
+
+        blocks = self._computed(compute, stored, Watch)
+        runs, more = _runs_of(blocks), _attributes(self.until, [])
+        parts = ((block, found.pop(block)) for block in blocks)
+        whole = dataset_of(self.job, parts, runs, command, more)
+        added, told = repeat(runs, perf_counter() - begun, whole)
+        variables = {name: (EACH_RUN, values) for name, values in added.items()}
+        return whole.assign(variables).assign_attrs(told)
+
+    def in_folder(
+        self, folder: BlockFolder, command: str, repeat: Callable[..., Any]
+    ) -> xr.Dataset:
+        """Do the same in a folder, from the blocks that it has."""
+        begun, out, job = perf_counter(), folder.path, self.job
+        kept = f"the finished runs are in {out}, and the same command continues"
+        looks, first = [Look(*each) for each in folder.looks()], self.blocks[0].start
+
+        def compute(span: list[range], **told: Any) -> None:
+            self.compute(folder.missing(span), folder.add, kept=kept, **told)
+
+        def stored(span: Sequence[range]) -> Blocks:
+            return folder.read(span, job)
+
+        rate = error_rate_after([look for look in looks if look.first == first])
+        blocks = self._computed(compute, stored, partial(Watch, rate))
+        runs = _runs_of(blocks)
+        look = Look(first, runs.stop, self.until or "")
+        results, more = (
+            out / RESULTS,
+            _attributes(self.until, earlier_looks(looks, look)),
+        )
+        write_results(results, job, stored(blocks), runs, command, more)
+        with load_results(results) as whole:
+            added, told = repeat(runs, perf_counter() - begun, whole)
+        if added:
+            add_to_results(results, added)
+        folder.keep_look(look)
+        return load_results(results).assign_attrs(told)
+
+    def _computed(
+        self,
+        compute: Callable[..., None],
+        stored: Callable[[Sequence[range]], Blocks],
+        new_watch: Callable[[], Watch],
+    ) -> list[range]:
+        """Compute all blocks, or until every estimator is decided.
+
+        Returns
+        -------
+        list of range
+            The blocks up to the one that decides, which does not depend on how many
+            are computed at a time.
+        """
+        blocks, runs = self.blocks, len(_runs_of(self.blocks))
+        if self.until is None:
+            compute(blocks, runs=runs, progress=self.progress)
+            return blocks
+        watches = [new_watch() for _ in self.job.estimators]
+
+        def advance(done: int, _: int) -> None:
+            if self.progress is not None:
+                self.progress(done, runs)
+
+        for k in range(0, len(blocks), self.wave):
+            span = blocks[k : k + self.wave]
+            until_here = _runs_of(blocks[: k + self.wave])
+            compute(span, runs=len(until_here), progress=advance)
+            for number, (_, parts) in enumerate(stored(span), start=k + 1):
+                for watch, part in zip(watches, parts, strict=True):
+                    watch.add_block(part)
+                if all(watch.decided for watch in watches):
+                    return blocks[:number]
+        return blocks
+
+
+def _attributes(until: str | None, earlier: Sequence[Look]) -> dict[str, str]:
+    """Return what results state about the looks at them."""
+    found = {"until": until} if until else {}
+    return found | ({"looks": json.dumps(earlier)} if earlier else {})
+
+
+def _runs_of(blocks: Sequence[range]) -> range:
+    return range(blocks[0].start, blocks[-1].stop)
 
 
 def _repeated(
     job: Job,
-    asked: range,
     factors: Sequence[float],
+    asked: range,
     seconds: float,
     results: xr.Dataset,
     **engine: Any,
@@ -221,15 +329,14 @@ def _repeated(
         `SMALL_NOISE_SHARE`, the share of the time that this took; ``seconds`` is the
         time of the other runs.
     """
-    from .verdict import averages_of, runs_to_repeat, scores_of  # noqa: PLC0415
-
     begun = perf_counter()
     shape = len(job.estimators), len(asked)
     found: dict[str, Array] = {name: np.full(shape, np.nan) for name in SMALL_NOISE}
     for row, choice in enumerate(job.estimators):
         for factor in factors:
             known = results.assign({k: (EACH_RUN, found[k]) for k in found})
-            count = runs_to_repeat(scores_of(known, choice.label, "invariant"))
+            scores = scores_of(known, choice.label, "invariant")
+            count = runs_to_repeat(scores, verdict_of(scores, "invariant"))
             if not count:
                 break
             small = monte_carlo(
@@ -377,6 +484,8 @@ def python_call(summary: dict[str, Any]) -> str:
         for option in ("block_size", "resolution", "first_run")
         if summary[option]
     ]
+    if until := summary.get("until"):
+        arguments.append(f"until={until!r}")
     note = (
         f"# first save {' and '.join(map(repr, files))}, see below\n" if files else ""
     )

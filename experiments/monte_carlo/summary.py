@@ -24,6 +24,7 @@ from ...evaluation.hypothesis_tests import (
     average_band,
 )
 from ..runs.trace import finite, mean, quotient, root_mean_square
+from .looks import is_sequential, looks_summary, verdict_of
 from .run_measures import (
     ALARM,
     COUNTS,
@@ -36,6 +37,8 @@ from .run_measures import (
 )
 from .verdict import (
     FITTED,
+    NEARLY,
+    NOT_CONSISTENT,
     POINT_FREEDOM,
     POSE_FREEDOM,
     EstimatorScores,
@@ -44,7 +47,6 @@ from .verdict import (
     failure_groups,
     heading_sentence,
     in_degrees,
-    judge,
     labels_of,
     report_of,
     run_warnings,
@@ -81,7 +83,8 @@ def summarise_monte_carlo(
         noise the estimators assume, None where the same), ``seed``, ``runs``,
         ``first_run`` (number or name of the first), ``steps``, ``block_size`` (None
         where unknown), ``resolution`` (of places in scores of association) [m],
-        ``versions``, ``command``; ``frame``; ``knowable_heading_std`` [rad], the
+        ``versions``, ``command``; ``until``, only for a study that was to run until it
+        is decided; ``frame``; ``knowable_heading_std`` [rad], the
         deviation of the heading at the start, below which it cannot fall;
         ``estimators`` by label, see `summarise_estimator`; and ``notes``, the
         warnings of `run_warnings`.
@@ -111,6 +114,7 @@ def summarise_monte_carlo(
         "command": str(attrs.get("command", "")),
         "frame": frame,
         "knowable_heading_std": knowable,
+        **({"until": str(attrs["until"])} if attrs.get("until") else {}),
         "estimators": entries,
         "notes": [
             *json.loads(attrs.get("notes", "[]")),
@@ -141,7 +145,8 @@ def summarise_estimator(
     -------
     dict
         ``verdict`` with ``reason``, ``sentence`` and ``heading_sentence``; ``accepted``
-        and ``decisions`` (None if fewer than 2 runs succeeded), ``sentences``,
+        and ``decisions`` (None if fewer than 2 runs succeeded), ``sentences``; for a
+        study that grows ``sequential``, see :func:`.looks.looks_summary`;
         ``warnings``; ``good_runs``, ``failed_runs``, ``failure_groups`` (see
         :func:`.verdict.failure_groups`); by frame ``pose_nees`` and its
         share of steps inside the 95 % band, and ``position_nees``;
@@ -162,15 +167,19 @@ def summarise_estimator(
     claimed = found["heading_std_end"]["claimed"]
     decides = scores.good.sum() > 1 and not scores.is_fitted
     report = report_of(scores, frame) if decides else None
-    verdict = FITTED
-    if not scores.is_fitted:
-        verdict = judge(report, len(scores.failures), len(scores.good))
+    verdict = FITTED if scores.is_fitted else verdict_of(scores, frame)
+    accepted = report and report.accepted
+    sequential: dict[str, Any] = {}
+    if report and is_sequential(scores):
+        accepted = verdict.word not in (NOT_CONSISTENT, NEARLY) and not scores.failures
+        sequential["sequential"] = looks_summary(scores, frame)
     return {
         "verdict": verdict.word,
         "reason": verdict.reason,
         "sentence": verdict_sentence(scores.label, verdict),
         "heading_sentence": heading_sentence(claimed, knowable),
-        "accepted": report and report.accepted,
+        "accepted": accepted,
+        **sequential,
         "decisions": report and decisions_table(report),
         "sentences": list(report.sentences()) if report else [],
         "warnings": list(report.warnings()) if report else [],

@@ -101,7 +101,11 @@ def judge(report: ConsistencyReport | None, failed: int, runs: int) -> Verdict:
         good = f"{runs - failed} of {counted(runs, 'run')} succeeded"
         reason = f"{good}: too few to decide"
         return Verdict(NOT_SHOWN, reason)
-    verdict = _verdict_on_successes(report)
+    return with_failures(_verdict_on_successes(report), failed, runs)
+
+
+def with_failures(verdict: Verdict, failed: int, runs: int) -> Verdict:
+    """Turn a verdict on the runs that succeeded into one on all runs."""
     if not failed:
         return verdict
     word = verdict.word if verdict.word == NOT_CONSISTENT else NOT_SHOWN
@@ -225,6 +229,25 @@ def _refusal(report: ConsistencyReport) -> str:
         return ""
     cautious = ": the filter is too cautious" if max(ratios) < 1 else ""
     return f"the squared errors of the pose are {what} ({p_text(p_value)}){cautious}"
+
+
+def squared_errors(report: ConsistencyReport) -> str:
+    """Write the ratios at the end, over all steps, and at the worst step of the grid.
+
+    The errors of a filter that is rejected may be wrong at some steps only.
+    """
+    ratios = report.final_step.statistic, report.time_average.statistic
+    end, average = map(_number, ratios)
+    worst = int(abs(np.log(np.maximum(report.family.statistic, 1e-300))).argmax())
+    step, ratio = report.family_steps[worst] + 1, float(report.family.statistic[worst])
+    cautious = ": the filter is too cautious" if max(*ratios, ratio) < 1 else ""
+    amounts = f"{end} times what the covariances state at the end"
+    if step < report.family_steps[-1] + 1:
+        amounts += f", {_number(ratio)} times at step {step}"
+    return (
+        f"the squared errors of the pose are {amounts} and {average} times over all "
+        f"steps{cautious}"
+    )
 
 
 def _is_near_everywhere(report: ConsistencyReport) -> bool:
@@ -506,15 +529,13 @@ def _small_noise(scores: EstimatorScores, frame: ErrorFrame) -> SmallNoise | Non
     return found
 
 
-def runs_to_repeat(scores: EstimatorScores) -> int:
+def runs_to_repeat(scores: EstimatorScores, verdict: Verdict) -> int:
     """Return how many of all runs to repeat with less noise, 0 if that shows nothing.
 
     See :class:`~slamgym.evaluation.diagnosis.Diagnosis`.
     """
     if scores.good.sum() < FEWEST_RUNS:
         return 0
-    report = report_of(scores, "invariant")
-    verdict = judge(report, len(scores.failures), len(scores.good))
     count = diagnosis_of(scores, "invariant", verdict).repeat
     return int(np.flatnonzero(scores.good)[count - 1]) + 1 if count else 0
 

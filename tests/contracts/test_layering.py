@@ -65,6 +65,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         run_measures
         results
         verdict
+        looks
         runner
         summary
         figures

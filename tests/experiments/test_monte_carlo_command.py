@@ -190,3 +190,23 @@ def test_a_filter_of_ones_own_that_is_not_consistent_is_checked(here, monkeypatc
     entries = json.loads(file.read_text())["estimators"]
     assert ["check" in entry for entry in entries.values()] == [False, True, False]
     assert len(entries["careless:Careless"]["check"]) <= 2
+
+
+def test_a_study_until_decided_stops_and_states_its_runs_and_evidence(here):
+    result = slamgym(
+        *("monte-carlo", "six_landmarks", "-e", "ekf", "--runs", 64),
+        *("--until", "decided", "--block-size", 16, "--out", "out", "--json"),
+    )
+    assert result.exit_code == 0, result.stderr
+    summary = json.loads(result.stdout)
+    found = summary["estimators"]["ekf"]
+    assert summary["runs"] < 64
+    assert summary["until"] == "decided"
+    assert found["verdict"] == "not consistent"
+    assert found["sequential"]["rejected_after"] <= summary["runs"]
+    assert "an anytime-valid test rejects it (e " in found["sentence"]
+
+
+def test_a_misspelt_until_is_told():
+    message = refused("monte-carlo", "six_landmarks", "--until", "done")
+    assert "until must be 'decided'" in message

@@ -1,6 +1,10 @@
 """Results of Monte Carlo that the tests of summaries, reports and figures share."""
 
 import functools
+import json
+
+import numpy as np
+import xarray as xr
 
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.sim_configs import load_scenario
@@ -33,3 +37,26 @@ def with_failures(dataset, failures):
         changed["failed_at"].loc[row] = step
         changed["message"].loc[row] = message
     return changed
+
+
+def simulated(nees, looks=(), failed=()):
+    """Results of an estimator "mine" that has NEES, (runs, steps), and nothing else."""
+    runs, steps = nees.shape
+    flags = np.isin(np.arange(runs), failed)
+    over_time = {
+        "pose_nees_invariant": np.insert(nees, 0, np.nan, axis=1),
+        "nis": np.zeros((runs, steps + 1)),
+        "nis_dof": np.zeros((runs, steps + 1), dtype=np.int64),
+    }
+    per_run = {
+        "failed": flags,
+        "failed_at": np.where(flags, 1, -1),
+        "message": np.where(flags, "boom", "").astype(object),
+    }
+    dims = "estimator", "run", "step"
+    return xr.Dataset(
+        {name: (dims, values[None]) for name, values in over_time.items()}
+        | {name: (dims[:2], values[None]) for name, values in per_run.items()},
+        {"estimator": ["mine"], "run": np.arange(runs)},
+        {"looks": json.dumps(looks)} if looks else {},
+    )

@@ -1,0 +1,205 @@
+"""Verdicts on a study that grows hold 5 % at all looks together."""
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+from monte_carlo_dataset import simulated
+from scipy import stats
+
+from slamgym.evaluation.hypothesis_tests import EQUIVALENCE_MARGIN
+from slamgym.experiments.monte_carlo import (
+    load_results,
+    monte_carlo,
+    summarise_monte_carlo,
+)
+from slamgym.experiments.monte_carlo.looks import Look, Watch, verdict_of
+from slamgym.experiments.monte_carlo.runner import python_call
+from slamgym.experiments.monte_carlo.verdict import scores_of
+
+JOB = {"scenario": "six_landmarks", "estimators": "ekf,invariant", "block_size": 16}
+MOST = 160
+
+
+def honest(rng, runs, steps=12, memory=0.9):
+    error, nees = rng.standard_normal((runs, 3)), []
+    for _ in range(steps):
+        fresh = rng.standard_normal((runs, 3))
+        error = memory * error + np.sqrt(1 - memory**2) * fresh
+        nees.append((error**2).sum(axis=1))
+    return np.stack(nees, axis=1)
+
+
+def verdict(nees, *looks, failed=()):
+    results = simulated(nees, [Look(0, runs, until) for runs, until in looks], failed)
+    return verdict_of(scores_of(results, "mine", "invariant"), "invariant")
+
+
+@pytest.fixture(scope="module")
+def decided():
+    return monte_carlo(**JOB, runs=MOST, until="decided")
+
+
+# run until decided
+
+
+def test_a_study_until_decided_ends_with_the_block_that_decides(decided):
+    runs = decided.sizes["run"]
+    assert 30 <= runs < MOST
+    assert runs % JOB["block_size"] == 0
+    entries = summarise_monte_carlo(decided)["estimators"]
+    assert entries["ekf"]["verdict"] == "not consistent"
+    assert entries["invariant"]["verdict"] == "consistent"
+    after = entries["invariant"]["sequential"]["shown_after"]
+    assert runs - JOB["block_size"] < after <= runs
+    assert f"after {after} runs" in entries["invariant"]["sentence"]
+    assert "e = " in entries["invariant"]["sentence"]
+
+
+def test_its_results_are_those_of_a_study_of_as_many_runs(decided):
+    xr.testing.assert_equal(decided, monte_carlo(**JOB, runs=decided.sizes["run"]))
+
+
+def test_it_runs_the_same_runs_with_any_number_of_workers(decided):
+    for jobs in (2, 3):
+        found = monte_carlo(
+            **JOB, runs=MOST, until="decided", jobs=jobs, backend="threading"
+        )
+        xr.testing.assert_identical(found, decided)
+
+
+def test_an_interrupted_study_until_decided_continues(decided, tmp_path):
+    def stop(done, _):
+        if done >= 32:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        monte_carlo(**JOB, runs=MOST, until="decided", out=tmp_path, progress=stop)
+    assert "looks" not in json.loads((tmp_path / "job.json").read_text("utf-8"))
+    told = []
+    with monte_carlo(
+        **JOB,
+        runs=MOST,
+        until="decided",
+        out=tmp_path,
+        progress=lambda *done: told.append(done),
+    ) as found:
+        xr.testing.assert_equal(found, decided)
+        assert found.attrs["until"] == "decided"
+        assert "looks" not in found.attrs
+    assert {most for _, most in told} == {MOST}
+    assert told[0] == (16, MOST)
+
+
+def test_a_study_that_is_not_decided_ends_with_its_runs():
+    found = monte_carlo(**JOB, runs=20, until="decided")
+    assert found.sizes["run"] == 20
+    entry = summarise_monte_carlo(found)["estimators"]["invariant"]
+    assert entry["verdict"] == "not shown"
+    assert "30 runs at least are needed" in entry["sentence"]
+
+
+def test_the_python_call_of_a_study_until_decided_repeats_it(decided):
+    assert "until='decided'" in python_call(summarise_monte_carlo(decided))
+
+
+def test_a_misspelt_until_is_refused():
+    with pytest.raises(ValueError, match="until must be 'decided'"):
+        monte_carlo(**JOB, runs=4, until="done")
+
+
+def test_runs_that_all_fail_are_not_repeated_for_ever():
+    watch = Watch()
+    watch.update(np.full((16, 5), np.nan), np.zeros(16, dtype=bool), 1)
+    assert not watch.decided
+    watch.update(np.full((16, 5), np.nan), np.zeros(16, dtype=bool), 1)
+    assert watch.decided
+
+
+def test_a_watch_counts_failed_runs_in_the_number_after_which_it_decides():
+    nees = np.insert(100 * honest(np.random.default_rng(0), 10), 0, np.nan, axis=1)
+    watch = Watch()
+    watch.update(nees, np.arange(10) >= 4, 1)
+    assert watch.rejected_after == 5
+
+
+# extend a folder
+
+
+def test_a_first_verdict_is_that_of_a_study_without_a_folder(tmp_path):
+    with monte_carlo(**JOB, runs=32, out=tmp_path) as found:
+        first = summarise_monte_carlo(found)
+    assert first == summarise_monte_carlo(monte_carlo(**JOB, runs=32))
+    assert "sequential" not in first["estimators"]["ekf"]
+
+
+def test_a_folder_counts_its_looks_and_a_repeated_one_once(tmp_path):
+    for runs in (16, 32, 32, 48):
+        monte_carlo(**JOB, runs=runs, out=tmp_path).close()
+    entry = summarise_monte_carlo(load_results(tmp_path))["estimators"]["invariant"]
+    assert entry["sequential"]["earlier_looks"] == [16, 32]
+    assert "look 3, after verdicts on 16 and 32 runs" in entry["sentence"]
+    with monte_carlo(**JOB, runs=48, out=tmp_path) as again:
+        assert summarise_monte_carlo(again)["estimators"]["invariant"] == entry
+    with monte_carlo(**JOB, runs=48, out=tmp_path, fresh=True) as fresh:
+        assert "looks" not in fresh.attrs
+
+
+@pytest.mark.parametrize("damaged", ["3", '[[0, "x", ""]]', "[[1, 2]]", "null"])
+def test_damaged_looks_are_refused_in_one_sentence(damaged, tmp_path):
+    monte_carlo(**JOB, runs=4, out=tmp_path).close()
+    file = tmp_path / "job.json"
+    table = json.loads(file.read_text("utf-8")) | {"looks": json.loads(damaged)}
+    file.write_text(json.dumps(table), encoding="utf-8")
+    with pytest.raises(ValueError, match=r"job\.json is damaged: looks must be"):
+        monte_carlo(**JOB, runs=8, out=tmp_path)
+
+
+def test_an_honest_folder_that_is_extended_five_times_is_rarely_refused():
+    rng, refused, sizes = np.random.default_rng(12), 0, (20, 30, 45, 70, 100, 150)
+    studies = 120
+    for _ in range(studies):
+        nees = honest(rng, sizes[-1])
+        looks = [(runs, "") for runs in sizes[:-1]]
+        word = verdict(nees, *looks).word
+        refused += word in ("not consistent", "nearly consistent")
+    assert stats.binom.sf(refused - 1, studies, 0.05) > 1e-3
+
+
+def test_a_first_verdict_that_rejects_stands_however_many_runs_agree():
+    nees = honest(np.random.default_rng(6), 400)
+    nees[:25] *= 1.3
+    assert verdict(nees[:25]).word == "not consistent"
+    found = verdict(nees, (25, ""))
+    assert found.word == "nearly consistent"
+    assert "the first verdict, after 25 runs, rejected it" in found.reason
+    assert verdict(nees, (25, "decided")).word == "consistent"
+
+
+def test_a_wrong_filter_is_rejected_by_a_later_verdict():
+    nees = 1.4 * honest(np.random.default_rng(6), 200)
+    found = verdict(nees, (4, ""), (8, ""))
+    assert found.word == "not consistent"
+    assert "an anytime-valid test rejects it (e " in found.reason
+
+
+def test_a_rejection_counts_more_than_an_acceptance():
+    rng = np.random.default_rng(7)
+    nees = np.concatenate([honest(rng, 150), 1.6 * honest(rng, 250)])
+    assert verdict(nees[:150], (10, "decided")).word == "consistent"
+    assert verdict(nees, (10, "decided")).word == "not consistent"
+
+
+def test_failed_runs_forbid_consistency_at_later_looks_too():
+    nees = honest(np.random.default_rng(8), 200)
+    found = verdict(nees, (50, ""), failed=[3])
+    assert found.word == "not shown"
+    assert found.reason.startswith("1 of 200 runs failed; of the others, after ")
+
+
+def test_the_interval_in_the_sentence_is_inside_the_margin_if_it_says_so():
+    found = verdict(honest(np.random.default_rng(9), 300), (40, ""))
+    low, high = map(float, found.reason.split("[")[1].split("]")[0].split(","))
+    assert EQUIVALENCE_MARGIN.low <= low < high <= EQUIVALENCE_MARGIN.high
+    assert "lies inside" in found.reason
