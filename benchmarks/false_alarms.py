@@ -98,8 +98,8 @@ def main() -> None:
         print(f"| {name} | " + " | ".join(f"{rate:.1%}" for rate in rates) + " |")
 
 
-MOST, LOOKS, CHUNK, FEW = 400, (50, 100, 200, 400), 50, 400
-RATIOS = 1.0, 0.8, 1.25, 0.5, 1.5, 2.0
+MOST, LOOKS, CHUNK, FEW = 400, (50, 100, 200, 400), 50, 200
+RATIOS = 1.0, 1.25, 0.8, 0.5, 1.5, 2.0
 
 
 def watched(nees: Array) -> Watch:
@@ -140,7 +140,7 @@ def column(rng: np.random.Generator, noise: float) -> dict[str, str]:
     plain: list[bool] = []
     for _ in range(REPETITIONS // CHUNK):
         for nees, nis in zip(*scores(rng, noise, (CHUNK, MOST)), strict=True):
-            for ratio in RATIOS[: 3 if len(first) >= FEW else None]:
+            for ratio in RATIOS[: 2 if len(first) >= FEW else None]:
                 watches[ratio].append(watched(ratio * nees))
             verdicts = [
                 p_value(nees, nis, n) for n in LOOKS[: 1 if len(first) >= FEW else None]

@@ -2,6 +2,7 @@
 
 ``trajectory_error``, ``nees`` and ``association_scores`` measure, and ``error_bound``
 computes the least possible error.  ``hypothesis_tests`` tests with known error rates,
+``sequential_tests`` does so at every look at a growing study,
 ``noise_findings`` tests the noise of a world, and ``diagnosis`` names the cause of an
 inconsistency.  ``consistency_report`` collects the tests on one filter.
 """
@@ -56,6 +57,9 @@ if TYPE_CHECKING:
     from .nees import relative_map_nees as relative_map_nees
     from .nees import state_nees as state_nees
     from .noise_findings import noise_sums as noise_sums
+    from .sequential_tests import ConfidenceSequence as ConfidenceSequence
+    from .sequential_tests import EProcess as EProcess
+    from .sequential_tests import average_of as average_of
     from .trajectory_error import Alignment as Alignment
     from .trajectory_error import LandmarkDistances as LandmarkDistances
     from .trajectory_error import PositionAccuracy as PositionAccuracy

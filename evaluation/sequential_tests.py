@@ -76,6 +76,16 @@ class EProcess:
         array([-0.7,  7.3, 17. ])
         """
         values = np.asarray(nees, dtype=np.float64)
+        if values.ndim != 2 or not np.isfinite(values).all():
+            raise ValueError(
+                "nees must be finite numbers of shape (runs, steps), "
+                f"got shape {values.shape}"
+            )
+        if self._logs is not None and values.shape[1] != len(self._logs):
+            raise ValueError(
+                f"nees must have the {len(self._logs)} steps of earlier runs, "
+                f"got {values.shape[1]}"
+            )
         freedom = np.broadcast_to(degrees_of_freedom, len(values))[:, None, None]
         gains = np.asarray(
             -0.5 * (freedom * np.log(SCALES) + values[:, :, None] * (1 / SCALES - 1))
@@ -83,8 +93,10 @@ class EProcess:
         if self._logs is None:
             self._logs = np.zeros(gains.shape[1:])
         logs = np.cumsum(np.concatenate([self._logs[None], gains]), axis=0)
-        self._logs = logs[-1]
-        return np.asarray(logsumexp(logs[1:], axis=(1, 2)) - np.log(logs[0].size))
+        self._logs = logs[-1].copy()  # a view would keep all of them
+        flat = logs[1:].reshape(len(values), -1)
+        top = flat.max(axis=1, initial=-np.inf)
+        return np.asarray(top + np.log(np.exp(flat - top[:, None]).mean(axis=1)))
 
 
 def average_of(logs: Sequence[Array], weights: Sequence[float] | None = None) -> Array:
@@ -136,9 +148,14 @@ class ConfidenceSequence:
         low, high : ndarray, shape (M,)
         """
         values = np.asarray(ratios, dtype=np.float64)
+        if values.ndim != 1 or not np.all((values >= 0) & np.isfinite(values)):
+            raise ValueError(
+                "ratios must be finite numbers >= 0 of shape (runs,), "
+                f"got shape {values.shape}"
+            )
         powers = np.stack([np.ones_like(values), values, values**2], axis=1)
         sums = np.cumsum(np.concatenate([self._sums, powers]), axis=0)
-        self._sums = sums[-1:]
+        self._sums = sums[-1:].copy()
         runs, total, squares = sums[1:].T
         mean = total / runs
         variance = np.maximum(squares / runs - mean**2, 0.0)

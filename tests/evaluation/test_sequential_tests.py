@@ -124,3 +124,22 @@ def test_a_confidence_sequence_shows_nothing_with_few_or_zero_numbers():
     assert np.all(np.isinf(high[:-1]))
     assert low[-1] == high[-1] == 1
     assert not shown(np.zeros(50))
+
+
+@pytest.mark.parametrize("nees", [[3.0, 3.0], [[np.nan, 3.0]], [[np.inf, 3.0]]])
+def test_evidence_from_numbers_that_are_not_finite_is_refused(nees):
+    with pytest.raises(ValueError, match="nees must be finite numbers of shape"):
+        EProcess().update(nees, 3)
+
+
+def test_evidence_from_other_steps_than_before_is_refused():
+    evidence = EProcess()
+    evidence.update(np.full((2, 10), 3.0), 3)
+    with pytest.raises(ValueError, match="the 10 steps of earlier runs, got 4"):
+        evidence.update(np.full((2, 4), 3.0), 3)
+
+
+@pytest.mark.parametrize("ratios", [[[1.0]], [-1.0], [np.nan]])
+def test_a_confidence_sequence_of_other_than_ratios_is_refused(ratios):
+    with pytest.raises(ValueError, match="ratios must be finite numbers >= 0"):
+        ConfidenceSequence().update(ratios)
