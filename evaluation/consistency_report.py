@@ -18,6 +18,7 @@ from ..estimator.models.rigid_motion import ErrorFrame
 from ..estimator.support import argument_checks
 from ..suggestions import counted
 from . import hypothesis_tests as tests
+from . import map_consistency
 
 #: Number of runs below which the report warns that it finds large errors only.
 FEW_RUNS = 20
@@ -27,6 +28,7 @@ FACTORS = (1.1, 1.2, 1.5)
 _GRID = 10
 _LAGS = 10
 _ERROR_RATE = 0.05
+_DECIDING = 3  # final step, time averages and grid
 _MOST_NAMES = 10
 #: The outcome of a test without data.
 _NOTHING = tests.HypothesisTest(np.nan, tests.Band(np.nan, np.nan), np.nan, _ERROR_RATE)
@@ -71,6 +73,8 @@ class ConsistencyReport:
     ratio_of_others: float
     #: (factor, number of runs with which the final step finds it in 90 % of cases).
     runs_needed: tuple[tuple[float, int], ...]
+    #: Of the maps at the end; None where the pose alone is tested.
+    map: map_consistency.MapReport | None = None
 
     def __repr__(self) -> str:
         return (
@@ -83,11 +87,12 @@ class ConsistencyReport:
 
     @property
     def accepted(self) -> bool:
-        """Whether no run failed and no NEES test rejects.
+        """Whether no run failed and no NEES test rejects, of the pose or of the map.
 
         A consistent filter is rejected in at most 5 % of cases.
 
-        The final step, the time averages and the grid share the 5 % (Bonferroni).
+        The final step, the time averages and the grid share the 5 % (Bonferroni), or
+        4.5 % if the tests of the map use .5 %.
         Below 10 runs the time averages do not count, because their test is not exact.
         NIS does not count: pooled over 10⁵ scans it rejects deviations of a few
         thousandths, which say nothing about the errors.  The bootstrap does not count,
@@ -97,9 +102,23 @@ class ConsistencyReport:
 
     @property
     def p_value(self) -> float:
-        """p-value of final step, time averages and grid together (Bonferroni)."""
+        """p-value of all tests that decide, together: those of pose and map."""
+        if self.map is None:
+            return self.pose_p_value
+        of_map = self.map.p_value * _ERROR_RATE / map_consistency.ERROR_RATE
+        return min(self.pose_p_value, of_map)
+
+    @property
+    def pose_p_value(self) -> float:
+        """p-value of final step, time averages and grid, to compare with 5 %."""
         p = (self.final_step.p_value, self.average_p_value, self.family.p_value)
-        return min(p) * len(p)
+        return min(p) * _ERROR_RATE / self.deciding_rate
+
+    @property
+    def deciding_rate(self) -> float:
+        """Share of the error rate of each of the three tests of the pose."""
+        of_map = 0.0 if self.map is None else map_consistency.ERROR_RATE
+        return (_ERROR_RATE - of_map) / _DECIDING
 
     @property
     def used_runs(self) -> int:
@@ -143,6 +162,7 @@ class ConsistencyReport:
             f"{grid.interval.high:.3f}]: {_outcome(grid.accepted)} "
             f"(rejects a consistent filter in at most {grid.error_rate:.0%}).",
             *(() if self.nis is _NOTHING else innovations),
+            *(() if self.map is None else (self.map.sentence(),)),
             f"Equivalence, {frame}: the 90 % interval of the ratio is "
             f"[{near.interval.low:.3f}, {near.interval.high:.3f}]; inside "
             f"[{low:g}, {high:g}]: {near.verdict} (claims consistency wrongly in at "
@@ -162,6 +182,10 @@ def evaluate_consistency(
     dof: int = 3,
     frame: ErrorFrame,
     rng: np.random.Generator,
+    landmarks: ArrayLike | None = None,
+    map_nees: ArrayLike | None = None,
+    map_dof: ArrayLike | None = None,
+    landmark_nees: ArrayLike | None = None,
 ) -> ConsistencyReport:
     """Test on many independent runs whether a filter is consistent.
 
@@ -179,6 +203,9 @@ def evaluate_consistency(
         Error coordinates of the NEES.
     rng : numpy.random.Generator
         Draws the bootstrap.
+    landmarks, map_nees, map_dof, landmark_nees : array_like, optional
+        Of the final maps, see :func:`.map_consistency.map_test`. Without ``landmarks``,
+        the pose alone is tested.
 
     Raises
     ------
@@ -188,6 +215,15 @@ def evaluate_consistency(
     argument_checks.one_of("frame", frame, ("additive", "invariant"))
     scores, scans, freedom = _same_shape(nees, nis, nis_dof)
     first, failed = _gaps(scores, scans, freedom)
+    maps = None
+    if landmarks is not None:
+        maps = map_consistency.map_test(
+            np.asarray(landmarks)[~failed],
+            *(
+                None if part is None else np.asarray(part)[~failed]
+                for part in (map_nees, map_dof, landmark_nees)
+            ),
+        )
     scores, scans, freedom = scores[~failed, first:], scans[~failed], freedom[~failed]
     averages = scores.mean(axis=1)
     steps = np.linspace(0, scores.shape[1] - 1, _GRID + 1).round()[1:]
@@ -216,6 +252,7 @@ def evaluate_consistency(
         deciding_runs=deciding,
         ratio_of_others=others,
         runs_needed=_runs_needed(dof),
+        map=maps,
     )
 
 

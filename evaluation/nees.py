@@ -26,6 +26,7 @@ from ..estimator.support.argument_checks import one_of
 #: Conditional variance, as a share of the variance, below which it counts as zero.
 SINGULAR = 1e-10
 
+_ROUNDING = 1e-9  # of eigenvalues of correlations, per row
 _FEW = 4  # up to this size, all covariances are factored together
 
 
@@ -47,12 +48,33 @@ def normalised_squared_error(errors: Array, covariances: Array) -> Array:
     >>> normalised_squared_error(np.array([[2.0, 0.0]]), np.array([np.eye(2) * 4]))
     array([1.])
     """
+    return np.asarray((whitened(errors, covariances) ** 2).sum(axis=-1))
+
+
+def whitened(errors: Array, covariances: Array) -> Array:
+    """Return w with wᵀ w = eᵀ P⁻¹ e, whose covariance is I if P is correct.
+
+    Parameters
+    ----------
+    errors : ndarray, shape (..., n)
+    covariances : ndarray, shape (..., n, n)
+
+    Returns
+    -------
+    ndarray, shape (..., n)
+        nan where a covariance is singular or anything is nan.
+
+    Examples
+    --------
+    >>> whitened(np.array([2.0, 0.0]), np.eye(2) * 4)
+    array([1., 0.])
+    """
     std = np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0))
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         scaled = errors / std
         correlations = covariances / std[..., :, None] / std[..., None, :]
         whiten = _whiten_few if errors.shape[-1] <= _FEW else _whiten_each
-        return np.asarray((whiten(scaled, correlations) ** 2).sum(axis=-1))
+        return whiten(scaled, correlations)
 
 
 def pose_nees(
@@ -161,19 +183,78 @@ def relative_map_nees(true_states: Array, means: Array, covariances: Array) -> A
     -------
     ndarray, shape (...)
     """
+    return normalised_squared_error(*_relative_map(true_states, means, covariances))
+
+
+def relative_landmark_deviations(
+    true_states: Array, means: Array, covariances: Array
+) -> Array:
+    """Return the whitened error of each landmark, as seen from the robot.
+
+    ::
+
+        w = L⁻¹ R(θ̂) (m − m̂),   L Lᵀ = R(θ̂) P R(θ̂)ᵀ,   P the covariance of m − m̂
+
+    with m as in :func:`relative_map_nees`. The axes are those of the map. If the
+    covariances are correct, w has the mean 0 and the covariance I, and its square is
+    the NEES of the landmark, 2 degrees of freedom.
+
+    Parameters
+    ----------
+    true_states, means, covariances
+        As in :func:`state_nees`.
+
+    Returns
+    -------
+    ndarray, shape (..., n, 2)
+        nan where the covariance of a landmark is singular.
+    """
+    errors, claimed = _relative_map(true_states, means, covariances)
+    rows = np.arange(errors.shape[-1]).reshape(-1, 2)
+    turn = np.swapaxes(_rotations(-means[..., 2]), -1, -2)[..., None, :, :]
+    blocks = turn @ claimed[..., rows[:, :, None], rows[:, None, :]]
+    blocks = blocks @ np.swapaxes(turn, -1, -2)
+    return whitened(np.einsum("...ij,...j->...i", turn, errors[..., rows]), blocks)
+
+
+def is_indefinite(covariance: Array) -> bool:
+    """Whether a finite matrix (n, n) has an eigenvalue that rounding cannot explain.
+
+    Examples
+    --------
+    >>> is_indefinite(np.diag([1.0, -1.0])), is_indefinite(np.diag([1.0, 0.0]))
+    (True, False)
+    """
+    if not np.isfinite(covariance).all():
+        return False
+    std = np.sqrt(abs(np.diagonal(covariance)))
+    std[std == 0] = 1.0
+    least = np.linalg.eigvalsh(covariance / std[:, None] / std)[0]
+    return bool(least < -_ROUNDING * len(std))
+
+
+def _relative_map(
+    true_states: Array, means: Array, covariances: Array
+) -> tuple[Array, Array]:
+    """Return the errors of the map in the robot's frame, and their covariance."""
     local = _landmarks_from_robot(means)
     errors = _landmarks_from_robot(true_states) - local
     n = errors.shape[-1] // 2
-    cos, sin = np.cos(means[..., 2]), np.sin(means[..., 2])
-    turn = np.stack([cos, sin, -sin, cos], axis=-1).reshape(*cos.shape, 2, 2)
-    jacobian = np.zeros((*cos.shape, 2 * n, 3 + 2 * n))
+    turn = _rotations(-means[..., 2])
+    jacobian = np.zeros((*turn.shape[:-2], 2 * n, 3 + 2 * n))
     for row in range(0, 2 * n, 2):
         jacobian[..., row : row + 2, :2] = -turn
         jacobian[..., row : row + 2, 3 + row : 5 + row] = turn
     jacobian[..., 0::2, 2] = local[..., 1::2]
     jacobian[..., 1::2, 2] = -local[..., 0::2]
     claimed = jacobian @ covariances @ np.swapaxes(jacobian, -1, -2)
-    return normalised_squared_error(errors, claimed)
+    return errors, claimed
+
+
+def _rotations(angles: Array) -> Array:
+    """Return R(φ) = [cos φ, −sin φ; sin φ, cos φ], shape (..., 2, 2)."""
+    cos, sin = np.cos(angles), np.sin(angles)
+    return np.stack([cos, -sin, sin, cos], axis=-1).reshape(*cos.shape, 2, 2)
 
 
 def _whiten_few(errors: Array, correlations: Array) -> Array:

@@ -21,7 +21,7 @@ from ..estimator.filters.batch import BatchTrace
 from ..estimator.models.rigid_motion import pose_rotation
 from ..estimator.support import argument_checks
 from ..evaluation.error_bound import PosteriorBound
-from ..evaluation.nees import normalised_squared_error
+from ..evaluation.nees import normalised_squared_error, whitened
 from ..evaluation.noise_findings import CHANNELS, MOMENTS
 from ..evaluation.trajectory_error import Alignment, align_positions, poses_at
 from ..sim_configs.scenario_files import scenario_text
@@ -44,6 +44,7 @@ from .monte_carlo.run_measures import (
     VARIABLES,
     Block,
     by_id,
+    deviations_by_id,
     measure_landmarks,
     measure_runs,
     write_failures,
@@ -67,6 +68,9 @@ _NO_BOUND = PosteriorBound(_UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN)
 NO_FILE = "there is no file of estimates"
 _AT_ONCE = 100  # drives in memory
 _ON_TIME = 0.01  # of a step
+#: Second-order error of a landmark by the heading, as a share of its deviation, up to
+#: which its NEES counts as χ².
+_BEND = 0.2
 _SYMMETRIC = 1e-6  # relative difference of two entries
 _INDEFINITE = -1e-9  # eigenvalue of correlations
 _NEAR = 1.5  # a mean NEES / 3 that an honest study may have
@@ -493,7 +497,10 @@ def _measured(
     for run, each in enumerate(files):
         if isinstance(each, str) or run in failures:
             continue
-        if problem := _add_map(block, run, chunk.runs, each, moved[run, -1]):
+        problem = _add_map(
+            block, run, chunk.runs, each, moved[run, -1], additive[run, 0, 2, 2], align
+        )
+        if problem:
             failures[run] = Failure(steps - 1, problem)
     write_failures(block, failures)
     return _Part(block, (truth, poses, claims, chunk.runs.initial_poses))
@@ -581,9 +588,20 @@ def _fitted(positions: Array, truth: Array) -> Alignment:
 
 
 def _add_map(
-    block: Block, run: int, runs: SimulatedRuns, estimate: Estimate, pose: Array
+    block: Block,
+    run: int,
+    runs: SimulatedRuns,
+    estimate: Estimate,
+    pose: Array,
+    heading_variance: float,
+    align: Any,
 ) -> str:
-    """Measure the final map of a run into its block; return why it is none."""
+    """Measure the final map of a run into its block; return why it is none.
+
+    The files hold no covariances between pose and map. So the verdict covers the
+    landmarks in the frame of the map, unless the heading of the start is so uncertain
+    that it bends their errors, whose NEES then is not χ².
+    """
     ids, count = estimate.landmark_ids.tolist(), runs.landmarks.shape[1]
     if not ids or not count:
         return ""
@@ -596,6 +614,12 @@ def _add_map(
     squares = normalised_squared_error(truth[ids] - estimate.landmarks, claims)
     measured["landmark_nees_additive"] = by_id(squares, ids, count)
     measured["landmark_mahalanobis"] = np.sqrt(measured["landmark_nees_additive"])
+    if align is None:
+        bend = np.hypot(*(truth[ids] - estimate.poses[0, :2]).T) * heading_variance
+        least = np.sqrt(np.maximum(np.linalg.eigvalsh(claims)[:, 0], 0.0))
+        rows = np.flatnonzero(bend <= _BEND * least)
+        deviations = whitened(truth[ids][rows] - estimate.landmarks[rows], claims[rows])
+        measured |= deviations_by_id(deviations, [ids[row] for row in rows], count)
     for name, value in measured.items():
         block[name][run] = value
     return ""

@@ -170,7 +170,8 @@ def load_results(path: str | Path) -> xr.Dataset:
             f"{file} is truncated, or holds no results: {error}; if the folder "
             "blocks is beside it, repeat the command: it makes the file again"
         ) from error
-    lacking = sorted(set(run_measures.VARIABLES) - set(results.variables))
+    needed = set(run_measures.VARIABLES) - set(run_measures.DEVIATIONS)  # newer
+    lacking = sorted(needed - set(results.variables))
     if lacking:
         results.close()
         raise ValueError(f"{file} is no result of a Monte Carlo: no {lacking[0]}")

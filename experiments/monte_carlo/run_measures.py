@@ -5,6 +5,7 @@ hidden identities, a run is bad if it fails, or if its path error is more than `
 above that of the same filter with known identities on the same readings.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -79,8 +80,12 @@ VARIABLES: dict[str, Variable] = {
     "state_nees_invariant": Variable(RUN, "f8", "final NEES of pose and map"),
     "state_nees_additive": Variable(RUN, "f8", "final NEES of pose and map"),
     "state_dof": Variable(RUN, "i8", "its degrees of freedom"),
-    "relative_map_nees": Variable(RUN, "f8", "final NEES of the map from the robot"),
+    "relative_map_nees": Variable(
+        RUN, "f8", "final NEES of the map from the robot, infinite if indefinite"
+    ),
     "relative_map_dof": Variable(RUN, "i8", "its degrees of freedom"),
+    "landmark_deviation_x": Variable(LANDMARK, "f8", "whitened error from the robot"),
+    "landmark_deviation_y": Variable(LANDMARK, "f8", "whitened error from the robot"),
     "landmark_rmse": Variable(RUN, "f8", "final RMS map error, not aligned [m]"),
     "landmark_rmse_aligned": Variable(RUN, "f8", "the same after the best motion [m]"),
     "landmark_area": Variable(RUN, "f8", "mean final 3σ ellipse of landmarks [m²]"),
@@ -100,6 +105,9 @@ VARIABLES: dict[str, Variable] = {
     "message": Variable(RUN, "U", "why"),
 }
 
+
+#: Errors of the landmarks relative to the robot, in the axes of the map, whitened.
+DEVIATIONS = "landmark_deviation_x", "landmark_deviation_y"
 
 COUNTS = AssociationScores._fields
 
@@ -368,9 +376,14 @@ def _measure_map(true_pose: Array, truth: Array, belief: Belief) -> dict[str, Va
     for frame in ERROR_FRAMES:
         values = nees.landmark_nees(*states, frame=frame)
         measured[f"landmark_nees_{frame}"] = by_id(values, ids, len(truth))
+    deviations = nees.relative_landmark_deviations(*states)
+    measured |= deviations_by_id(deviations, ids, len(truth))
     estimated = ids, belief.landmarks, belief.landmark_covariances
+    relative = float(nees.relative_map_nees(*states))
+    if math.isnan(relative) and nees.is_indefinite(belief.covariance):
+        relative = math.inf
     return measured | {
-        "relative_map_nees": float(nees.relative_map_nees(*states)),
+        "relative_map_nees": relative,
         **measure_landmarks(true_pose, truth, belief.pose, *estimated),
         "landmark_mahalanobis": np.sqrt(measured["landmark_nees_additive"]),
     }
@@ -410,6 +423,15 @@ def measure_landmarks(
         "landmark_rmse_aligned": accuracy.aligned_rmse,
         "landmark_area": float(ellipse_areas(covariances).mean()),
         "landmark_error": by_id(accuracy.raw_errors, ids, len(true_landmarks)),
+    }
+
+
+def deviations_by_id(deviations: Array, ids: list[int], count: int) -> dict[str, Array]:
+    """Return whitened errors (n, 2) for all landmarks, infinite where undefined."""
+    known = np.where(np.isnan(deviations), np.inf, deviations).T
+    return {
+        name: by_id(values, ids, count)
+        for name, values in zip(DEVIATIONS, known, strict=True)
     }
 
 

@@ -23,6 +23,8 @@ from ...evaluation.hypothesis_tests import (
     HypothesisTest,
     average_band,
 )
+from ...evaluation.map_consistency import ERROR_RATE as MAP_ERROR_RATE
+from ...evaluation.map_consistency import MapReport, farthest
 from ..runs.trace import finite, mean, quotient, root_mean_square
 from .looks import is_sequential, looks_summary, verdict_of
 from .run_measures import (
@@ -48,6 +50,7 @@ from .verdict import (
     heading_sentence,
     in_degrees,
     labels_of,
+    maps_of,
     report_of,
     run_warnings,
     scores_of,
@@ -151,7 +154,8 @@ def summarise_estimator(
         :func:`.verdict.failure_groups`); by frame ``pose_nees`` and its
         share of steps inside the 95 % band, and ``position_nees``;
         ``heading_nees``; ``median_run`` and ``share_above_3`` of the runs' averages;
-        NEES at the end of ``state``, ``landmarks`` and ``relative_map``; ``nis``;
+        NEES at the end of ``state``, ``landmarks``, ``relative_map`` and its
+        ``worst_landmark``; ``nis``;
         ``heading_std_end``, ``{claimed, true}`` [rad]; ``rmse`` of position [m] and
         heading [rad]; ``ate`` and ``landmark_rmse``, ``{raw, aligned}`` [m];
         ``landmark_mahalanobis``, root mean square; ``area`` of the 3σ ellipses at the
@@ -188,7 +192,7 @@ def summarise_estimator(
         "failure_groups": failure_groups(scores.failures),
         **found,
         "efficiency": efficiency_summary(scores),
-        "diagnosis": diagnosis_summary(scores, frame, verdict),
+        "diagnosis": diagnosis_summary(scores, frame, verdict, report.map if report else None),
         "seeds_sentence": seeds_sentence(scores, frame, _errors_of_bad_runs(scores)),
         "association": association_summary(scores),
         "unused_readings": _unused_readings(scores),
@@ -357,7 +361,10 @@ def _declared(frame: ErrorFrame) -> list[Measure]:
         row("nees_end.state", _by_freedom(f"state_nees_{frame}", "state_dof")),
         row("nees_end.landmarks", _by_freedom(f"landmark_nees_{frame}")),
         row("nees_end.relative_map",
-            _by_freedom("relative_map_nees", "relative_map_dof")),
+            _by_freedom("relative_map_nees", "relative_map_dof"),
+            "NEES of the map at the end", "1"),
+        row("nees_end.worst_landmark", _worst_landmark(frame), "… of the worst landmark",
+            "≈ 1"),
         row("nis", lambda scores: scores.nis_per_degree,
             "NIS / degrees of freedom", "1"),
         row("heading_std_end.claimed", _end(root, "heading_std"),
@@ -509,6 +516,18 @@ def _by_freedom(name: str, dof: str = "") -> Computation:
     return compute
 
 
+def _worst_landmark(frame: ErrorFrame) -> Computation:
+    """Return the ratio of the landmark that is farthest from 1, seen from the robot."""
+
+    def compute(scores: EstimatorScores) -> float | None:
+        maps = maps_of(scores, frame)
+        if maps is None or not len(maps.ratios):
+            return None
+        return finite(maps.ratios[farthest(maps.ratios)])
+
+    return compute
+
+
 def decisions_table(report: ConsistencyReport) -> dict[str, Any]:
     """Return the decisions of a report as plain JSON types.
 
@@ -520,7 +539,10 @@ def decisions_table(report: ConsistencyReport) -> dict[str, Any]:
         is accepted, all None where nothing is decided; ``grid``, with ``steps``,
         ``rejected`` and one ``statistic`` per step;
         ``equivalence``, whose 90 % ``interval`` must lie inside ``margin``;
-        ``runs_needed`` to find covariances too small by a factor in 90 % of cases.
+        ``runs_needed`` to find covariances too small by a factor in 90 % of cases;
+        ``map``, None where the pose alone is tested, with the 90 % ``interval`` of its
+        ratio and, for each of its ``landmarks``, the ``ratio`` seen from the robot,
+        the ``map_ratio`` in the frame of the map, and the ``mean`` error in deviations.
     """
     grid, equivalence = report.family, report.equivalence
     return {
@@ -547,6 +569,34 @@ def decisions_table(report: ConsistencyReport) -> dict[str, Any]:
             "error_rate": equivalence.error_rate,
         },
         "runs_needed": {f"{factor:g}": runs for factor, runs in report.runs_needed},
+        "map": report.map and _map_decision(report.map),
+    }
+
+
+def _map_decision(maps: MapReport) -> dict[str, Any]:
+    """Return the decisions on the map as plain JSON types."""
+    rows = zip(
+        maps.landmarks, maps.ratios, maps.map_ratios, maps.means, strict=True
+    )
+    return {
+        "statistic": finite(maps.equivalence.statistic),
+        "interval": [finite(end) for end in maps.equivalence.interval],
+        "p_value": maps.p_value,
+        "accepted": maps.accepted,
+        "shown": maps.shown,
+        "error_rate": MAP_ERROR_RATE,
+        "runs": maps.runs,
+        "without_nees": maps.undefined + maps.indefinite,
+        "joint": maps.joint,
+        "landmarks": [
+            {
+                "landmark": int(name),
+                "ratio": finite(ratio),
+                "map_ratio": finite(alone),
+                "mean": mean.tolist(),
+            }
+            for name, ratio, alone, mean in rows
+        ],
     }
 
 

@@ -37,11 +37,14 @@ from ...evaluation.diagnosis import (
     diverged_runs,
     p_text,
 )
-from ...evaluation.hypothesis_tests import EQUIVALENCE_MARGIN
+from ...evaluation.hypothesis_tests import EQUIVALENCE_MARGIN, EquivalenceTest
+from ...evaluation.map_consistency import ERROR_RATE as MAP_ERROR_RATE
+from ...evaluation.map_consistency import BIAS_MARGIN, TESTS, MapReport, map_test
 from ...suggestions import counted
 from ..runs.summary import MOST_REJECTED, NIS_RANGE, nis_suspicion
 from ..runs.trace import finite, quotient
 from .run_measures import (
+    DEVIATIONS,
     KNOWN_IDS_ATE,
     KNOWN_IDS_NEES,
     LARGER,
@@ -57,11 +60,10 @@ NOT_SHOWN = "not shown"
 #: Rating of each word, which chooses its colour.
 KINDS = {CONSISTENT: "good", NEARLY: "good", NOT_CONSISTENT: "bad", NOT_SHOWN: "open"}
 
-_ERROR_RATE = 0.05
-_DECIDING = 3  # final step, time averages and grid share the error rate
 _MARGIN = f"[{EQUIVALENCE_MARGIN.low:g}, {EQUIVALENCE_MARGIN.high:g}]"
 _INSIDE = f"lies inside {_MARGIN}"
 _TOO_SURE = 0.9
+_CERTAIN = 1e-12  # p-value below which others add nothing
 _FEW = 0.1  # share of the runs that may make an average
 _BOOTSTRAP_SEED = 0  # the same for each estimator, independent of the others
 _NOT_REFUSED = "the errors of the pose agree with the covariances (5 %)"
@@ -77,6 +79,8 @@ class Verdict(NamedTuple):
     word: str
     #: Continues after the word, without a full stop.
     reason: str
+    #: Whether tests reject the map alone.
+    by_map: bool = False
 
 
 #: In place of a verdict on estimates that are aligned.
@@ -109,10 +113,10 @@ def with_failures(verdict: Verdict, failed: int, runs: int) -> Verdict:
     if not failed:
         return verdict
     word = verdict.word if verdict.word == NOT_CONSISTENT else NOT_SHOWN
-    others = (
+    reason = (
         f"{failed} of {counted(runs, 'run')} failed; of the others, {verdict.reason}"
     )
-    return Verdict(word, others)
+    return verdict._replace(word=word, reason=reason)
 
 
 def verdict_sentence(label: str, verdict: Verdict) -> str:
@@ -170,9 +174,74 @@ def in_degrees(angle: float) -> str:
 
 
 def _verdict_on_successes(report: ConsistencyReport) -> Verdict:
-    """Return the verdict on the successful runs."""
+    """Return the verdict on the successful runs: that on the pose, then on the map."""
+    pose, maps = _verdict_on_poses(report), report.map
+    if maps is None:
+        return pose._replace(reason=f"{pose.reason}; this covers the pose only")
+    if not maps.accepted:
+        agree = pose.word != NOT_CONSISTENT
+        join = f"{_NOT_REFUSED}, but those of the map do not: " if agree else ""
+        if pose.word == NEARLY or not agree:
+            join = f"{pose.reason}; of the map, "
+        return Verdict(NOT_CONSISTENT, join + _map_refusal(maps), agree)
+    if pose.word in (NOT_CONSISTENT, NOT_SHOWN):
+        return pose
+    if maps.shown:
+        low, high = _interval(maps.equivalence)
+        both = f"that of the map, [{low:.3f}, {high:.3f}]"
+        return Verdict(pose.word, f"{pose.reason}, as does {both}")
+    return Verdict(NOT_SHOWN, f"{pose.reason}; {_map_not_shown(maps)}")
+
+
+def _map_not_shown(maps: MapReport) -> str:
+    """Write why a map that no test rejects is not shown to be consistent."""
+    if maps.undefined:
+        singular = "its covariance is singular or no covariance"
+        runs = counted(maps.undefined, "run")
+        return f"the map has no NEES at the end of {runs}: {singular}"
+    low, high = _interval(maps.equivalence)
+    needed = _runs_needed(maps.equivalence, maps.runs)
+    many = f", about {needed:,} in total if its ratio is 1" if needed else ""
+    return (
+        "no test rejects the map, but the 90 % interval of its ratio, "
+        f"[{low:.3f}, {high:.3f}], is not inside {_MARGIN}: more runs are needed{many}"
+    )
+
+
+def _map_refusal(maps: MapReport) -> str:
+    """Write how wrong a rejected map is, by the test that shows it best."""
+    p_value, ratio = p_text(maps.p_value), maps.equivalence.statistic
+    if maps.indefinite:
+        return f"its covariance has a negative eigenvalue in {_of_runs(maps)}"
+    each = np.append(maps.landmark_p_values, 1.0)
+    if maps.joint_p_value <= max(each.min(), _CERTAIN):
+        cautious = ": the map is too cautious" if ratio < 1 else ""
+        times = f"{_number(ratio)} times what the covariances state"
+        return f"the squared errors are {times} ({p_value}){cautious}"
+    worst = int(each.argmin())
+    name, many = maps.landmarks[worst], np.count_nonzero(TESTS * each < MAP_ERROR_RATE)
+    others = f", the worst of {many} landmarks" if many > 1 else ""
+    if each[worst] == maps.mean_p_values[worst]:
+        size = np.hypot(*maps.means[worst])
+        what = f"landmark {name} is off by {size:.2f} deviations on average"
+    else:
+        from_robot = each[worst] == maps.p_values[worst]
+        ratios = maps.ratios if from_robot else maps.map_ratios
+        seen = " seen from the robot" if from_robot else ""
+        what = (
+            f"the squared errors of landmark {name}{seen} are "
+            f"{_number(ratios[worst])} times what its covariances state"
+        )
+    return f"{what}{others} ({p_value})"
+
+
+def _interval(verdict: EquivalenceTest) -> tuple[float, float]:
+    return max(verdict.interval[0], 0.0), verdict.interval[1]  # of a ratio >= 0
+
+
+def _verdict_on_poses(report: ConsistencyReport) -> Verdict:
     verdict = report.equivalence
-    low, high = max(verdict.interval[0], 0.0), verdict.interval[1]  # of a ratio >= 0
+    low, high = _interval(verdict)
     interval = f"the 90 % interval of the ratio, [{low:.3f}, {high:.3f}]"
     refusal = _refusal(report)
     if refusal and _is_near_everywhere(report):
@@ -187,20 +256,19 @@ def _verdict_on_successes(report: ConsistencyReport) -> Verdict:
         lies = f"{interval}, lies outside {_MARGIN}"
     else:
         kept, lies = f"{_NOT_REFUSED}, but", f"{interval}, is not inside {_MARGIN}"
-    needed = _runs_needed(report)
+    needed = _runs_needed(verdict, report.used_runs)
     many = f", about {needed:,} in total if its ratio is 1" if needed else ""
     return Verdict(NOT_SHOWN, f"{kept} {lies}: more runs are needed{many}")
 
 
-def _runs_needed(report: ConsistencyReport) -> int:
+def _runs_needed(verdict: EquivalenceTest, runs: int) -> int:
     """Return with how many runs a filter of ratio 1 is accepted in 90 % of cases.
 
     Its 90 % interval must then be about half as wide as the margin.  Its width is in
     proportion to the ratio, and to one over the square root of the number of runs.  0
     if there are too few runs now.
     """
-    ratio, (low, high) = report.equivalence.statistic, report.equivalence.interval
-    runs = report.runs - len(report.failed_runs)
+    ratio, (low, high) = verdict.statistic, verdict.interval
     if runs < FEW_AVERAGES:
         return 0
     least, most = EQUIVALENCE_MARGIN
@@ -218,9 +286,9 @@ def _refusal(report: ConsistencyReport) -> str:
     ratios = [final.statistic, average.statistic]
     claims = "what the covariances state"
     amounts = "{} times {} at the end, {} times over all steps"
-    if p_value * _DECIDING < _ERROR_RATE:
+    if p_value < report.deciding_rate:
         what = amounts.format(_number(ratios[0]), claims, _number(ratios[1]))
-    elif grid.p_value * _DECIDING < _ERROR_RATE:
+    elif grid.p_value < report.deciding_rate:
         worst = int(abs(np.log(grid.statistic[grid.rejected])).argmax())
         step = int(report.family_steps[grid.rejected][worst]) + 1  # it knows no step 0
         ratios, p_value = [float(grid.statistic[grid.rejected][worst])], grid.p_value
@@ -404,11 +472,18 @@ def _failed(label: str, entry: Mapping[str, Any], runs: int) -> str:
 
 #: The cause for estimates in another convention than their files should have.
 CONVENTION = "convention"
+#: The cause where the map alone is rejected.
+MAP = "map"
+_MOSTLY = 0.5  # share of the squared errors that an offset makes
+_ALIKE = 2.0  # largest by smallest ratio of landmarks with one scale
 _MISTAKES = ("wrong", "duplicate", "ghost", "clutter_used")
 
 
 def diagnosis_summary(
-    scores: EstimatorScores, frame: ErrorFrame, verdict: Verdict
+    scores: EstimatorScores,
+    frame: ErrorFrame,
+    verdict: Verdict,
+    maps: MapReport | None = None,
 ) -> dict[str, Any] | None:
     """Name the cause for which an estimator is not consistent.
 
@@ -417,7 +492,8 @@ def diagnosis_summary(
     dict or None
         ``cause``, one of :data:`slamgym.evaluation.CAUSES`, its ``p``, a ``sentence``,
         and ``others``, further causes; see :func:`slamgym.evaluation.diagnose`. The
-        cause is "convention" for estimates that break one. None for results without
+        cause is "convention" for estimates that break one, and "map" if the map alone
+        is rejected. None for results without
         noise, and for estimates that are fitted to the truth.
     """
     mistakes = json.loads(scores.results.attrs.get("mistakes", "{}"))
@@ -427,12 +503,79 @@ def diagnosis_summary(
     if "noise_sums" not in scores.results or scores.is_fitted:
         return None
     found = diagnosis_of(scores, frame, verdict)
-    return {
+    entry = {
         "cause": found.cause,
         "p": finite(found.p_value),
         "sentence": found.sentence,
         "others": list(found.others),
     }
+    if maps is None or maps.accepted:
+        return entry
+    named = f"{MAP}: {_map_cause(maps)}"
+    if verdict.by_map and found.cause in (HONEST, CANNOT_TELL):
+        return {"cause": MAP, "p": maps.p_value, "sentence": named, "others": []}
+    return entry | {
+        "sentence": f"{found.sentence} {named[0].upper()}{named[1:]}",
+        "others": [*found.others, MAP],
+    }
+
+
+def _map_cause(maps: MapReport) -> str:
+    """Write what is wrong about the covariances or the positions of a rejected map."""
+    low, high = EQUIVALENCE_MARGIN
+    whole, ratios, alone = maps.equivalence.statistic, maps.ratios, maps.map_ratios
+    if maps.indefinite:
+        return f"the covariance has a negative eigenvalue in {_of_runs(maps)}."
+    if not len(ratios):
+        return f"the squared errors of the whole map are {_number(whole)} times."
+    if np.isnan(alone).any():
+        alone = ratios
+    lone, sizes = maps.landmark_p_values * TESTS < MAP_ERROR_RATE, np.hypot(*maps.means.T)
+    from_robot = f"seen from the robot, they are {_range(ratios)} times"
+    if 0 < 3 * lone.sum() <= len(lone):
+        names = ", ".join(map(str, maps.landmarks[lone]))
+        few = "one landmark" if lone.sum() == 1 else "some landmarks"
+        return (
+            f"{few}: the squared errors of {names} are {_range(alone[lone])} times "
+            f"what the covariances state, with a mean error of {_range(sizes[lone])} "
+            f"deviations; those of the other {len(lone) - lone.sum()} are "
+            f"{_range(alone[~lone])} times."
+        )
+    share = float(np.median(sizes**2 / 2 / ratios))
+    if sizes.min() > BIAS_MARGIN and share > _MOSTLY:
+        return (
+            f"offset: the landmarks are off by {_range(sizes)} deviations on average, "
+            f"which makes {share:.0%} of their squared errors (median landmark)."
+        )
+    if alone.max() <= _ALIKE * alone.min() and not (low < np.median(alone) < high):
+        size = "large" if np.median(alone) < 1 else "small"
+        return (
+            f"scale: the covariances are too {size}; the squared errors of the "
+            f"landmarks are {_range(alone)} times what they state, those of the whole "
+            f"map {_number(whole)} times."
+        )
+    agree = f"the squared errors of each landmark are {_range(alone)} times"
+    if low <= alone.min() and alone.max() <= high:
+        if low <= ratios.min() and ratios.max() <= high:
+            return (
+                f"covariances between the landmarks: {agree} what they state, those "
+                f"of the whole map {_number(whole)} times."
+            )
+        return f"covariances between pose and map: {agree}, but {from_robot}."
+    return (
+        f"{agree} what the covariances state, and those of the whole map "
+        f"{_number(whole)} times, which no single scale, offset or landmark explains."
+    )
+
+
+def _of_runs(maps: MapReport) -> str:
+    return f"{maps.indefinite} of {counted(maps.all_runs, 'run')}"
+
+
+def _range(values: Array) -> str:
+    """Write the smallest and the largest of some numbers."""
+    least, most = _number(values.min()), _number(values.max())
+    return least if least == most else f"{least} to {most}"
 
 
 def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
@@ -501,7 +644,7 @@ def diagnosis_of(
         mistakes=_mistakes(scores),
         known_nees=_known_nees(scores, frame),
         small_noise=_small_noise(scores, frame),
-        rejected=verdict.word == NOT_CONSISTENT,
+        rejected=verdict.word == NOT_CONSISTENT and not verdict.by_map,
     )
     if found.cause != HONEST or verdict.word == CONSISTENT:
         return found
@@ -687,7 +830,30 @@ def report_of(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport:
         dof=POSE_FREEDOM,
         frame=frame,
         rng=np.random.default_rng(_BOOTSTRAP_SEED),
+        **_map_scores(scores, frame),
     )
+
+
+def maps_of(scores: EstimatorScores, frame: ErrorFrame) -> MapReport | None:
+    """Decide about the maps of one estimator as :func:`report_of` does."""
+    found = _map_scores(scores, frame)
+    return map_test(*(each[scores.good] for each in found.values())) if found else None
+
+
+def _map_scores(scores: EstimatorScores, frame: ErrorFrame) -> dict[str, Array]:
+    """Return what the verdict on the maps needs, of all runs.
+
+    Empty where identities are hidden, and for results of an older version.
+    """
+    if KNOWN_IDS_ATE in scores.results or not {*DEVIATIONS} <= {*scores.results}:
+        return {}
+    pair = [scores.results[name].values for name in DEVIATIONS]
+    return {
+        "landmarks": np.stack(pair, axis=-1),
+        "map_nees": scores.results["relative_map_nees"].values,
+        "map_dof": scores.results["relative_map_dof"].values,
+        "landmark_nees": scores.results[f"landmark_nees_{frame}"].values,
+    }
 
 
 def labels_of(dataset: xr.Dataset) -> tuple[str, ...]:

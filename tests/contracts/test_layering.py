@@ -44,7 +44,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
     "evaluation": """
         hypothesis_tests sequential_tests trajectory_error error_bound
         association_scores
-        nees noise_findings
+        nees noise_findings map_consistency
         diagnosis
         consistency_report
     """,
