@@ -38,6 +38,8 @@ class MapReport(NamedTuple):
     undefined: int
     #: Runs whose NEES is infinite: their matrix has a negative eigenvalue.
     indefinite: int
+    #: Number of runs with a map.
+    all_runs: int
     #: Whether the ratio is that of the whole map, with all covariances between
     #: landmarks; else it is the average over the landmarks.
     joint: bool
@@ -59,11 +61,6 @@ class MapReport(NamedTuple):
     means: Array
     #: p-values of the mean errors, adjusted for their number, shape (k,).
     mean_p_values: Array
-
-    @property
-    def all_runs(self) -> int:
-        """Number of runs with a map."""
-        return self.runs + self.undefined + self.indefinite
 
     @property
     def p_value(self) -> float:
@@ -189,6 +186,7 @@ def map_test(
         runs=int(defined.sum()),
         undefined=int((has_map & ~defined & ~indefinite).sum()),
         indefinite=int(indefinite.sum()),
+        all_runs=int(has_map.sum()),
         joint=joint,
         equivalence=equivalence_test(totals[defined] / freedom[defined], 1),
         joint_p_value=float(

@@ -475,6 +475,7 @@ CONVENTION = "convention"
 #: The cause where the map alone is rejected.
 MAP = "map"
 _MOSTLY = 0.5  # share of the squared errors that an offset makes
+_NEARLY = 1.5  # ratio of a landmark that agrees, beside others that do not
 _ALIKE = 2.0  # largest by smallest ratio of landmarks with one scale
 _MISTAKES = ("wrong", "duplicate", "ghost", "clutter_used")
 
@@ -514,10 +515,7 @@ def diagnosis_summary(
     named = f"{MAP}: {_map_cause(maps)}"
     if verdict.by_map and found.cause in (HONEST, CANNOT_TELL):
         return {"cause": MAP, "p": maps.p_value, "sentence": named, "others": []}
-    return entry | {
-        "sentence": f"{found.sentence} {named[0].upper()}{named[1:]}",
-        "others": [*found.others, MAP],
-    }
+    return entry  # errors of the pose make those of the map
 
 
 def _map_cause(maps: MapReport) -> str:
@@ -547,7 +545,7 @@ def _map_cause(maps: MapReport) -> str:
             f"offset: the landmarks are off by {_range(sizes)} deviations on average, "
             f"which makes {share:.0%} of their squared errors (median landmark)."
         )
-    if alone.max() <= _ALIKE * alone.min() and not (low < np.median(alone) < high):
+    if alone.max() <= _ALIKE * alone.min() and not low < np.median(alone) < high:
         size = "large" if np.median(alone) < 1 else "small"
         return (
             f"scale: the covariances are too {size}; the squared errors of the "
@@ -555,7 +553,7 @@ def _map_cause(maps: MapReport) -> str:
             f"map {_number(whole)} times."
         )
     agree = f"the squared errors of each landmark are {_range(alone)} times"
-    if low <= alone.min() and alone.max() <= high:
+    if 1 / _NEARLY < alone.min() and alone.max() < _NEARLY:
         if low <= ratios.min() and ratios.max() <= high:
             return (
                 f"covariances between the landmarks: {agree} what they state, those "

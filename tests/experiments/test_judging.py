@@ -169,7 +169,9 @@ def test_a_filter_is_judged_through_files_as_in_a_monte_carlo(
             tolerance = {"rtol": 1e-9, "atol": 1e-12} if way == "tum" else EXACT
             np.testing.assert_allclose(results[name], study[name], **tolerance)
     ours, theirs = entry_of(results), entry_of(study)
-    assert (ours["verdict"], ours["reason"]) == (theirs["verdict"], theirs["reason"])
+    assert ours["verdict"] == theirs["verdict"]
+    covered = "; this covers the pose only"  # this start bends errors of the landmarks
+    assert ours["reason"] == theirs["reason"] + covered
     assert ours["diagnosis"]["cause"] == theirs["diagnosis"]["cause"]
     assert ours["nis"] is None
     assert (ours["efficiency"]["map"] is not None) == has_map
