@@ -201,8 +201,7 @@ def map_test(
         map_p_values=_adjusted(_outside_margin(alone, _POINT * counts)),
         means=means,
         mean_p_values=_adjusted(
-            1
-            - chndtr(counts * (means**2).sum(axis=1), _POINT, counts * BIAS_MARGIN**2)
+            1 - chndtr(counts * (means**2).sum(axis=1), _POINT, counts * BIAS_MARGIN**2)
         ),
     )
 

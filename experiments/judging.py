@@ -497,10 +497,8 @@ def _measured(
     for run, each in enumerate(files):
         if isinstance(each, str) or run in failures:
             continue
-        problem = _add_map(
-            block, run, chunk.runs, each, moved[run, -1], additive[run, 0, 2, 2], align
-        )
-        if problem:
+        unsure = float("inf") if align else float(additive[run, 0, 2, 2])
+        if problem := _add_map(block, run, chunk.runs, each, moved[run, -1], unsure):
             failures[run] = Failure(steps - 1, problem)
     write_failures(block, failures)
     return _Part(block, (truth, poses, claims, chunk.runs.initial_poses))
@@ -594,13 +592,13 @@ def _add_map(
     estimate: Estimate,
     pose: Array,
     heading_variance: float,
-    align: Any,
 ) -> str:
     """Measure the final map of a run into its block; return why it is none.
 
     The files hold no covariances between pose and map. So the verdict covers the
     landmarks in the frame of the map, unless the heading of the start is so uncertain
-    that it bends their errors, whose NEES then is not χ².
+    that it bends their errors, whose NEES then is not χ². An infinite variance of it
+    stands for estimates that are aligned, whose landmarks are not.
     """
     ids, count = estimate.landmark_ids.tolist(), runs.landmarks.shape[1]
     if not ids or not count:
@@ -614,12 +612,11 @@ def _add_map(
     squares = normalised_squared_error(truth[ids] - estimate.landmarks, claims)
     measured["landmark_nees_additive"] = by_id(squares, ids, count)
     measured["landmark_mahalanobis"] = np.sqrt(measured["landmark_nees_additive"])
-    if align is None:
-        bend = np.hypot(*(truth[ids] - estimate.poses[0, :2]).T) * heading_variance
-        least = np.sqrt(np.maximum(np.linalg.eigvalsh(claims)[:, 0], 0.0))
-        rows = np.flatnonzero(bend <= _BEND * least)
-        deviations = whitened(truth[ids][rows] - estimate.landmarks[rows], claims[rows])
-        measured |= deviations_by_id(deviations, [ids[row] for row in rows], count)
+    bend = np.hypot(*(truth[ids] - estimate.poses[0, :2]).T) * heading_variance
+    least = np.sqrt(np.maximum(np.linalg.eigvalsh(claims)[:, 0], 0.0))
+    rows = np.flatnonzero(bend <= _BEND * least)
+    deviations = whitened(truth[ids][rows] - estimate.landmarks[rows], claims[rows])
+    measured |= deviations_by_id(deviations, [ids[row] for row in rows], count)
     for name, value in measured.items():
         block[name][run] = value
     return ""

@@ -192,7 +192,9 @@ def summarise_estimator(
         "failure_groups": failure_groups(scores.failures),
         **found,
         "efficiency": efficiency_summary(scores),
-        "diagnosis": diagnosis_summary(scores, frame, verdict, report.map if report else None),
+        "diagnosis": diagnosis_summary(
+            scores, frame, verdict, report.map if report else None
+        ),
         "seeds_sentence": seeds_sentence(scores, frame, _errors_of_bad_runs(scores)),
         "association": association_summary(scores),
         "unused_readings": _unused_readings(scores),
@@ -363,8 +365,8 @@ def _declared(frame: ErrorFrame) -> list[Measure]:
         row("nees_end.relative_map",
             _by_freedom("relative_map_nees", "relative_map_dof"),
             "NEES of the map at the end", "1"),
-        row("nees_end.worst_landmark", _worst_landmark(frame), "… of the worst landmark",
-            "≈ 1"),
+        row("nees_end.worst_landmark", _worst_landmark(frame),
+            "… of the worst landmark", "≈ 1"),
         row("nis", lambda scores: scores.nis_per_degree,
             "NIS / degrees of freedom", "1"),
         row("heading_std_end.claimed", _end(root, "heading_std"),
@@ -575,9 +577,7 @@ def decisions_table(report: ConsistencyReport) -> dict[str, Any]:
 
 def _map_decision(maps: MapReport) -> dict[str, Any]:
     """Return the decisions on the map as plain JSON types."""
-    rows = zip(
-        maps.landmarks, maps.ratios, maps.map_ratios, maps.means, strict=True
-    )
+    rows = zip(maps.landmarks, maps.ratios, maps.map_ratios, maps.means, strict=True)
     return {
         "statistic": finite(maps.equivalence.statistic),
         "interval": [finite(end) for end in maps.equivalence.interval],

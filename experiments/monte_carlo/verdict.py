@@ -38,8 +38,8 @@ from ...evaluation.diagnosis import (
     p_text,
 )
 from ...evaluation.hypothesis_tests import EQUIVALENCE_MARGIN, EquivalenceTest
-from ...evaluation.map_consistency import ERROR_RATE as MAP_ERROR_RATE
 from ...evaluation.map_consistency import BIAS_MARGIN, TESTS, MapReport, map_test
+from ...evaluation.map_consistency import ERROR_RATE as MAP_ERROR_RATE
 from ...suggestions import counted
 from ..runs.summary import MOST_REJECTED, NIS_RANGE, nis_suspicion
 from ..runs.trace import finite, quotient
@@ -520,25 +520,29 @@ def diagnosis_summary(
 
 def _map_cause(maps: MapReport) -> str:
     """Write what is wrong about the covariances or the positions of a rejected map."""
-    low, high = EQUIVALENCE_MARGIN
-    whole, ratios, alone = maps.equivalence.statistic, maps.ratios, maps.map_ratios
+    whole = f"those of the whole map {_number(maps.equivalence.statistic)} times"
     if maps.indefinite:
         return f"the covariance has a negative eigenvalue in {_of_runs(maps)}."
-    if not len(ratios):
-        return f"the squared errors of the whole map are {_number(whole)} times."
-    if np.isnan(alone).any():
-        alone = ratios
-    lone, sizes = maps.landmark_p_values * TESTS < MAP_ERROR_RATE, np.hypot(*maps.means.T)
-    from_robot = f"seen from the robot, they are {_range(ratios)} times"
-    if 0 < 3 * lone.sum() <= len(lone):
-        names = ", ".join(map(str, maps.landmarks[lone]))
-        few = "one landmark" if lone.sum() == 1 else "some landmarks"
-        return (
-            f"{few}: the squared errors of {names} are {_range(alone[lone])} times "
-            f"what the covariances state, with a mean error of {_range(sizes[lone])} "
-            f"deviations; those of the other {len(lone) - lone.sum()} are "
-            f"{_range(alone[~lone])} times."
-        )
+    if not len(maps.ratios):
+        return f"of the squared errors, {whole} what the covariances state."
+    alone = maps.ratios if np.isnan(maps.map_ratios).any() else maps.map_ratios
+    lone = maps.landmark_p_values * TESTS < MAP_ERROR_RATE
+    if not 0 < 3 * lone.sum() <= len(lone):
+        return _common_cause(maps, alone, whole)
+    names = ", ".join(map(str, maps.landmarks[lone]))
+    few = "one landmark" if lone.sum() == 1 else "some landmarks"
+    sizes = np.hypot(*maps.means[lone].T)
+    return (
+        f"{few}: the squared errors of {names} are {_range(alone[lone])} times what "
+        f"the covariances state, with a mean error of {_range(sizes)} deviations; "
+        f"those of the other {len(lone) - lone.sum()} are {_range(alone[~lone])} times."
+    )
+
+
+def _common_cause(maps: MapReport, alone: Array, whole: str) -> str:
+    """Write what is wrong about a map as a whole, or that nothing single is."""
+    low, high = EQUIVALENCE_MARGIN
+    ratios, sizes = maps.ratios, np.hypot(*maps.means.T)
     share = float(np.median(sizes**2 / 2 / ratios))
     if sizes.min() > BIAS_MARGIN and share > _MOSTLY:
         return (
@@ -549,21 +553,18 @@ def _map_cause(maps: MapReport) -> str:
         size = "large" if np.median(alone) < 1 else "small"
         return (
             f"scale: the covariances are too {size}; the squared errors of the "
-            f"landmarks are {_range(alone)} times what they state, those of the whole "
-            f"map {_number(whole)} times."
+            f"landmarks are {_range(alone)} times what they state, {whole}."
         )
-    agree = f"the squared errors of each landmark are {_range(alone)} times"
-    if 1 / _NEARLY < alone.min() and alone.max() < _NEARLY:
-        if low <= ratios.min() and ratios.max() <= high:
-            return (
-                f"covariances between the landmarks: {agree} what they state, those "
-                f"of the whole map {_number(whole)} times."
-            )
-        return f"covariances between pose and map: {agree}, but {from_robot}."
-    return (
-        f"{agree} what the covariances state, and those of the whole map "
-        f"{_number(whole)} times, which no single scale, offset or landmark explains."
-    )
+    agree = f"the squared errors of each landmark are {_range(alone)} times what"
+    if alone.min() <= 1 / _NEARLY or alone.max() >= _NEARLY:
+        return (
+            f"{agree} the covariances state, {whole}: no single scale, offset or "
+            "landmark explains this."
+        )
+    if low <= ratios.min() and ratios.max() <= high:
+        return f"covariances between the landmarks: {agree} they state, {whole}."
+    from_robot = f"seen from the robot, they are {_range(ratios)} times"
+    return f"covariances between pose and map: {agree} they state, but {from_robot}."
 
 
 def _of_runs(maps: MapReport) -> str:
