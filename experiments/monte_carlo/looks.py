@@ -37,9 +37,11 @@ from .verdict import (
     NOT_CONSISTENT,
     NOT_SHOWN,
     POSE_FREEDOM,
+    POSE_ONLY,
     EstimatorScores,
     Verdict,
     judge,
+    map_refusal,
     report_of,
     squared_errors,
     with_failures,
@@ -225,7 +227,9 @@ def _sequential_verdict(
     interval = f"the {_INTERVAL} of the ratio, [{low:.3f}, {high:.3f}], {lies}"
     if not np.isfinite(high):
         interval = f"{counted(FEWEST_SHOWN, 'run')} at least are needed to show it"
-    refusal = _refusal(scores, frame, report, watch, looks)
+    refusal, by_map = _refusal(scores, frame, report, watch, looks)
+    if by_map:
+        return Verdict(NOT_CONSISTENT, refusal, by_map)
     if refusal:
         steps = (report.final_step.statistic, *report.family.statistic)
         least, most = EQUIVALENCE_MARGIN
@@ -233,12 +237,13 @@ def _sequential_verdict(
             return Verdict(NEARLY, f"{refusal}; the difference is small: {interval}")
         return Verdict(NOT_CONSISTENT, refusal)
     evidence = f"{_evidence(watch.log_evidence)}; 5 % over all looks"
+    only = f"; {POSE_ONLY}"
     kept = f"no anytime-valid test rejects the pose ({evidence}), "
     if inside:
         after = f"after {counted(watch.shown_after or 0, 'run')}, "
-        return Verdict(CONSISTENT, f"{after}{kept}and {interval}{_after(looks)}")
+        return Verdict(CONSISTENT, f"{after}{kept}and {interval}{_after(looks)}{only}")
     more = "more runs are needed"
-    return Verdict(NOT_SHOWN, f"{kept}but {interval}: {more}{_after(looks)}")
+    return Verdict(NOT_SHOWN, f"{kept}but {interval}: {more}{_after(looks)}{only}")
 
 
 def _refusal(
@@ -247,24 +252,33 @@ def _refusal(
     report: ConsistencyReport,
     watch: Watch,
     looks: Sequence[Look],
-) -> str:
-    """Write which look rejects the filter, and how wrong it is; "" for none."""
+) -> tuple[str, bool]:
+    """Write which look rejects the filter, and how wrong it is; "" for none.
+
+    Also return whether the first verdict rejected the map alone.
+    """
     what = squared_errors(report)
     if watch.rejected_after is not None:
         values = f"{_evidence(watch.log_evidence)}; 5 % over all looks"
         after = counted(watch.rejected_after, "run")
-        return f"after {after}, an anytime-valid test rejects it ({values}); {what}"
+        return (
+            f"after {after}, an anytime-valid test rejects it ({values}); {what}",
+            False,
+        )
     if looks and not looks[0].until:
         part = np.arange(len(scores.good)) < looks[0].runs
         first = scores._replace(good=scores.good & part)
-        p_value = report_of(first, frame).p_value if first.good.sum() > 1 else 1.0
-        if p_value < _FIRST_SHARE:
+        found = report_of(first, frame) if first.good.sum() > 1 else None
+        if found is not None and found.p_value < _FIRST_SHARE:
             after = counted(looks[0].runs, "run")
-            return (
-                f"the first verdict, after {after}, rejected it, which stands "
-                f"({p_text(p_value)}; 5 % over all looks); {what}"
-            )
-    return ""
+            by_map = found.pose_p_value >= _FIRST_SHARE
+            if found.map is not None and by_map:
+                what = f"of the map, {map_refusal(found.map)}"
+            else:
+                what = f"{p_text(found.p_value)}; 5 % over all looks); {what}"
+            start = f"the first verdict, after {after}, rejected it, which stands"
+            return f"{start}{': ' if by_map else ' ('}{what}", by_map
+    return "", False
 
 
 def _after(looks: Sequence[Look]) -> str:

@@ -60,6 +60,9 @@ NOT_SHOWN = "not shown"
 #: Rating of each word, which chooses its colour.
 KINDS = {CONSISTENT: "good", NEARLY: "good", NOT_CONSISTENT: "bad", NOT_SHOWN: "open"}
 
+#: Follows a verdict where no map is judged.
+POSE_ONLY = "this covers the pose only"
+
 _MARGIN = f"[{EQUIVALENCE_MARGIN.low:g}, {EQUIVALENCE_MARGIN.high:g}]"
 _INSIDE = f"lies inside {_MARGIN}"
 _TOO_SURE = 0.9
@@ -177,13 +180,13 @@ def _verdict_on_successes(report: ConsistencyReport) -> Verdict:
     """Return the verdict on the successful runs: that on the pose, then on the map."""
     pose, maps = _verdict_on_poses(report), report.map
     if maps is None:
-        return pose._replace(reason=f"{pose.reason}; this covers the pose only")
+        return pose._replace(reason=f"{pose.reason}; {POSE_ONLY}")
     if not maps.accepted:
         agree = pose.word != NOT_CONSISTENT
         join = f"{_NOT_REFUSED}, but those of the map do not: " if agree else ""
         if pose.word == NEARLY or not agree:
             join = f"{pose.reason}; of the map, "
-        return Verdict(NOT_CONSISTENT, join + _map_refusal(maps), agree)
+        return Verdict(NOT_CONSISTENT, join + map_refusal(maps), agree)
     if pose.word in (NOT_CONSISTENT, NOT_SHOWN):
         return pose
     if maps.shown:
@@ -208,7 +211,7 @@ def _map_not_shown(maps: MapReport) -> str:
     )
 
 
-def _map_refusal(maps: MapReport) -> str:
+def map_refusal(maps: MapReport) -> str:
     """Write how wrong a rejected map is, by the test that shows it best."""
     p_value, ratio = p_text(maps.p_value), maps.equivalence.statistic
     if maps.indefinite:
