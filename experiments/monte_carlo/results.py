@@ -263,7 +263,7 @@ def _coordinates(job: Job, runs: range) -> dict[str, np.ndarray[Any, Any]]:
 # --------------------------------------------------------------------------------------
 # The folder of a Monte Carlo: it belongs to one job (``job.json``) and one writer.
 
-FORMAT = "slamgym monte carlo 5"
+FORMAT = "slamgym monte carlo 6"
 JOB, BLOCKS, RESULTS = "job.json", "blocks", "results.nc"
 REPORT, SUMMARY = "report.html", "summary.json"
 
@@ -478,7 +478,12 @@ def _job_in(path: Path) -> dict[str, Any]:
         identity = json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError):
         identity = None
-    if not isinstance(identity, dict) or identity.get("format") != FORMAT:
+    form = identity.get("format") if isinstance(identity, dict) else None
+    if form != FORMAT and str(form).startswith(FORMAT.rstrip("0123456789")):
+        raise ValueError(
+            f"{file} was written by another version of slamgym: choose another folder"
+        )
+    if not isinstance(identity, dict) or form != FORMAT:
         raise ValueError(f"{file} is damaged, or no result of slamgym monte-carlo")
     return identity
 
