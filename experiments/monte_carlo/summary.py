@@ -44,6 +44,7 @@ from .verdict import (
     POINT_FREEDOM,
     POSE_FREEDOM,
     EstimatorScores,
+    coarse_bearings,
     diagnosis_summary,
     estimators_of,
     failure_groups,
@@ -90,7 +91,7 @@ def summarise_monte_carlo(
         is decided; ``frame``; ``knowable_heading_std`` [rad], the
         deviation of the heading at the start, below which it cannot fall;
         ``estimators`` by label, see `summarise_estimator`; and ``notes``, the
-        warnings of `run_warnings`.
+        warnings of `run_warnings` and `coarse_bearings`.
     """
     attrs = dataset.attrs
     frame = frame or attrs.get("frame", "invariant")
@@ -103,6 +104,7 @@ def summarise_monte_carlo(
         for label in labels_of(dataset)
     }
     block_size = attrs.get("block_size")
+    coarse = coarse_bearings(attrs["scenario"], entries)
     return {
         "scenario": str(attrs["scenario_name"]),
         "scenario_toml": str(attrs["scenario"]),
@@ -122,6 +124,7 @@ def summarise_monte_carlo(
         "notes": [
             *json.loads(attrs.get("notes", "[]")),
             *run_warnings(entries, dataset.sizes["run"]),
+            *([coarse] if coarse else []),
         ],
     }
 

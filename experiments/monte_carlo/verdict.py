@@ -382,6 +382,51 @@ def _kind(message: str) -> str:
     return re.sub(r"-?\d[\d.]*(e[+-]\d+)?", "", message.partition(";")[0])
 
 
+def coarse_bearings(scenario: str, entries: Mapping[str, Mapping[str, Any]]) -> str:
+    """Write whether bearings are too coarse for filters, beside fine ranges.
+
+    A reading of deviations (σβ, σr) at the range r lies on an arc, which is r σβ²/2
+    away from its tangent at one σβ.  A filter that places a landmark by one reading
+    takes the tangent for the arc, and is overconfident where this exceeds σr.
+
+    Parameters
+    ----------
+    scenario : str
+        The TOML text of the world.
+    entries : mapping
+        By label, each with ``verdict``.
+
+    Returns
+    -------
+    str
+        Empty if no filter is refused, or the sensor is accurate or without a limit.
+
+    Examples
+    --------
+    >>> world = "sensor = {std = [0.3, 0.1], max_range = 5.0}"
+    >>> coarse_bearings(world, {"ekf": {"verdict": "not consistent"}})
+    'At its maximum range, a bearing off by σβ = 0.3 rad moves a reading 0.225 m off...
+    >>> coarse_bearings(world, {"ekf": {"verdict": "consistent"}})
+    ''
+    """
+    sensor = tomllib.loads(scenario).get("sensor", {})
+    farthest = float(sensor.get("max_range", math.inf))
+    refused = any(entry.get("verdict") == NOT_CONSISTENT for entry in entries.values())
+    has_both = sensor.get("kind", "bearing_range") == "bearing_range"
+    if not refused or not has_both or math.isinf(farthest) or "std" not in sensor:
+        return ""
+    bearing, fixed = map(float, sensor["std"])
+    range_std = fixed + farthest * float(sensor.get("range_std_per_metre", 0.0))
+    off = farthest * bearing**2 / 2
+    if off < range_std:
+        return ""
+    return (
+        f"At its maximum range, a bearing off by σβ = {bearing:g} rad moves a reading "
+        f"{off:.3g} m off the tangent, and σr is {range_std:.3g} m: a filter that "
+        "places landmarks by one reading is overconfident (docs/filters.md, invariant)."
+    )
+
+
 def run_warnings(entries: Mapping[str, Mapping[str, Any]], runs: int) -> list[str]:
     """List why the numbers of a Monte Carlo should be used with caution.
 

@@ -9,7 +9,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from slamgym.estimator import make_batch
+from slamgym.estimator import make_batch, make_estimator
+from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.motions import predict_pose
 from slamgym.evaluation.hypothesis_tests import average_band
 from slamgym.evaluation.nees import pose_nees
 from slamgym.experiments.runs.simulated_runs import simulate_runs
@@ -92,3 +94,54 @@ def test_an_unknown_first_heading_does_not_mislead_the_invariant_filter():
 def test_large_heading_jumps_do_not_mislead_the_invariant_filter():
     assert 0.9 < study("slippery", "invariant")[0].mean() < 1.15
     assert study("slippery", "invariant", iterations=1)[0].mean() > 1.8
+
+
+@pytest.mark.slow
+def test_coarse_bearings_beside_fine_ranges_need_a_map_to_begin_with():
+    """What hurts is that one reading places a landmark, not the update.
+
+    A reading lies on an arc, r σβ²/2 = 0.22 m off its tangent, for σr = 0.1 m.
+    """
+    without, given = np.mean([coarse_run(seed) for seed in range(16)], axis=0)
+    assert without > 1.6
+    assert 0.7 < given < 1.3
+
+
+def coarse_run(seed):
+    """Return the average NEES / 3 of a drive on a circle, without and with a map."""
+    rng = np.random.default_rng(seed)
+    angle, distance = rng.uniform(0, 2 * np.pi, 20), rng.uniform(1.0, 7.0, 20)
+    places = np.c_[distance * np.cos(angle), 4.0 + distance * np.sin(angle)]
+    motion_std, std = np.array([0.01, 0.005, 0.01]), np.array([0.3, 0.1])
+    noise = {"motion_std": motion_std, "measurement_std": std}
+    filters = [
+        make_estimator("invariant", **noise, initial_pose_std=(1e-3,) * 3)
+        for _ in range(2)
+    ]
+    guess = places + 0.2 * rng.standard_normal(places.shape)
+    mean = np.concatenate([np.zeros(3), guess.ravel()])
+    covariance = np.diag([1e-6] * 3 + [0.04] * 40)
+    filters[1].load_state_dict(
+        filters[1].state_dict()
+        | {"mean": mean, "reference": mean, "covariance": covariance}
+        | {"landmark_ids": np.arange(20)}
+    )
+    pose, odometry, found = np.zeros(3), np.array([0.25, 0.25 / 4.0]), []
+    for step in range(100):
+        if step:
+            moved = predict_pose(pose, odometry)
+            pose = moved.pose + moved.jacobian_noise @ (
+                motion_std * rng.standard_normal(3)
+            )
+        exact = predict_measurement(pose, places).measurement
+        seen = np.flatnonzero((exact[:, 1] > 0.3) & (exact[:, 1] < 5.0))
+        z = exact[seen] + std * rng.standard_normal((len(seen), 2))
+        z[:, 1] = np.maximum(z[:, 1], 0.05)
+        for slam in filters:
+            if step:
+                slam.predict(odometry)
+            slam.update(z, seen)
+            belief = slam.belief()
+            estimate = belief.pose[None], belief.pose_covariance[None]
+            found.append(pose_nees(pose[None], *estimate, frame="invariant")[0] / 3)
+    return np.reshape(found, (-1, 2)).mean(axis=0)
