@@ -7,7 +7,8 @@ filter without the fault is consistent, and 20 studies have none. An answer is r
 it names the kind of the fault, or if the fault changes so little that the verdict is
 "consistent" or "nearly consistent"; "cannot tell" is counted by itself. `--later` tries
 20 other faults in three other worlds: neither were known when the rules were developed.
-`--seed` gives other random numbers.
+`--map` reports wrong maps beside correct poses in two worlds, and counts the studies
+that are refused, and those of 20 without a fault. `--seed` gives other random numbers.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
-from slamgym.estimator import EkfSlam, UpdateReport
+from slamgym import Belief
+from slamgym.estimator import EkfSlam, InvariantEkfSlam, UpdateReport
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.experiments.monte_carlo import monte_carlo, runner, summarise_monte_carlo
 from slamgym.sim_configs import Scenario, load_scenario
@@ -417,6 +419,104 @@ LATER_FAULTS = (
     Fault("camera mounted with .03 rad", (MODEL,), input=turned),
     Fault("motion noise in every other step", (COVARIANCE,), AddsNoiseEveryOtherStep),
 )
+Change = Callable[[Array, Array], None]
+
+
+def turn_map(mean: Array, _: Array) -> None:
+    """Turn the map by .03 rad about the origin."""
+    x, y = mean[3::2].copy(), mean[4::2].copy()
+    mean[3::2], mean[4::2] = x - 0.03 * y, y + 0.03 * x
+
+
+def stretch_map(mean: Array, _: Array) -> None:
+    """Make the map 2 % larger."""
+    mean[3:] *= 1.02
+
+
+def rotate_identities(mean: Array, _: Array) -> None:
+    """Give the first three landmarks each other's places."""
+    mean[3:9] = np.roll(mean[3:9], 2)
+
+
+def move_one(mean: Array, _: Array) -> None:
+    """Move the second landmark by .1 m."""
+    mean[6:7] += 0.1
+
+
+def shrink_map(_: Array, covariance: Array) -> None:
+    """Report 60 % of the variances of the map."""
+    covariance[3:] *= np.sqrt(0.6)
+    covariance[:, 3:] *= np.sqrt(0.6)
+
+
+def inflate_one(_: Array, covariance: Array) -> None:
+    """Report nine times the variance of the second landmark."""
+    covariance[5:7] *= 3
+    covariance[:, 5:7] *= 3
+
+
+def mirror_ellipses(_: Array, covariance: Array) -> None:
+    """Report covariances of the map with the wrong sign between x and y."""
+    covariance[4::2] *= -1
+    covariance[:, 4::2] *= -1
+
+
+def swap_axes(_: Array, covariance: Array) -> None:
+    """Take the x of a landmark for its y in the covariance."""
+    order = np.arange(len(covariance))
+    order[3::2], order[4::2] = order[4::2].copy(), order[3::2].copy()
+    covariance[:] = covariance[order][:, order]
+
+
+def reverse_order(_: Array, covariance: Array) -> None:
+    """Give the landmarks the covariances in reverse order."""
+    pairs = np.arange(3, len(covariance)).reshape(-1, 2)[::-1]
+    order = np.concatenate([np.arange(3), pairs.ravel()])
+    covariance[:] = covariance[order][:, order]
+
+
+def halve_cross_covariance(_: Array, covariance: Array) -> None:
+    """Report half of the covariances between pose and map."""
+    covariance[:3, 3:] /= 2
+    covariance[3:, :3] /= 2
+
+
+MAP_FAULTS: tuple[Change, ...] = (
+    turn_map,
+    stretch_map,
+    rotate_identities,
+    move_one,
+    shrink_map,
+    inflate_one,
+    mirror_ellipses,
+    swap_axes,
+    reverse_order,
+    halve_cross_covariance,
+)
+MAP_WORLDS = "anchored", "six_landmarks"
+
+
+def with_map(change: Change) -> type:
+    """Return the invariant filter with a fault in the map that it reports."""
+
+    class Reporting(InvariantEkfSlam):
+        """Reports a wrong map."""
+
+        def belief(self) -> Belief:
+            """Report the pose as it is, and the map with the fault."""
+            own = super().belief()
+            mean, covariance = own.mean.copy(), own.covariance.copy()
+            if own.landmark_ids:
+                change(mean, covariance)
+            return Belief(mean, covariance, own.landmark_ids, own.frame)
+
+        def predict(self, odometry: Any, dt: float = 1.0) -> None:
+            """Move as usual, but not in a batch, which has a belief of its own."""
+            super().predict(odometry, dt)
+
+    return Reporting
+
+
 UNSURE = {"start": {"std": [0.3, 0.3, 0.001], "drawn": "truth"}}
 WORLDS = {
     "anchored": load_scenario("anchored"),
@@ -481,9 +581,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=7_000_000)
     parser.add_argument("--faults", nargs="+", help="only names that contain one")
     parser.add_argument("--later", action="store_true", help="other faults and worlds")
+    parser.add_argument("--map", action="store_true", help="wrong maps")
     parser.add_argument("--no-honest", action="store_true")
     parser.add_argument("--sentences", action="store_true")
     given = parser.parse_args(arguments)
+    if given.map:
+        judge_maps(given.runs, given.seed, given.sentences)
+        return
     ratings: Counter[str] = Counter()
     linear = 0
     print("| fault | world | NEES / 3 | verdict | answer | rating |")
@@ -521,6 +625,33 @@ def honest_alarms(runs: int, seed: int) -> list[bool]:
             cause = entry["diagnosis"]["cause"]
             found.append(cause not in ("honest", CANNOT_TELL))
     return found
+
+
+def judge_maps(runs: int, seed: int, with_sentences: bool) -> None:
+    """Print how many wrong maps are refused, and how many correct ones."""
+    print("| fault of the map | world | map NEES | verdict | answer |")
+    print("|---|---|---|---|---|")
+    refused = 0
+    wrong = {change.__name__: with_map(change) for change in MAP_FAULTS}
+    for world in MAP_WORLDS:
+        summary = summarise_monte_carlo(monte_carlo(world, wrong, runs, seed))
+        for name, entry in summary["estimators"].items():
+            refused += entry["verdict"] == "not consistent"
+            ratio = entry["nees_end"]["relative_map"]
+            nees, cause = "–" if ratio is None else f"{ratio:.3g}", entry["diagnosis"]
+            row = name.replace("_", " "), world, nees, entry["verdict"], cause["cause"]
+            print(f"| {' | '.join(row)} |", flush=True)
+            if with_sentences:
+                print("   ", entry["sentence"], cause["sentence"])
+    print(f"\nrefused: {refused} of {len(MAP_FAULTS) * len(MAP_WORLDS)}")
+    words: Counter[str] = Counter()
+    for repetition in range(20):
+        world, first = MAP_WORLDS[repetition % 2], seed + 1_000_000 + runs * repetition
+        results = monte_carlo(world, "invariant", runs, first)
+        entry = summarise_monte_carlo(results)["estimators"]["invariant"]
+        words[entry["verdict"]] += 1
+    found = ", ".join(f"{word} {n}" for word, n in words.most_common())
+    print(f"without a fault: {found}")
 
 
 if __name__ == "__main__":

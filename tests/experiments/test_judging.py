@@ -551,6 +551,30 @@ def test_a_data_set_without_beliefs_is_refused(text_drives):
 # Truth from elsewhere.
 
 
+@pytest.mark.parametrize(
+    ("offset", "claimed", "accepted"),
+    [(0.0, 1.0, True), (0.5, 1.0, False), (0.0, 0.01, False), (0.0, 30.0, False)],
+)
+def test_a_map_in_the_frame_of_the_start_is_judged(offset, claimed, accepted, tmp_path):
+    drives = tmp_path / "drives"
+    generate_trajectories("anchored", drives, **JOB, estimator="invariant")
+    (tmp_path / "mine").mkdir()
+    for drive in load_trajectories(drives):
+        np.savez(
+            tmp_path / "mine" / f"seed_{drive.seed}.npz",
+            belief_poses=drive.belief_poses,
+            belief_pose_covariances=drive.belief_pose_covariances,
+            belief_landmarks=drive.belief_landmarks + np.array([offset, 0.0]),
+            belief_landmark_covariances=drive.belief_landmark_covariances * claimed,
+            belief_landmark_ids=drive.belief_landmark_ids,
+        )
+    entry = entry_of(judge(tmp_path / "mine", drives))
+    assert entry["decisions"]["final_step"]["accepted"]
+    assert entry["decisions"]["map"]["accepted"] == accepted
+    assert (entry["verdict"] == "not consistent") == (not accepted)
+    assert ("those of the map do not" in entry["reason"]) == (not accepted)
+
+
 @pytest.fixture
 def elsewhere(tmp_path, beliefs):
     """Return folders of true paths and of estimates as TUM."""

@@ -262,6 +262,16 @@ def test_a_fresh_job_removes_what_the_earlier_one_wrote_and_nothing_else(tmp_pat
     assert (tmp_path / "summary.json.aside").read_text() == "mine"
 
 
+def test_a_folder_of_another_version_is_called_so_and_kept(tmp_path):
+    monte_carlo(**JOB, runs=4, out=tmp_path).close()
+    job = tmp_path / "job.json"
+    job.write_text(re.sub(r"(slamgym monte carlo )\d+", r"\g<1>4", job.read_text()))
+    before = tree(tmp_path)
+    with pytest.raises(ValueError, match="written by another version of slamgym"):
+        monte_carlo(**JOB, runs=4, out=tmp_path)
+    assert tree(tmp_path) == before
+
+
 def test_a_folder_with_something_else_stays_as_it_is(tmp_path):
     (tmp_path / ".job.0123abcd.json").write_text("{}")
     (tmp_path / "thesis.tex").write_text("years of work")

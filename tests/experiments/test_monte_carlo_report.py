@@ -146,6 +146,82 @@ def test_the_ekf_is_refused_and_the_invariant_filter_is_consistent():
     assert "lies inside [0.8, 1.25]" in entries["invariant"]["sentence"]
 
 
+def with_wrong_map(change):
+    """Return the entry of the invariant filter, the map of whose results is changed.
+
+    `change` takes the deviations of the landmarks, (estimators, runs, landmarks, 2).
+    """
+    dataset = typical().copy(deep=True)
+    names = "landmark_deviation_x", "landmark_deviation_y"
+    deviations = np.stack([dataset[name].values for name in names], axis=-1)
+    before = (deviations**2).sum(axis=-1)
+    change(deviations)
+    for axis, name in enumerate(names):
+        dataset[name].values[:] = deviations[..., axis]
+    nees = dataset["landmark_nees_invariant"].values
+    nees *= (deviations**2).sum(axis=-1) / before
+    whole = dataset["relative_map_nees"].values
+    whole *= np.nansum(deviations**2, axis=(-2, -1)) / np.nansum(before, axis=-1)
+    return summarise_monte_carlo(dataset)["estimators"]["invariant"]
+
+
+def test_the_verdict_on_an_honest_filter_covers_the_map():
+    entry = summarise_monte_carlo(typical())["estimators"]["invariant"]
+    low, high = entry["decisions"]["map"]["interval"]
+    assert entry["reason"].endswith(f"as does that of the map, [{low:.3f}, {high:.3f}]")
+    assert 0.8 < entry["nees_end"]["worst_landmark"] < 1.6
+
+
+@pytest.mark.parametrize(("factor", "size"), [(5.0, "small"), (0.2, "large")])
+def test_a_map_of_wrong_scale_is_refused_by_name(factor, size):
+    def scale(deviations):
+        deviations *= factor
+
+    entry = with_wrong_map(scale)
+    assert entry["verdict"] == "not consistent"
+    assert not entry["accepted"]
+    assert "of the pose agree with the covariances (5 %), but" in entry["reason"]
+    assert entry["diagnosis"]["cause"] == "map"
+    assert f"scale: the covariances are too {size}" in entry["diagnosis"]["sentence"]
+    assert entry["decisions"]["final_step"]["accepted"]
+
+
+def test_one_wrong_landmark_is_refused_by_its_number():
+    def move(deviations):
+        deviations[..., 4, 0] += 4.0
+
+    entry = with_wrong_map(move)
+    assert entry["verdict"] == "not consistent"
+    assert "one landmark: the squared errors of 4 are" in entry["diagnosis"]["sentence"]
+    ratios = {
+        each["landmark"]: each["ratio"]
+        for each in entry["decisions"]["map"]["landmarks"]
+    }
+    assert max(ratios, key=ratios.get) == 4
+    assert entry["nees_end"]["worst_landmark"] == pytest.approx(ratios[4])
+
+
+def test_an_offset_of_all_landmarks_is_told_from_a_scale():
+    def move(deviations):
+        deviations[..., 1] -= 3.0
+
+    entry = with_wrong_map(move)
+    assert entry["diagnosis"]["sentence"].startswith("map: offset: the landmarks are")
+
+
+def test_the_table_has_a_row_of_the_map_and_of_its_worst_landmark():
+    text = table_text(summarise_monte_carlo(typical()))
+    assert "NEES of the map at the end" in text
+    assert "… of the worst landmark" in text
+
+
+def test_a_verdict_without_maps_covers_the_pose_only():
+    dataset = typical().drop_vars(["landmark_deviation_x", "landmark_deviation_y"])
+    entry = summarise_monte_carlo(dataset)["estimators"]["invariant"]
+    assert entry["reason"].endswith("; this covers the pose only")
+    assert entry["decisions"]["map"] is None
+
+
 def test_a_heading_better_known_than_at_the_start_is_pointed_out():
     summary = summarise_monte_carlo(typical())
     entries = summary["estimators"]
