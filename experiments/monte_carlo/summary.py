@@ -545,9 +545,11 @@ def decisions_table(report: ConsistencyReport) -> dict[str, Any]:
         ``rejected`` and one ``statistic`` per step;
         ``equivalence``, whose 90 % ``interval`` must lie inside ``margin``;
         ``runs_needed`` to find covariances too small by a factor in 90 % of cases;
-        ``map``, None where the pose alone is tested, with the 90 % ``interval`` of its
-        ratio and, for each of its ``landmarks``, the ``ratio`` seen from the robot,
-        the ``map_ratio`` in the frame of the map, and the ``mean`` error in deviations.
+        ``rate_of_each``, the share of the error rate of final step, averages and grid;
+        ``map``, None where the pose alone is tested, with its ``sentence``, the 90 %
+        ``interval`` of its ratio and, for each of its ``landmarks``, the ``ratio`` seen
+        from the robot, the ``map_ratio`` in the frame of the map, and the ``mean``
+        error in deviations.
     """
     grid, equivalence = report.family, report.equivalence
     return {
@@ -574,6 +576,7 @@ def decisions_table(report: ConsistencyReport) -> dict[str, Any]:
             "error_rate": equivalence.error_rate,
         },
         "runs_needed": {f"{factor:g}": runs for factor, runs in report.runs_needed},
+        "rate_of_each": report.deciding_rate,
         "map": report.map and _map_decision(report.map),
     }
 
@@ -582,6 +585,7 @@ def _map_decision(maps: MapReport) -> dict[str, Any]:
     """Return the decisions on the map as plain JSON types."""
     rows = zip(maps.landmarks, maps.ratios, maps.map_ratios, maps.means, strict=True)
     return {
+        "sentence": maps.sentence(),
         "statistic": finite(maps.equivalence.statistic),
         "interval": [finite(end) for end in maps.equivalence.interval],
         "p_value": maps.p_value,

@@ -215,6 +215,14 @@ def test_the_table_has_a_row_of_the_map_and_of_its_worst_landmark():
     assert "… of the worst landmark" in text
 
 
+def test_the_page_holds_the_decision_on_the_map_and_the_rate_of_the_others():
+    dataset = typical()
+    summary = summarise_monte_carlo(dataset)
+    page = html.unescape(html_report(dataset, summary)).replace("\xa0", " ")
+    assert summary["estimators"]["invariant"]["decisions"]["map"]["sentence"] in page
+    assert "one has p < 0.015." in page
+
+
 def test_a_verdict_without_maps_covers_the_pose_only():
     dataset = typical().drop_vars(["landmark_deviation_x", "landmark_deviation_y"])
     entry = summarise_monte_carlo(dataset)["estimators"]["invariant"]
