@@ -502,9 +502,9 @@ def with_map(change: Change) -> type:
     class Reporting(InvariantEkfSlam):
         """Reports a wrong map."""
 
-        def belief(self) -> Belief:
+        def belief(self, landmark_ids: Any = None) -> Belief:
             """Report the pose as it is, and the map with the fault."""
-            own = super().belief()
+            own = super().belief(landmark_ids)
             mean, covariance = own.mean.copy(), own.covariance.copy()
             if own.landmark_ids:
                 change(mean, covariance)
