@@ -6,9 +6,9 @@ Each of 23 faults, of a filter or of its readings, is tried in three worlds wher
 filter without the fault is consistent, and 20 studies have none. An answer is right if
 it names the kind of the fault, or if the fault changes so little that the verdict is
 "consistent" or "nearly consistent"; "cannot tell" is counted by itself. `--later` tries
-20 other faults in three other worlds: neither were known when the rules were developed.
-`--map` reports wrong maps beside correct poses in two worlds, and counts the studies
-that are refused, and those of 20 without a fault. `--seed` gives other random numbers.
+20 other faults in three other worlds, unknown when the rules were developed. `--map`
+reports wrong maps beside correct poses in two worlds, and counts the refused studies,
+also among 20 without a fault. `--seed` gives other random numbers.
 """
 
 from __future__ import annotations
@@ -280,7 +280,7 @@ class SquaresDt(EkfSlam):
 
 
 def repeated(runs: Any) -> Any:
-    """Return runs whose every fifth scan is that of the step before."""
+    """Return runs in which every fifth scan repeats that of the step before."""
     measurements, visible = runs.measurements.copy(), runs.visible.copy()
     for array in (measurements, visible):
         array[:, 5::5] = array[:, 4:-1:5][:, : array[:, 5::5].shape[1]]
@@ -288,7 +288,7 @@ def repeated(runs: Any) -> Any:
 
 
 def turned(runs: Any) -> Any:
-    """Return runs whose camera is mounted with .03 rad."""
+    """Return runs whose camera is mounted with an error of .03 rad."""
     return runs._replace(measurements=runs.measurements + np.array([0.03, 0]))
 
 
@@ -299,14 +299,14 @@ def noise_of(runs: Any, column: int) -> Array:
 
 
 def scaled_far(world: Scenario, runs: Any) -> Any:
-    """Return runs whose noise of ranges is 1.6 times beyond the median range."""
+    """Return runs with 1.6 times the range noise beyond the median range."""
     noise = noise_of(runs, 1)
     far = runs.measurements[..., 1] > np.median(runs.measurements[..., 1][runs.visible])
     return with_noise(runs, 1, np.where(far, 1.6, 1.0) * noise)
 
 
 def per_metre(world: Scenario, runs: Any) -> Any:
-    """Return runs whose noise of ranges grows by a deviation over 6 m."""
+    """Return runs whose range noise grows by a standard deviation every 6 m."""
     noise = noise_of(runs, 1)
     ranges = runs.measurements[..., 1] - noise
     return with_noise(runs, 1, (0.6 + ranges / 6) * noise)
@@ -319,7 +319,7 @@ def long_ranges(world: Scenario, runs: Any) -> Any:
 
 
 def wild_bearings(world: Scenario, runs: Any) -> Any:
-    """Return runs where 5 % of the bearings err by six deviations."""
+    """Return runs in which 5 % of the bearings have six times the noise."""
     wild = np.random.default_rng(7).random(runs.visible.shape) < 0.05
     return with_noise(runs, 0, np.where(wild, 6.0, 1.0) * noise_of(runs, 0))
 

@@ -7,8 +7,8 @@ Two linear Kalman filters, 50 runs. One forgets its errors within a few steps. T
 estimates three constants and never forgets. All figures are shares of 2000 repetitions,
 with a statistical error of half a percentage point.
 
-With ``looks``, the same filters are watched after every run; a ratio is what squared
-errors are multiplied by. "extended" is a study whose verdict is read after 50, 100,
+With ``looks``, the same filters are watched after every run. A ratio multiplies the
+squared errors. "extended" is a study whose verdict is read after 50, 100,
 200, 400 runs. A second table shows how many runs real filters need.
 """
 

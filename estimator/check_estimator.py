@@ -131,7 +131,7 @@ def find_breaches(
     factory: Factory | str,
     levels: Sequence[Level] = ("required", "correct", "recommended"),
 ) -> tuple[Finding, ...]:
-    """Return what `check_estimator` finds at some levels, and raise nothing for it.
+    """Return the findings of `check_estimator` at some levels, without raising them.
 
     Examples
     --------
@@ -156,7 +156,7 @@ def find_breaches(
 
 
 def _callable(factory: Factory | str) -> Factory:
-    """Return the factory of a name, or what is given if it is one."""
+    """Return the factory of a name, or the given factory."""
     if isinstance(factory, str):
         name, options = read_label(factory)
         return partial(find_estimator(name), **options)
@@ -451,9 +451,9 @@ def check_motion(factory: Factory) -> Iterator[str]:
 
 
 def check_steps(factory: Factory) -> Iterator[str]:
-    """Check how each call moves mean and covariance; name a mistake where it can.
+    """Check how each call moves mean and covariance; name the mistake if it is known.
 
-    The checks of single models look only at methods in which no mistake has a name:
+    The checks of single models run only for methods without a named mistake, because
     they describe the same deviation in general words.
     """
     made = partial(Trial, factory)

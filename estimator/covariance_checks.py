@@ -1,14 +1,14 @@
 """Check how an estimator moves mean and covariance in every call: `step_mistakes`.
 
 If all noise is small, every filter follows the equations of the linear Kalman filter,
-whatever its inner coordinates are.  An irregular drive compares each call with these
-equations, from the belief before the call, so that one mistake does not hide another::
+whatever its inner coordinates are.  Each call of an irregular drive is compared with
+these equations, from the belief before it, so that one mistake does not hide another::
 
     predict    P' = G P Gᵀ + F R Fᵀ dt
     new l      P_lp = J P,    P_ll = J P Jᵀ + N Q Nᵀ,       J = ∂l/∂p, N = ∂l/∂z
     update     K = P Hᵀ S⁻¹,  S = H P Hᵀ + Q,  P' = P − K S Kᵀ,  x' = x + K ν
 
-Beliefs that differ are compared with those of frequent mistakes, the tables
+A belief that differs is compared with those of frequent mistakes, in the tables
 ``_MOTION``, ``_ADDITION``, ``_CORRECTION`` and ``_AFTERWARDS``.  The finding names the
 mistake that gives the same numbers in all of these calls, or at least in most.
 """
@@ -138,7 +138,7 @@ class _Motion(NamedTuple):
     def fitted(
         self, got: _Gaussian
     ) -> Iterator[tuple[str, Callable[[Any], _Gaussian]]]:
-        """Yield mistakes of a factor, which is that of the belief after this call."""
+        """Yield mistakes by a factor, which is fitted to the belief after this call."""
         kept = self._replace(R=0 * self.R).right().covariance
         inner = self.F.T @ (got.covariance - kept)[:3, :3] @ self.F  # F⁻¹ = Fᵀ
         yield from _noise_factors(
@@ -314,7 +314,7 @@ class _Scan(NamedTuple):
     def fitted(
         self, got: _Gaussian
     ) -> Iterator[tuple[str, Callable[[Any], _Gaussian]]]:
-        """Yield mistakes of a factor, which is that of the belief after this call."""
+        """Yield mistakes by a factor, which is fitted to the belief after this call."""
         yield from _covariance_changes(self.right(), got)
         if not (self.slots or len(self.new)):
             return
@@ -751,7 +751,7 @@ _AFTERWARDS: Sequence[tuple[str, Callable[[_Gaussian], _Gaussian]]] = (
 
 
 def _joined(within: Array, across: Array) -> Array:
-    """Return covariances of the pose, and of landmarks, and those across, from two."""
+    """Join covariances within pose and map, and those across, from two matrices."""
     P = within.copy()
     P[:3, 3:], P[3:, :3] = across[:3, 3:], across[3:, :3]
     return P
@@ -848,12 +848,12 @@ class _Made(NamedTuple):
 
     @property
     def used(self) -> bool:
-        """Whether the call is no empty scan."""
+        """Whether the call is not an empty scan."""
         call = self.call
         return isinstance(call, _Motion) or bool(call.slots or len(call.new))
 
     def wrong_part(self) -> str | None:
-        """Return the method that went wrong, "" if none, None for no fair start."""
+        """Return the wrong method, "" if none is, None if the call cannot be judged."""
         try:
             right = self.call.right()
         except np.linalg.LinAlgError:

@@ -87,7 +87,7 @@ class ConsistencyReport:
 
     @property
     def accepted(self) -> bool:
-        """Whether no run failed and no NEES test rejects, of the pose or of the map.
+        """Whether no run failed and no test of the NEES of pose or map rejects.
 
         A consistent filter is rejected in at most 5 % of cases.
 
@@ -102,7 +102,7 @@ class ConsistencyReport:
 
     @property
     def p_value(self) -> float:
-        """p-value of all tests that decide, together: those of pose and map."""
+        """p-value of all deciding tests together: those of pose and map."""
         if self.map is None:
             return self.pose_p_value
         of_map = self.map.p_value * _ERROR_RATE / map_consistency.ERROR_RATE

@@ -11,7 +11,7 @@ The tests answer three questions in this order.
    what it was, and the filter knows this (`excess_of`)?  An excess that vanishes is of
    the linearisation.  One that stays is of a wrong Jacobian or covariance: both
    scale with the noise.  One that grows is of a wrong model, whose errors do not.
-   With a hundredth of the noise, nearly every filter is linear, and decides.
+   With a hundredth of the noise, nearly every filter is linear: these runs decide.
 
 A cause is named only if it explains what the errors show: its sign and its size must
 agree with them, and an interval must show that an excess vanishes.
@@ -270,19 +270,19 @@ def _checked(nees: ArrayLike, heading_nees: ArrayLike) -> tuple[Array, Array]:
     return pose[:, first:], heading[:, np.isfinite(heading).all(axis=0)]
 
 
-#: Times of what a wrong size of noise explains that errors of a nonlinear filter reach.
+#: Factor by which errors of nonlinear filters may exceed what the noise explains.
 _SLACK = 2.0
 
 
 def _explains(finding: noise_findings.Finding, errors: Errors) -> bool:
-    """Whether a fault of the noise changes the errors in the way that they show."""
+    """Whether a fault of the noise changes the errors in the observed direction."""
     if errors.p_value >= FILTER_RATE:
         return True
     return finding.sign != (-1 if errors.ratio > 1 else 1)
 
 
 def _exceeds(pose: Array, heading: Array, most: float) -> bool:
-    """Whether the squared errors are shown to be larger than a number of times."""
+    """Whether the squared errors significantly exceed a multiple of those stated."""
     return math.isfinite(most) and any(
         score.mean() > most
         and _beyond_margin(score.mean(axis=1) / most) < FILTER_RATE / 2
@@ -403,7 +403,7 @@ class Errors(NamedTuple):
     diverged: int
     #: "pose" or "heading".
     of: str
-    #: That their averages are 1, without the margin of a tenth.
+    #: p-value that their averages are 1, without the margin of a tenth.
     p_of_one: float
 
     @property
@@ -482,9 +482,9 @@ def runs_to_repeat(
     pose, heading : ndarray, shape (M, K), (M, L)
         As for `errors_of`.
     small : SmallNoise, optional
-        Of runs that were repeated before.
+        The runs that were repeated before.
     cause : str
-        To which they point.
+        The cause that they suggest.
     """
     if small is not None and cause == LINEARISATION:
         return 0
@@ -533,11 +533,11 @@ def excess_of(
 
     With the average NEES per degree a of a run and b with less noise, the excess b − 1
     is tested against shares of a − 1 (t-test over runs): `SHRINKS`, and one over the
-    factor by which the noise is smaller, the mean of what a wrong covariance and a
-    wrong model do.  If there are runs with two factors, a is that of the larger one: a
-    filter that diverges with all noise is no measure.  If most runs err clearly, or if
-    some diverged, the answer is what most of these runs show, because a few of them
-    make the average.
+    factor by which the noise is smaller, the mean of the shares that a wrong covariance
+    and a wrong model give.  If there are runs with two factors, a is that of the larger
+    one, because a filter that diverges with all noise gives no reference.  If most runs
+    err clearly, or if some diverged, the answer is what most of these runs show,
+    because a few of them determine the average.
 
     An excess vanishes only if the 90 % interval of b shows that it is small.
 
@@ -624,7 +624,7 @@ def _shrunk_errors(small: SmallNoise) -> float:
 
 
 class _Rest(NamedTuple):
-    """What less noise leaves of the errors, NEES per degree."""
+    """The errors that remain with less noise, as NEES per degree."""
 
     #: "pose" or "heading".
     of: str
@@ -641,7 +641,7 @@ class _Rest(NamedTuple):
     few_diverged: bool
 
     def text(self, factor: float, times: float) -> str:
-        """Write the finding; the noise explains a number of times of it."""
+        """Write the finding, with the ratios multiplied by ``times``."""
         ratio, low, high = (times * x for x in (self.ratio, self.low, self.high))
         found = (
             f"With {_share(factor)} of the noise, the squared errors of the {self.of} "
@@ -690,7 +690,7 @@ def _averages_of(small: SmallNoise) -> dict[str, Array]:
 def _pairs(
     pose: Array, heading: Array, small: SmallNoise
 ) -> list[tuple[str, Array, Array]]:
-    """Return what is known of each run: name, NEES per degree, and with less noise."""
+    """Return name, NEES per degree of each run, and the same with less noise."""
     after = _averages_of(small)
     found = [("pose", pose.mean(axis=1) / POSE, after["pose"])]
     if heading.size and np.isfinite(after["heading"]).any():

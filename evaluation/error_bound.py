@@ -102,7 +102,7 @@ def posterior_bound(
         bound of other sensors is nan: their first reading of a landmark is no bound.
     origin : (float, float)
         Origin of the invariant frame [m].  It must lie near the path: about a distant
-        one, every error is that of the heading, and the others lose their digits.
+        one, the heading error dominates, and the other errors lose their digits.
 
     Raises
     ------

@@ -1,10 +1,10 @@
 """Tests whether the covariances of final maps agree with their errors: `map_test`.
 
 A landmark is judged by its position relative to the robot, which a rotation or
-translation of the world does not change. Linearisation lifts the NEES even of a good
+translation of the world does not change. Linearisation raises the NEES even of a good
 filter by some percent, which many landmarks and runs would show with certainty.
-Therefore no test asks whether a ratio is exactly 1, but whether it lies outside the
-margin of :data:`.hypothesis_tests.EQUIVALENCE_MARGIN`, [.8, 1.25].
+The tests therefore ask not whether a ratio is exactly 1, but whether it lies outside
+the margin of :data:`.hypothesis_tests.EQUIVALENCE_MARGIN`, [.8, 1.25].
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .hypothesis_tests import EQUIVALENCE_MARGIN, EquivalenceTest, equivalence_t
 
 #: Length of a mean error that counts as zero, in deviations.
 BIAS_MARGIN = 0.25
-#: Rejections of a consistent map that the whole of its tests may have.
+#: Rate at which all its tests together may reject a consistent map.
 ERROR_RATE = 0.005
 _POINT = 2  # degrees of freedom of a landmark
 #: Tests that share it: of the whole map, of each landmark, seen from the robot and in

@@ -54,7 +54,7 @@ class Finding(NamedTuple):
     text: str
     #: 1 if it makes errors larger than the covariances state, -1 if smaller, else 0.
     sign: int = 1
-    #: Ratio of the NEES of a linear filter that it explains, at most.
+    #: Largest ratio of the NEES that it explains in a linear filter.
     at_most: float = np.inf
 
 
@@ -110,7 +110,7 @@ def significant_findings(sums: Array, error_rate: float) -> list[Finding]:
 
 def _tests(channel: str, total: Array, runs: int) -> Iterator[Finding]:
     known = dict(zip(MOMENTS, total.tolist(), strict=False))
-    found = dict.fromkeys(MOMENTS, 0.0) | known  # results of before have no distances
+    found = dict.fromkeys(MOMENTS, 0.0) | known  # earlier results have no distances
     count = found["count"]
     mean = found["first"] / count
     variance = (found["second"] - count * mean**2) / (count - 1)

@@ -32,7 +32,7 @@ from ..arrays import Array
 SCALES = np.delete(np.geomspace(0.3, 20.0, 43), 12)
 #: Number of runs below which a confidence sequence shows nothing.
 FEWEST_SHOWN = 30
-#: That of both ends together, so that each end, too, stays below 5 % for the skewed
+#: Rate of both ends together. Each end then stays below 5 % also for the skewed
 #: averages of NEES, for which the asymptotic rate is exceeded.
 SHOWN_ERROR_RATE = 0.07
 _LARGEST_LOG = 700.0

@@ -53,7 +53,7 @@ class Estimate(NamedTuple):
 def true_path(path: Path) -> Array:
     """Read rows (t, x, y, θ); without times, t counts the poses.
 
-    Times grow: rows that repeat the one before them are left out.
+    Times must increase. Rows that repeat the one before them are left out.
     """
     if is_tum(path):
         lines = content_lines(path)
@@ -68,14 +68,14 @@ def true_path(path: Path) -> Array:
 
 
 def is_tum(path: Path) -> bool:
-    """Whether the first line that is no comment has the numbers of a row of TUM."""
+    """Whether the first line that is not a comment has the numbers of a row of TUM."""
     lines = content_lines(path) if path.is_file() else []
     fields = lines[0].text.split() if lines else []
     return len(fields) in (8, *(8 + size for size in _TUM_SIZES))
 
 
 def growing_rows(rows: Array, places: Sequence[str]) -> IntArray:
-    """Return which rows (t, …) to keep so that times grow; refuse others.
+    """Return which rows (t, …) to keep so that times increase; refuse unsorted ones.
 
     Parameters
     ----------
@@ -109,10 +109,10 @@ _CSV = (
 )
 _TUM = "t x y z qx qy qz qw and 6, 9, 21 or 36 entries of a covariance"
 _ENDINGS = (".csv", ".tum", ".txt", ".npz")
-_UNIT = 0.1  # by which the length of a quaternion may differ from 1
+_UNIT = 0.1  # largest difference of the length of a quaternion from 1
 _TILT = np.pi / 6  # of a robot that has a heading
-_GAP = 3.0  # of the truth, in rows of it that are usual
-_CLIMB = 0.05  # of a path, and tilt, that are not of a plane
+_GAP = 3.0  # of the truth, in usual intervals of its rows
+_CLIMB = 0.05  # and tilt: beyond it, a path is not planar
 _POSE_SIZES, _TUM_SIZES = (6, 9), (6, 9, 21, 36)
 
 
@@ -298,7 +298,7 @@ def _of_npz(file: Path) -> Iterator[tuple[Any, Estimate]]:
 
 
 def content_lines(path: Path) -> list[LogLine]:
-    """Read the lines of a file that are no comments."""
+    """Read the lines of a file that are not comments."""
     return [line for line in read_lines(path) if not line.text.startswith("#")]
 
 

@@ -372,14 +372,14 @@ class _Inside(NamedTuple):
     truth: Array
     #: Poses of the file that have none.
     left_out: int = 0
-    #: Of the time stamps, where they were converted.
+    #: Unit of the time stamps, if they were converted.
     unit: str = ""
 
 
 def _within(estimate: Estimate, path: Array) -> _Inside:
     """Return the estimates at times of a true path (n, 4), and the truth there.
 
-    A pose in a gap of the truth, where a straight line would be no truth, has none.
+    A pose in a gap of the truth has none, because no interpolation is valid there.
     """
     if estimate.times is None:
         if len(estimate.poses) != len(path):
@@ -593,12 +593,12 @@ def _add_map(
     pose: Array,
     heading_variance: float,
 ) -> str:
-    """Measure the final map of a run into its block; return why it is none.
+    """Measure the final map of a run into its block; return the problem, if any.
 
     The files hold no covariances between pose and map. So the verdict covers the
     landmarks in the frame of the map, unless the heading of the start is so uncertain
-    that it bends their errors, whose NEES then is not χ². An infinite variance of it
-    stands for estimates that are aligned, whose landmarks are not.
+    that it bends their errors, whose NEES then is not χ². An infinite variance stands
+    for aligned estimates, whose landmarks are not aligned.
     """
     ids, count = estimate.landmark_ids.tolist(), runs.landmarks.shape[1]
     if not ids or not count:

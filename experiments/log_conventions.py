@@ -1,9 +1,9 @@
 """Name the convention that a log breaks: `mistake_in`.
 
 A log with clockwise bearings, degrees or shifted rows looks like a log with much noise.
-`mistake_in` reads a part of the log in each of the conventions that people mix up, and
-names the one in which its readings agree with its odometry. A log that agrees in its
-own convention, or in none, has nothing to name. No truth is needed.
+`mistake_in` reads a part of the log in each of the conventions that are often confused,
+and names the one in which its readings agree with its odometry. It names nothing if the
+log agrees as given, or in no convention. No truth is needed.
 
 Symbols
 -------
@@ -44,9 +44,9 @@ _GAIN, _TOTAL, _LEAD = 0.2, 20.0, 0.05
 _USUAL = (0.6, 1.4)
 #: Loss by the noise as given that is no reason to look at other conventions [nats].
 _LOSS = 0.1
-_SKIPPED = 10.0  # loss by a reading without use, such as one of range ≤ 0 [nats]
-_TWIN = 1e-3  # by which two readings differ that are mirror images [nats]
-_NEARER = 2.0  # by which the truth tells mirror images apart
+_SKIPPED = 10.0  # loss by an unusable reading, such as one of range ≤ 0 [nats]
+_TWIN = 1e-3  # largest difference of two mirror images [nats]
+_NEARER = 2.0  # factor of errors by which the truth separates mirror images
 #: Factors of the noise as given, of motion and of sensor; of `_FEW`, a few of them.
 _SIZES = (1 / 16, 1 / 4, 1.0, 4.0, 16.0)
 _FACTORS = np.array(list(product(_SIZES, _SIZES)))
@@ -72,11 +72,11 @@ class Mistake(NamedTuple):
     nis: tuple[float, float]
     #: Share of the readings that the gate rejects, likewise.
     rejected: tuple[float, float]
-    #: Factors of the noise of motion and sensor under which both are so.
+    #: Factors of the noise of motion and sensor under which both hold.
     factors: tuple[float, float] = (1.0, 1.0)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the mistake as plain JSON types; each pair is of it, and as given."""
+        """Return plain JSON types; each pair is in this convention, and as given."""
         return {**self._asdict(), "text": str(self)}
 
     def __str__(self) -> str:
@@ -125,9 +125,9 @@ def mistake_in(log: slamlog.SlamLog, settings: FilterSettings) -> Mistake | None
     Parameters
     ----------
     log : SlamLog
-        Bearings and ranges with identities; nothing is named of other logs.
+        Bearings and ranges with identities; other logs give None.
     settings : FilterSettings
-        Of a filter of the log, for its noise.
+        Settings of a filter for the log, which state its noise.
 
     Examples
     --------
@@ -204,7 +204,7 @@ def part_of(log: slamlog.SlamLog) -> Reading:
 
 
 def events_of(reading: Reading) -> DriveEvents:
-    """Return what a filter takes of a part of a log."""
+    """Return the input of a filter for a part of a log."""
     d, alpha, dt = reading.rows.T
     zero = np.zeros_like(d)
     motions = {
@@ -396,7 +396,7 @@ class Other(NamedTuple):
 
 
 def others(given: Reading) -> Iterator[Other]:
-    """Yield a part of a log as read in the conventions that people mix up."""
+    """Yield a part of a log as read in the conventions that are often confused."""
     yield from _of_measurements(given)
     yield from _of_odometry(given)
     yield from _shifted(given)

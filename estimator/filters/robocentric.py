@@ -24,8 +24,8 @@ from .gaussian_map import LANDMARKS, complete, parts_jit, update_map
 # since that scan in place of the pose; the start (x, y), the world's heading and a zero
 # in place of the first two landmarks; then the landmarks.  The start is where the robot
 # was expected at first, a point of the world near the drive.  The world's origin may
-# lie far away, where the smallest turn moves it by more than the map is uncertain.  The
-# start's place in the world is the reference of the first landmark.
+# lie so far away that the smallest turn moves it by more than the map's uncertainty.
+# The start's place in the world is the reference of the first landmark.
 ORIGIN, HEADING, FIRST_LANDMARK = 3, 5, 7
 RESERVED = (-(2**63), 1 - 2**63)  # ids of these two places
 TAKEN = -5  # status of an update with one of these ids

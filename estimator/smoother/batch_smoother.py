@@ -136,7 +136,7 @@ def smooth(
 def _seen_from(
     origin: Array, landmarks: Mapping[int, ArrayLike], start: Start | None
 ) -> tuple[dict[int, ArrayLike], Start | None]:
-    """Return what to start from with positions relative to another origin."""
+    """Return the initial values with positions relative to another origin."""
     given: dict[int, ArrayLike] = {
         i: argument_checks.finite_vector(f"landmarks[{i}]", place, 2) - origin
         for i, place in landmarks.items()
@@ -146,7 +146,7 @@ def _seen_from(
     if isinstance(start, Belief):
         return given, replace(start, mean=seen_from(origin, start.mean))
     poses = argument_checks.as_floats("start", start)
-    shaped = poses.ndim > 0 and poses.shape[-1] == 3  # else refused with its shape
+    shaped = poses.ndim > 0 and poses.shape[-1] == 3  # else refused later
     return given, seen_from(origin, poses) if shaped else poses
 
 
@@ -297,7 +297,7 @@ class SmoothedDrive:
     drive : Drive
         What was smoothed.
     origin : ndarray, shape (2,)
-        About which the optimiser and the drive know their positions [m].
+        Origin of the positions in the optimiser and the drive [m].
     """
 
     def __init__(

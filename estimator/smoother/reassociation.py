@@ -10,11 +10,11 @@ that the readings cover: together the negative logarithm of the evidence, by Lap
 approximation [1]_.  u readings are given to no landmark, each for the price c of
 clutter.  L is the likelihood of the detections: scans show or miss the landmarks that
 are well in view, as a Markov chain with two states, whose rates are those of the drive.
-Without it, two landmarks for one would lower the cost, each of them with the nearer
-half of the readings; but then each of them is missed when the other is shown.
+Without L, two landmarks in place of one would lower the cost, each with the nearer half
+of the readings.  But each of them is then missed whenever the other is shown.
 
-The result must be better by more than chance where both associations explain equally
-many readings; else the drive stays as it was given.  Real readings have errors that no
+The result must be better by more than chance when both associations explain equally
+many readings.  Otherwise, the drive stays as given.  Real readings have errors that no
 noise explains, and an additional landmark explains them at the price of a wrong path.
 
 The search begins with the associations given or, if these score lower, with those of
@@ -160,8 +160,8 @@ class _State(NamedTuple):
     def advantage_of(self, other: _State) -> float:
         """Return by how much another state is better with equally many readings.
 
-        The state that explains more readings gets the cost of as many as the other one
-        explains, by its average, and no credit for the others.
+        The cost of the state that explains more readings is scaled to the number of the
+        other one.  The additional readings give no credit.
         """
         mine, others = self.used, other.used
         gain = self.score - PRICE * (len(self.labels) - mine) - self.cost

@@ -94,14 +94,14 @@ def fit_noise(log: LogFile, *, given: FitNoiseOptions) -> None:
 def _show_fit(
     summary: dict[str, Any], mistake: "Mistake | None", reporter: Reporter
 ) -> None:
-    """Print a fit; of a log with a mistake, that first, and no noise to use."""
+    """Print a fit; for a log with a mistake, print the mistake first, and no noise."""
     from .tables import advice, heading, noise_comparison_table, noise_table
 
     title = heading("Noise of ", summary["log"], ", by ", summary["estimator"])
     if mistake is not None:
         no_noise = "No noise is suggested, because it would hide the mistake."
         reporter.show(title, Text(f"Warning: {mistake} {no_noise}", "yellow"), "")
-        title = Text("What the fit makes of the log as it is:", "dim")
+        title = Text("The fit to the log as it is:", "dim")
     compared = noise_comparison_table(summary)
     reporter.show(title, noise_table(summary), "", compared, "")
     if mistake is None:

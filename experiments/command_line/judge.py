@@ -114,7 +114,7 @@ def _judge_in_space(files: FilesOfEstimates, given: JudgeOptions, space: str) ->
         raise BadInputError(unknown_choice("--space", space, ERRORS))
     others = (given.drives, given.covariances, given.frame, given.align, given.out)
     if given.truths is None or any(each is not None for each in others):
-        raise BadInputError("--space needs --truth, and takes no other option but it")
+        raise BadInputError("--space needs --truth, and accepts no other option")
     found = judge_in_space(
         files, given.truths, covariances=kind, order=order or ORDERS[0]
     )

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Of a map whose covariance is written: 32 MB.
+#: Largest map whose covariance is written: 32 MB.
 _MOST_LANDMARKS = 1000
 _FEW_STEPS = 60  # of a run whose every step is drawn by default
 
@@ -128,7 +128,7 @@ def filter_and_write(
         for run, settings in zip(runs, filters.values(), strict=True)
     ]
     mistake = mistake_in(log, next(iter(filters.values())))
-    if mistake is not None:  # which is no matter of noise
+    if mistake is not None:  # not a matter of noise
         for summary in summaries:
             summary["warnings"] = [str(mistake)]
     named = {"mistake": None if mistake is None else mistake.as_dict()}

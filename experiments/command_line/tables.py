@@ -440,7 +440,7 @@ def advice(summary: dict[str, Any]) -> Table:
     if lost > MOST_REJECTED * count:
         text = (
             f"{lost} of {count} readings ({lost / count:.0%}), which fit no noise: the "
-            "noise is that of the others alone"
+            "noise is fitted to the others alone"
         )
         rows.append(("given up", text))
     if summary["calibration"] is not None:

@@ -315,12 +315,12 @@ def _parse(lines: list[LogLine], default_name: str) -> SlamLog:
 
 
 def with_header(log: SlamLog, header: Mapping[str, LogLine]) -> SlamLog:
-    """Return a log with what lines ``# key: value`` set, by their keys.
+    """Return a log with the settings of lines ``# key: value``, given by key.
 
     Raises
     ------
     LogError
-        If the value of a known key is none of it.
+        If a known key has an invalid value.
     """
     notes = {key: _value(line) for key, line in header.items()}
     for key in _NOISES & notes.keys():

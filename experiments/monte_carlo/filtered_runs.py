@@ -249,7 +249,7 @@ def covariance_flaw(covariance: Array, names: Sequence[str] = _POSE_NAMES) -> st
     ----------
     covariance : ndarray, shape (n, n)
     names : sequence of str
-        Of its n numbers.
+        Names of the n numbers.
 
     Examples
     --------
@@ -318,9 +318,9 @@ def _names(parts: Sequence[str]) -> list[str]:
 
 
 def first_flaw(settings: FilterSettings, runs: SimulatedRuns, run: int) -> str:
-    """Repeat a run, and write since when and where its covariance is indefinite.
+    """Repeat a run; write from which step and where its covariance is indefinite.
 
-    It is "" if it never is, or if the filter knows the truth.
+    The result is "" if it never is, or if the filter knows the truth.
     """
     slam = settings.make(runs.initial_poses[run])
     trace = FilteredRuns.unknown(runs).trace

@@ -226,7 +226,7 @@ def _sequential_verdict(
     lies = f"lies inside {_MARGIN}" if inside else f"is not inside {_MARGIN}"
     interval = f"the {_INTERVAL} of the ratio, [{low:.3f}, {high:.3f}], {lies}"
     if not np.isfinite(high):
-        interval = f"{counted(FEWEST_SHOWN, 'run')} at least are needed to show it"
+        interval = f"{counted(FEWEST_SHOWN, 'run')} or more are needed to show it"
     refusal, by_map = _refusal(scores, frame, report, watch, looks)
     if by_map:
         return Verdict(NOT_CONSISTENT, refusal, by_map)
@@ -276,7 +276,7 @@ def _refusal(
                 what = f"of the map, {map_refusal(found.map)}"
             else:
                 what = f"{p_text(found.p_value)}; 5 % over all looks); {what}"
-            start = f"the first verdict, after {after}, rejected it, which stands"
+            start = f"the first verdict, after {after}, rejected it, and stands"
             return f"{start}{': ' if by_map else ' ('}{what}", by_map
     return "", False
 

@@ -97,7 +97,7 @@ def test_a_study_that_is_not_decided_ends_with_its_runs():
     assert found.sizes["run"] == 20
     entry = summarise_monte_carlo(found)["estimators"]["invariant"]
     assert entry["verdict"] == "not shown"
-    assert "30 runs at least are needed" in entry["sentence"]
+    assert "30 runs or more are needed" in entry["sentence"]
 
 
 def test_the_python_call_of_a_study_until_decided_repeats_it(decided):

@@ -271,7 +271,7 @@ def _format_of_log(
 def _format_of(
     source: Path, lines: list[log_lines.LogLine]
 ) -> tuple[str, named_columns.Table | None]:
-    """Detect the format from the first lines of a file that are no comments."""
+    """Detect the format from the first lines of a file that are not comments."""
     if slamlog.format_line_of(lines) is not None:
         return "slamlog", None
     content = log_lines.content_of(lines)

@@ -132,7 +132,7 @@ class Table(NamedTuple):
         return found
 
     def number(self, row: Cells, column: str) -> float:
-        """Read a cell in SI units; raise LogError for what is no finite number."""
+        """Read a cell in SI units; raise LogError unless it is a finite number."""
         place, scale = self.columns[column]
         return row.line.to_real(row.fields[place]) * scale
 
@@ -285,7 +285,7 @@ def read_named(tables: Sequence[Table], name: str, source: Path) -> slamlog.Slam
     Raises
     ------
     LogError
-        If there is no odometry or are no measurements, or two tables of one kind, or a
+        If odometry or measurements are missing, if two tables have one kind, or if a
         row is malformed.
     """
     of = _by_kind(tables, source)
@@ -371,7 +371,7 @@ def lacking(kind: str, tables: Sequence[Table], source: Path) -> slamlog.LogErro
 
 
 class _Motion(NamedTuple):
-    """The odometry between two times, and the second one is that of a row."""
+    """The odometry between two times; the second one is that of a row."""
 
     line: log_lines.LogLine
     start: float
@@ -448,8 +448,8 @@ def _readings(table: Table, on_clock: Callable[[Array], Array]) -> _TimedReading
 def _true_start(first: _Motion, truth: Array) -> Array:
     """Return the true pose before the first motion, nan where unknown.
 
-    The truth may begin within the first half of the motion, for stamps are rounded, or
-    at the end of a motion of nothing.
+    The truth may begin within the first half of the motion, because stamps are rounded,
+    or at the end of an empty motion.
     """
     start = first.start
     latest = start + (first.end - start) / 2 if any(first.increment) else first.end
