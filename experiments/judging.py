@@ -20,6 +20,7 @@ from ..arrays import AnyArray, Array
 from ..estimator.filters.batch import BatchTrace
 from ..estimator.models.rigid_motion import pose_rotation
 from ..estimator.support import argument_checks
+from ..evaluation.consistency_report import evaluate_consistency
 from ..evaluation.error_bound import PosteriorBound
 from ..evaluation.nees import normalised_squared_error, whitened
 from ..evaluation.noise_findings import CHANNELS, MOMENTS
@@ -41,6 +42,7 @@ from .estimate_files import (
 from .monte_carlo.filtered_runs import Failure, FilteredRuns, bound_runs, noise_of_runs
 from .monte_carlo.results import provenance
 from .monte_carlo.run_measures import (
+    LARGEST_SCORE,
     VARIABLES,
     Block,
     by_id,
@@ -49,6 +51,7 @@ from .monte_carlo.run_measures import (
     measure_runs,
     write_failures,
 )
+from .monte_carlo.verdict import POSE_FREEDOM
 from .runs.simulated_runs import SimulatedRuns
 from .trajectories.manifest import MANIFEST, TrajectoryDataset, load_trajectories
 from .trajectories.trajectory import Trajectory, array_of
@@ -103,9 +106,12 @@ def judge(
     covariances : {"additive", "invariant", "right", "left"}, optional
         The error whose covariances the files hold; "right" is "invariant". Its NEES
         decides; for "left" that of the invariant error, which is the same. By default
-        covariances are read as additive, and the invariant error decides, or the
-        additive one if its mean NEES is nearer to 3 and at most 1.5 times off. For
-        beliefs of filters in a data set, it is the invariant one.
+        covariances are read as additive, and the additive or the invariant error
+        decides: the one that rejects fewer estimators, so that one which is honest in
+        either is rejected in at most 5 % of cases. Where both reject equally many, it
+        is the invariant one, or the additive one if its mean NEES is nearer to 3 and at
+        most 1.5 times off. For beliefs of filters in a data set, it is the invariant
+        one.
     align : "fit" or (x, y, θ), optional
         A motion [m, m, rad] of all estimates, covariances included, into the frame of
         the truth. "fit" finds the one that brings each path closest to the truth; NEES
@@ -153,7 +159,7 @@ def judge(
             parts[label].append(_measured(chunk, files, frame, align))
     decides = "additive" if covariances == "additive" else "invariant"
     if covariances is None and not task.is_own:
-        decides = _nearest([part for each in parts.values() for part in each])
+        decides = _deciding(parts)
     mistakes = {
         label: _mistakes(each, task, frame, decides) for label, each in parts.items()
     }
@@ -622,16 +628,41 @@ def _add_map(
     return ""
 
 
-def _nearest(parts: Sequence[_Part]) -> str:
-    """Return the error whose mean NEES is nearer to 3; invariant if neither is near."""
-    found = {}
+def _deciding(parts: Mapping[str, Sequence[_Part]]) -> str:
+    """Return the error that decides where none is declared.
+
+    It is the one that rejects fewer estimators. A choice by the mean NEES alone would
+    reject an honest estimator in more than 5 % of cases, because it may choose the
+    error in which the estimator is not honest.
+    """
+    rejected, gaps = {}, {}
     for frame in ("invariant", "additive"):
-        nees = np.concatenate([part.block[f"pose_nees_{frame}"] for part in parts])
-        ratios = nees[:, 1:][np.isfinite(nees[:, 1:])] / 3
-        mean = ratios.mean() if len(ratios) else 1.0
-        found[frame] = abs(np.log(max(float(mean), 1e-300)))
-    is_additive = found["additive"] < min(found["invariant"], np.log(_NEAR))
+        scores = [
+            np.concatenate([part.block[f"pose_nees_{frame}"] for part in each])[:, 1:]
+            for each in parts.values()
+        ]
+        rejected[frame] = sum(map(_is_rejected, scores))
+        known = np.concatenate([each[np.isfinite(each)] for each in scores])
+        mean = float(known.mean()) / POSE_FREEDOM if len(known) else 1.0
+        gaps[frame] = abs(np.log(max(mean, 1e-300)))
+    if rejected["additive"] != rejected["invariant"]:
+        return min(rejected, key=lambda frame: rejected[frame])
+    is_additive = gaps["additive"] < min(gaps["invariant"], np.log(_NEAR))
     return "additive" if is_additive else "invariant"
+
+
+def _is_rejected(nees: Array) -> bool:
+    """Whether the NEES of runs (M, K) is not that of an honest estimator, at 5 %."""
+    scores = np.where(nees < LARGEST_SCORE, nees, np.nan)
+    first = int(np.isfinite(scores).any(axis=0).argmax())
+    scores = scores[np.isfinite(scores[:, first:]).all(axis=1)]
+    if len(scores) < 2 or scores.shape[1] < 2:
+        return False
+    none, rng = np.zeros_like(scores), np.random.default_rng(0)
+    report = evaluate_consistency(
+        scores, none, none, dof=POSE_FREEDOM, frame="invariant", rng=rng
+    )
+    return not report.accepted
 
 
 def _mistakes(parts: Sequence[_Part], task: _Task, frame: str, decides: str) -> str:

@@ -47,7 +47,9 @@ class JudgeOptions(Options):
         None, "additive|invariant|right|left", "additive"
     )
     frame: str | None = declared(
-        None, "invariant|additive", "that of --covariances, or the nearer to 1"
+        None,
+        "invariant|additive",
+        "that of --covariances, or the one that rejects less",
     )
     space: str | None = declared(
         None, "left|right|decoupled[,rotation-first]", "poses in the plane"

@@ -18,6 +18,7 @@ from slamgym.estimator.smoother import smooth
 from slamgym.evaluation.nees import normalised_squared_error
 from slamgym.experiments import (
     generate_trajectories,
+    judging,
     nees_figure,
     read_slamlog,
     runs_figure,
@@ -775,6 +776,29 @@ def test_additive_errors_are_decided_in_the_additive_frame(additive):
         summary = summarise_monte_carlo(results)
         assert summary["frame"] == "additive"
         assert summary["estimators"]["e"]["verdict"] != "not consistent"
+
+
+@pytest.mark.parametrize("honest", ["additive", "invariant"])
+def test_the_error_that_rejects_decides_only_if_both_reject(honest):
+    """Even if its mean is nearer to 3, because it errs to both sides."""
+    rng = np.random.default_rng(5)
+    other = "invariant" if honest == "additive" else "additive"
+    nees = rng.chisquare(3, (60, 21))
+    nees *= 3.1 / nees[:, 1:].mean()
+    uneven = nees * np.where(np.arange(21) > 10, 1.7, 0.3)
+    uneven *= 3 / uneven[:, 1:].mean()
+    block = {f"pose_nees_{honest}": nees, f"pose_nees_{other}": uneven}
+    assert judging._deciding({"mine": [judging._Part(block, ())]}) == honest
+    block[f"pose_nees_{honest}"] = nees * np.where(np.arange(21) > 10, 1.8, 0.3)
+    assert judging._deciding({"mine": [judging._Part(block, ())]}) == other
+
+
+def test_an_estimator_that_diverges_does_not_choose_the_error_of_others():
+    nees = np.random.default_rng(6).chisquare(3, (60, 21))
+    mine = {"pose_nees_additive": nees, "pose_nees_invariant": 1.3 * nees}
+    lost = {name: 1e4 * values for name, values in mine.items()}
+    parts = {"mine": [judging._Part(mine, ())], "lost": [judging._Part(lost, ())]}
+    assert judging._deciding(parts) == "additive"
 
 
 def test_a_clock_that_is_half_a_step_off_is_named(additive):
