@@ -149,7 +149,7 @@ def mistake_in(log: slamlog.SlamLog, settings: FilterSettings) -> Mistake | None
     if not is_usual or ground_truth.hides_identities(log) or not log.scans:
         return None
     given = part_of(log)
-    if len(given.measurements) < _FEWEST or not len(given.rows):
+    if given is None or len(given.measurements) < _FEWEST or not len(given.rows):
         return None
     with one_blas_thread():
         return _Comparison(log, settings, given).mistake()
@@ -167,8 +167,11 @@ def explaining(log: slamlog.SlamLog, settings: FilterSettings) -> Iterator[None]
         raise np.linalg.LinAlgError(f"{error}. {mistake}") from error
 
 
-def part_of(log: slamlog.SlamLog) -> Reading:
-    """Return the part of a log that is read in other conventions, as it is given."""
+def part_of(log: slamlog.SlamLog) -> Reading | None:
+    """Return the part of a log that is read in other conventions, as it is given.
+
+    None if it has no scan, as the first one comes late or shows too many landmarks.
+    """
     rows: list[tuple[float, float, float]] = []
     row_steps, scans, steps, seen = [], [], [], set[int]()
     count = 0
@@ -185,6 +188,8 @@ def part_of(log: slamlog.SlamLog) -> Reading:
             scans.append(scan)
             steps.append(count)
         count += 1
+    if not scans:
+        return None
     sizes = [len(scan.measurements) for scan in scans]
     every = -(-sum(sizes) // _READINGS)
     is_read = np.zeros(count, dtype=bool)

@@ -14,6 +14,7 @@ from slamgym.experiments.log_conventions import mistake_in
 from slamgym.experiments.logs import (
     OdometryRow,
     Scan,
+    SlamLog,
     read_slamlog,
     record_episode,
     write_slamlog,
@@ -200,6 +201,16 @@ def test_outliers_are_no_mistake_of_conventions(corridor):
         return np.where(is_wrong, rng.uniform(-3, 3, len(b)), b), r
 
     assert mistake_of(of_scans(spoilt)(corridor)) is None
+
+
+@pytest.mark.filterwarnings("ignore:.*does not specify")
+@pytest.mark.parametrize(("landmarks", "late"), [(60, 1), (3, 9000)])
+def test_a_log_without_a_scan_in_its_first_part_has_nothing_to_name(landmarks, late):
+    ids, readings = np.arange(landmarks), np.full((landmarks, 2), (0.1, 5.0))
+    events = [OdometryRow(float(k), 0.1, 0.0, 1.0) for k in range(1, late + 20)]
+    for k in reversed(range(late, late + 19)):
+        events.insert(k, Scan(float(k), readings, ids))
+    assert mistake_of(SlamLog("drive", events=events)) is None
 
 
 def test_a_mirrored_log_is_consistent(corridor):
