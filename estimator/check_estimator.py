@@ -457,9 +457,11 @@ def check_steps(factory: Factory) -> Iterator[str]:
     they describe the same deviation in general words.
     """
     made = partial(Trial, factory)
-    mistakes = tuple(step_mistakes(made))
-    yield from map(str, mistakes)
-    named = {mistake.method for mistake in mistakes if mistake.cause}
+    named = set()
+    for mistake in step_mistakes(made):  # one by one: it may end with an exception
+        yield str(mistake)
+        if mistake.cause:
+            named.add(mistake.method)
     for method, check in (
         ("predict()", check_motion),
         ("update() of new landmarks", check_mapping),

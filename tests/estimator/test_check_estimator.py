@@ -632,6 +632,21 @@ def test_a_wrong_covariance_is_named_with_the_entry_and_its_value(mistake):
     assert any(re.search(complaint, each.message) for each in findings), findings
 
 
+def test_a_mistake_is_named_although_a_later_call_fails():
+    class LosesNoiseAndFails(EkfSlam):
+        calls = 0
+
+        def predict(self, odometry, dt=1.0):
+            super().predict(odometry, 0.0)
+            self.calls += 1
+            if self.calls == 15:
+                raise RuntimeError("the fifteenth call")
+
+    messages = [each.message for each in find_breaches(LosesNoiseAndFails, ["correct"])]
+    assert any("the motion noise is missing" in each for each in messages)
+    assert any("the fifteenth call" in each for each in messages)
+
+
 def test_the_readings_of_a_wrong_filter_are_not_called_unwrapped():
     textbook = textbook_module("np.arctan2(dy, dx)", "np.arctan(dy / dx)")
     messages = [str(each) for each in find_breaches(textbook.TextbookEkf, ("correct",))]

@@ -11,6 +11,7 @@ from inner_parts import in_information_form
 from town_drives import map_all, run, wander
 
 from slamgym.estimator import EkfSlam, check_estimator
+from slamgym.estimator.check_estimator import find_breaches
 from slamgym.estimator.large_maps import elimination as landmark_dissection
 from slamgym.estimator.large_maps.multifrontal import (
     InformationMatrix,
@@ -71,6 +72,15 @@ def exact_circle(laps, *, count=24, seen=6, start_std=(0.1, 0.1, 0.05)):
 )
 def test_it_keeps_the_contract(options):
     assert check_estimator(partial(SparseInformationSlam, **options)) == ()
+
+
+@pytest.mark.parametrize("bound", [2, 4])
+def test_a_small_bound_breaks_no_rule_but_that_of_the_exact_update(bound):
+    """Odometry that is given up differs from the equation of an update, on purpose."""
+    bounded = partial(SparseInformationSlam, active_bound=bound)
+    (finding,) = find_breaches(bounded)
+    assert finding.level == "correct"
+    assert finding.message.startswith("update(): ")
 
 
 @pytest.mark.parametrize("base", BASES)
