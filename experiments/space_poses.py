@@ -198,6 +198,9 @@ def judge_in_space(
             f"{next(iter(true), 'nothing')}"
         )
     drives = [_within(found[name], *true[name]) for name in names]
+    for _, estimate, _ in drives:
+        if len(estimate.covariances) < 2:
+            raise ValueError(f"{estimate.file} must have at least two poses, got one")
     exact, poses, claims, left_out = _stacked(drives)
     readings = dict(_readings(exact, poses, claims, order))
     error, matrices = readings[_name(covariances, order)]

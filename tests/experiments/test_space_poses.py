@@ -175,6 +175,15 @@ def test_an_npz_of_poses_in_space_is_judged_like_tum(tmp_path):
         judge_in_space(tmp_path / "all.npz", truth)
 
 
+def test_a_drive_of_one_pose_in_space_is_refused_with_its_file(tmp_path):
+    pose, claim = np.array([[0, 0, 0, 0, 0, 0, 1.0]]), np.eye(6)[None]
+    np.savez(tmp_path / "run.npz", belief_poses=pose, belief_pose_covariances=claim)
+    truth = tmp_path / "run.tum"
+    truth.write_text("0 0 0 0 0 0 0 1\n")
+    with pytest.raises(ValueError, match=r"run\.npz must have at least two poses, got"):
+        judge_in_space(tmp_path / "run.npz", truth)
+
+
 def test_what_is_no_pose_in_space_is_refused(tmp_path):
     estimates, truth = write(tmp_path, 10, WRITTEN["left"], runs=2)
     path = estimates / "seed_1.tum"

@@ -239,6 +239,10 @@ def test_the_example_of_the_page_runs(folder, monkeypatch, tmp_path):
         ({"measurements": MEASUREMENTS + "3,7,0,1\n"},
          r"line 6: expected each landmark once per scan, got id 7 again"),
         ({"odometry": "t,v,omega\n1,1,0\n"}, "expected at least two rows of v and ome"),
+        ({"odometry": "t,d,alpha\n1,,\n"},
+         "odometry.csv, line 1: expected rows of odometry below it, got empty ones"),
+        ({"measurements": "t,id,bearing,range\n8,4,0,1\n9,4,0,1\n"},
+         "line 2: expected readings within the time of the odometry, 0 to 3, on one"),
         ({"odometry": "1,1,0\n2,1,0\n"},
          "odometry.csv, line 1: expected a first row with the columns t, d, alpha or"),
         ({"odometry": "# motion: arc\n" + ODOMETRY}, "line 1: expected turn-last, mid"),
@@ -346,17 +350,26 @@ def test_a_truth_with_epoch_stamps_is_set_to_the_clock_of_the_log(folder, file):
         ("0 1 2 3 0.5 0.5 0.5 0.5\n" * 2, "pose 0 tilted by more than 30°: convert"),
         ("0 0 1 0 1 0 0 0 0 1 0 0\n" * 2, "pose 0 tilted by more than 30°: convert"),
         (TUM.replace("\n", "9\n", 1).replace("0 5", "90 5"), "path.txt"),
-        ("# format: slamlog 1\nodometry,1,1,0,1\n", "expected a true path, got a log"),
+        ("# format: slamlog 1\nodometry,1,1,0,1\n", "expected a true path with poses"),
         ("t,east,yaw\n0,1,2\n1,1,2\n", "expected truth, a table with the columns t"),
         (matrices(camera=True) * 2, "expected a pose for each of the 4 times of the l"),
         ("".join(f"{k + 50} 1 2 0 0 0 0 1\n" for k in range(3)),
          "expected times of the log, 0 to 3, got 50 to 52: give both on one clock"),
+        ("t,x,y,theta\n1,,,\n", "expected a true path with poses, got none"),
+        (TUM + "2.5 8 8 0 0 0 0 1\n",
+         "path.txt, pose 4: expected a time >= 3, that of the pose before it, got 2.5"),
     ],
 )  # fmt: skip
 def test_a_truth_that_does_not_fit_is_refused(folder, file, text, message):
     log = folder(odometry=ODOMETRY, measurements=MEASUREMENTS)
     with pytest.raises(LogError, match=message):
         read_log(log, truth=file(text, "path.txt"))
+
+
+def test_a_folder_without_a_true_path_is_no_truth(folder):
+    log = folder(odometry=ODOMETRY, measurements=MEASUREMENTS)
+    with pytest.raises(LogError, match=r"drive: expected a true path with poses, got"):
+        read_log(log, truth=log)
 
 
 # What is no log

@@ -157,12 +157,12 @@ def read_true_path(path: str | PathLike[str]) -> TruePath:
     """
     source = Path(path)
     if source.is_dir():
-        return TruePath(read_log(source).ground_truth)
+        return _known(TruePath(read_log(source).ground_truth), source)
     path = log_lines.ReadFile(path)
     lines = log_lines.read_lines(path)
     kind, table = _format_of(source, lines)
     if table is not None and "truth" in table.kinds:
-        return TruePath(named_columns.true_path_of(table))
+        return _known(TruePath(named_columns.true_path_of(table)), source)
     if kind == "csv" and table is not None:
         raise named_columns.lacking("truth", [table], source)
     if kind == "isam":
@@ -172,14 +172,18 @@ def read_true_path(path: str | PathLike[str]) -> TruePath:
         if kind == "course":
             return TruePath(numbers)  # rows t x y θ
         return path_of(numbers, kind, str(source))
-    rows = read_log(path).ground_truth
-    if not len(rows):
+    return _known(TruePath(read_log(path).ground_truth), source)
+
+
+def _known(path: TruePath, source: Path) -> TruePath:
+    """Return a path with poses; refuse an empty one."""
+    if not len(path.rows):
         raise slamlog.LogError(
-            f"{source}: expected a true path, got a log without one: rows "
-            "'groundtruth,t,x,y,theta' hold it, or a file in the format of TUM, "
-            "'t x y z qx qy qz qw'"
+            f"{source}: expected a true path with poses, got none: rows "
+            "'groundtruth,t,x,y,theta' of a log hold it, or a file in the format of "
+            "TUM, 't x y z qx qy qz qw'"
         )
-    return TruePath(rows)
+    return path
 
 
 def _read_graph(
@@ -228,7 +232,14 @@ def _with_true_path(log: slamlog.SlamLog, path: str | PathLike[str]) -> slamlog.
                 f"as the poses have no times, got {len(rows)}"
             )
         rows = np.column_stack([due, rows[:, 1:]])
-    epoch = float(log.header.get("epoch", 0.0)) if len(rows) else 0.0
+    falls = np.flatnonzero(np.diff(rows[:, 0]) < 0)
+    if len(falls):
+        before, after = rows[falls[0] : falls[0] + 2, 0]
+        raise slamlog.LogError(
+            f"{path}, pose {falls[0] + 1}: expected a time >= {before:.15g}, that of "
+            f"the pose before it, got {after:.15g}: sort the rows by time"
+        )
+    epoch = float(log.header.get("epoch", 0.0))
     if abs(rows[0, 0]) > epoch / 2 > 0:
         rows = np.column_stack([rows[:, 0] - epoch, rows[:, 1:]])
     if rows[-1, 0] < start or rows[0, 0] > times[-1]:

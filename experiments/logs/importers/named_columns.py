@@ -291,6 +291,8 @@ def read_named(tables: Sequence[Table], name: str, source: Path) -> slamlog.Slam
     of = _by_kind(tables, source)
     form = of["odometry"].form_of("odometry")
     rows = list(of["odometry"].filled(form))
+    if not rows:
+        raise of["odometry"].header.error("rows of odometry below it", "empty ones")
     stamps = of["odometry"].times(rows)
     epoch = float(stamps[0]) if abs(stamps[0]) > _EPOCH else 0.0
 
@@ -303,6 +305,12 @@ def read_named(tables: Sequence[Table], name: str, source: Path) -> slamlog.Slam
     # Before its first increment a robot stands; its velocity is not known then.
     begin = motions[0].start if "v" in form else -math.inf
     inside = [each for each in timed if begin <= each[1].t <= motions[-1].end]
+    if timed and not inside:
+        raise timed[0][0].error(
+            f"readings within the time of the odometry, {motions[0].start:.15g} to "
+            f"{motions[-1].end:.15g}, on one clock",
+            f"all {len(timed)} outside it, the first at t = {timed[0][1].t:.15g}",
+        )
     truth = true_path_of(of["truth"]) if "truth" in of else np.empty((0, 4))
     truth[:, 0] = on_clock(truth[:, 0])
     places = _landmarks(of["landmarks"]) if "landmarks" in of else {}
