@@ -61,9 +61,11 @@ if TYPE_CHECKING:
     from .sequential_tests import EProcess as EProcess
     from .sequential_tests import average_of as average_of
     from .trajectory_error import Alignment as Alignment
+    from .trajectory_error import Exchange as Exchange
     from .trajectory_error import LandmarkDistances as LandmarkDistances
     from .trajectory_error import PositionAccuracy as PositionAccuracy
     from .trajectory_error import align_positions as align_positions
+    from .trajectory_error import exchanged_positions as exchanged_positions
     from .trajectory_error import landmark_covariances as landmark_covariances
     from .trajectory_error import landmark_distances as landmark_distances
     from .trajectory_error import poses_at as poses_at

@@ -12,12 +12,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array
+from ..arrays import Array, IntArray
 from ..estimator.models.bearing_range import wrap_angle
 from ..estimator.models.rigid_motion import rotation
 from ..estimator.support.argument_checks import as_floats, shaped
 
 _ROUNDING = 4 * np.finfo(np.float64).eps
+_LEAST_TO_EXCHANGE = 5  # positions, so that most of them are right
+_FAR = 10.0  # standard deviations between a position and an exchanged truth
+_NEARER = 5.0  # factor between the distances to the own truth and to the other one
+_MOST_TRIED = 64  # positions whose pairs are tried as alignments
 
 
 class Alignment(NamedTuple):
@@ -52,6 +56,16 @@ class PositionAccuracy(NamedTuple):
     def aligned_rmse(self) -> float:
         """Root of the mean square of the aligned errors [m]."""
         return float(np.sqrt(np.mean(self.aligned_errors**2)))
+
+
+class Exchange(NamedTuple):
+    """Positions whose truths are exchanged."""
+
+    #: Cycles of indices: each position fits the truth of the next one, and the last one
+    #: that of the first.
+    cycles: tuple[tuple[int, ...], ...]
+    #: The motion that takes the estimate onto the truth, exchanged back.
+    alignment: Alignment
 
 
 class LandmarkDistances(NamedTuple):
@@ -143,6 +157,116 @@ def position_accuracy(estimate: ArrayLike, truth: ArrayLike) -> PositionAccuracy
         aligned_errors=np.linalg.norm(alignment.apply(e) - g, axis=1),
         alignment=alignment,
     )
+
+
+def exchanged_positions(estimate: ArrayLike, truth: ArrayLike) -> Exchange:
+    """Find positions that fit each other's truth, as in a table with exchanged ids.
+
+    ::
+
+        ‖ẽᵢ − gᵢ‖ > max(10 s, 5 ‖ẽᵢ − gⱼ‖),    s² = Σ ‖ẽₖ − g_π(k)‖² / (2n − 3)
+
+    holds for every i of a cycle π that is found, with j = π(i) and ẽ the positions
+    after alignment with the truth in the order π.  The aligned map must thus be good
+    for all others.  π is the best assignment of the positions that lie far from their
+    own truths after the alignment with the least median error [1]_.
+
+    Parameters
+    ----------
+    estimate, truth : array_like, shape (n, 2)
+        Positions eₖ and gₖ of the same n >= 1 things [m].
+
+    Returns
+    -------
+    Exchange
+        No cycle if n < 5, or if half of the positions or more are far from the truth.
+
+    Raises
+    ------
+    ValueError
+        If the arrays are not n finite positions each.
+
+    References
+    ----------
+    .. [1] P. J. Rousseeuw, Least median of squares regression, JASA 79(388), 1984.
+
+    Examples
+    --------
+    >>> places = np.array([[0, 0], [4, 0], [9, 3], [2, 7], [5, 5], [8, 8]])
+    >>> exchanged_positions(places, places[[0, 4, 2, 3, 1, 5]]).cycles
+    ((1, 4),)
+    """
+    e, g = _paired(estimate=estimate, truth=truth)
+    n = len(e)
+    order = np.arange(n)
+    if n >= _LEAST_TO_EXCHANGE:
+        order = _best_order(e, g)
+    moved = align_positions(e, g[order]).apply(e)
+    own, other = (np.linalg.norm(moved - there, axis=1) for there in (g, g[order]))
+    scale = np.sqrt(np.sum(other**2) / max(2 * n - 3, 1))
+    is_sure = own > np.maximum(_FAR * scale, _NEARER * other)
+    cycles = tuple(cycle for cycle in _cycles(order) if is_sure[list(cycle)].all())
+    order = np.arange(n)
+    for cycle in cycles:
+        order[list(cycle)] = np.roll(cycle, -1)
+    return Exchange(cycles, align_positions(e, g[order]))
+
+
+def _best_order(e: Array, g: Array) -> IntArray:
+    """Assign the positions that are far from their truths to these truths, (n,)."""
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 (slow to import)
+
+    moved = _median_aligned(e, g)
+    errors = np.linalg.norm(moved - g, axis=1)
+    (far,) = np.nonzero(errors > _FAR * np.median(errors))
+    gaps = np.linalg.norm(moved[far, None] - g[far], axis=2)
+    order = np.arange(len(e))
+    order[far] = far[linear_sum_assignment(np.minimum(gaps, errors[far, None]))[1]]
+    return order
+
+
+def _median_aligned(e: Array, g: Array) -> Array:
+    """Move positions by the motion of a pair of them that has the least median error.
+
+    ::
+
+        u = (gⱼ − gᵢ) / (eⱼ − eᵢ) of length 1,   e ↦ u (e − (eᵢ + eⱼ)/2) + (gᵢ + gⱼ)/2
+
+    with positions as complex numbers.
+    """
+    e, g = e - e.mean(axis=0), g - (centre := g.mean(axis=0))
+    z, w = e @ (1, 1j), g @ (1, 1j)
+    tried = np.unique(np.linspace(0, len(e) - 1, _MOST_TRIED).astype(np.int64))
+    least, best = np.inf, z
+    for i in tried:
+        j = tried[(tried > i) & (z[tried] != z[i]) & (w[tried] != w[i])]
+        turn = (w[j] - w[i]) / (z[j] - z[i])
+        turn /= np.abs(turn)
+        moved = turn[:, None] * (z - (z[i] + z[j, None]) / 2) + (w[i] + w[j, None]) / 2
+        medians = np.median(np.abs(moved - w), axis=1)
+        if len(j) and medians.min() < least:
+            least, best = medians.min(), moved[medians.argmin()]
+    return np.asarray(np.column_stack([best.real, best.imag]) + centre)
+
+
+def _cycles(order: IntArray) -> list[tuple[int, ...]]:
+    """List the cycles of a permutation, each from its least index, without fixed ones.
+
+    Examples
+    --------
+    >>> _cycles(np.array([1, 0, 2, 4, 5, 3]))
+    [(0, 1), (3, 4, 5)]
+    """
+    found, seen = [], set[int]()
+    for first in range(len(order)):
+        cycle, index = [], first
+        while index not in seen:
+            seen.add(index)
+            cycle.append(index)
+            index = int(order[index])
+        if len(cycle) > 1:
+            found.append(tuple(cycle))
+    return found
 
 
 def landmark_distances(

@@ -154,6 +154,8 @@ def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
     files = written(str(place), summary["files"])
     is_compared = any(summary[key]["filter"] for key in ("ate", "landmark_rmse"))
     compared = (smoothing_table(summary), "") if is_compared else ()
-    warned = () if mistake is None else (Text(f"Warning: {mistake}", "yellow"), "")
+    told = summary["warnings"] if mistake is None else [str(mistake)]
+    warned = [Text(f"Warning: {text}", "yellow") for text in told]
+    warned += [Text()] * bool(warned)
     reporter.show(title, *compared, smoothing_figures(summary), "", *warned, files)
     reporter.finish({**summary, "out": str(place)})

@@ -32,8 +32,14 @@ _TOO_MUCH, _TOO_LITTLE = 0.5, 2.0  # of NIS or NEES per degree, where 1 is expec
 
 
 def landmark_table(summary: dict[str, Any]) -> Table:
-    """Lay out the landmarks and their distances to the truth, the worst of many."""
+    """Lay out the landmarks and their distances to the truth, the worst of many.
+
+    The distances are aligned ones where the start of the log is not the true one.
+    """
     rows = summary["landmarks"]
+    are_aligned = summary.get("aligned_landmarks") is not None
+    if are_aligned:
+        rows = summary["aligned_landmarks"]
     known = any(row["euclidean"] is not None for row in rows)
     shown, caption = rows, None
     if len(rows) > _MOST_ROWS:
@@ -43,6 +49,7 @@ def landmark_table(summary: dict[str, Any]) -> Table:
         told = f"the {len(shown)} {which} of {len(rows)}; all: summary.json"
         caption = Text(told, "dim")
     title = "Landmarks, with their distances from the truth" * known or "Landmarks"
+    title += " after alignment" * are_aligned
     headings = ["id", "x [m]", "y [m]"]
     headings += ["Euclidean [m]", "Mahalanobis [σ]"] if known else []
     table = _table(headings, title=title, caption=caption)

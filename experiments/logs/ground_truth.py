@@ -15,7 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array, IntArray
+from ...estimator.models.bearing_range import wrap_angle
 from ...evaluation.trajectory_error import PositionAccuracy, poses_at, position_accuracy
+from .recording import steps_of
 from .slamlog import NO_LANDMARK, LogError, Scan, SlamLog
 
 
@@ -40,6 +42,30 @@ def true_poses_of(log: SlamLog, times: Array) -> Array | None:
     if offset.any():
         poses[:, :2] -= _turned(offset, poses[:, 2])
     return poses if np.isfinite(poses[:, :2]).any() else None
+
+
+def starts_at_truth(log: SlamLog) -> bool:
+    """Whether a log starts at the true pose, so that its map has the truth's frame.
+
+    The header (``start_from``) decides, or the true pose at the start within three
+    standard deviations (``start_sigma``) and 1 cm and 0.01 rad.  Where the file has no
+    true pose, its start is taken for true; where these begin later, only a start other
+    than the origin is.
+    """
+    source = log.header.get("start_from")
+    if source is not None:
+        return source == "ground truth"
+    if not len(log.ground_truth):
+        return True
+    first = next(steps_of(log))
+    poses = true_poses_of(log, np.array([first.t]))
+    if poses is None:
+        return bool(log.start.any())
+    error = poses[0] - log.start
+    error[2] = wrap_angle(error[2])
+    sigma = log.header.get("start_sigma", "0,0,0")
+    slack = 0.01 + 3 * np.array([float(number) for number in sigma.split(",")])
+    return not (np.abs(error) > slack).any()  # an unknown heading is no error
 
 
 class TrueLandmarks(NamedTuple):

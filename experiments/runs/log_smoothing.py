@@ -166,7 +166,8 @@ def summarise_smoothing(
         ``iterations``; ``repair``: the scores ``first`` and ``last`` of the
         association, its ``landmarks`` and ``unused`` readings, or None;
         ``ate``, ``landmark_rmse`` and ``nees`` (of the pose), each
-        of ``filter`` and ``smoother``, None if the truth is unknown.
+        of ``filter`` and ``smoother``, None if the truth is unknown; ``warnings``, see
+        `exchange_warnings`.
     """
     log, trace, drive = smoothed.log, smoothed.filtered.trace, smoothed.drive
     path = trace.t, smoothed.poses
@@ -197,6 +198,9 @@ def summarise_smoothing(
             "smoother": summary.rmse_table(accuracy_of(drive.landmarks, truth)),
         },
         "nees": {"filter": summary.nees_summary(trace), "smoother": _nees(smoothed)},
+        "warnings": summary.exchange_warnings(
+            log, drive.landmark_ids, drive.landmarks, truth
+        ),
     }
 
 

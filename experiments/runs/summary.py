@@ -1,11 +1,12 @@
 """Summarise a run as one dictionary of plain JSON types: `summarise`.
 
-`run_warnings` lists what is suspicious about a run, without the truth.
+`run_warnings` lists what is suspicious about a run. Only `exchange_warnings` needs the
+truth.
 """
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,16 +14,20 @@ import numpy as np
 from ... import __version__
 from ...arrays import Array
 from ...estimator.models.bearing_range import wrap_angle
-from ...estimator.models.rigid_motion import ErrorFrame
+from ...estimator.models.rigid_motion import ErrorFrame, rotation
 from ...evaluation import nees
 from ...evaluation.association_scores import oracle_errors, places_of
 from ...evaluation.hypothesis_tests import chi_square_quantile
-from ...evaluation.trajectory_error import PositionAccuracy
+from ...evaluation.trajectory_error import (
+    Alignment,
+    PositionAccuracy,
+    exchanged_positions,
+)
 from ..logs import ground_truth
 from ..logs.slamlog import SlamLog
 from .filter_settings import FilterSettings
 from .log_replay import Replay
-from .trace import RunTrace, accuracy_of, compare_association, finite
+from .trace import Integers, RunTrace, accuracy_of, compare_association, finite
 
 _SHARE = 0.95  # probability of the interval of the NIS
 
@@ -46,7 +51,9 @@ def summarise(
     Returns
     -------
     dict
-        ``landmarks``, see :func:`landmark_table`; ``never_placed``, the ids of
+        ``landmarks``, see :func:`landmark_table`; ``aligned_landmarks``, the same with
+        distances after alignment, where the start of the log is not the true one, else
+        None; ``never_placed``, the ids of
         landmarks that the log names and the map never held; ``pose``,
         ``pose_covariance``; ``steps``, ``scans``; ``readings``, counted by their
         outcome; ``map_changes``, the numbers of landmarks confirmed, removed and
@@ -71,6 +78,7 @@ def summarise(
         "pose": _finite_list(trace.poses[-1]),
         "pose_covariance": [_finite_list(row) for row in trace.pose_covariances[-1]],
         "landmarks": landmark_table(trace),
+        "aligned_landmarks": _aligned_landmarks(replay),
         "never_placed": never_placed(replay),
         "nis": nis_summary(trace),
         "nees": nees_summary(trace),
@@ -145,12 +153,22 @@ def never_placed(replay: Replay) -> list[int]:
     return sorted(replay.log.read_ids - held)
 
 
-def landmark_table(trace: RunTrace) -> list[dict[str, Any]]:
+def landmark_table(
+    trace: RunTrace, alignment: Alignment | None = None
+) -> list[dict[str, Any]]:
     """List the final landmarks and their distances to the truth.
 
     ::
 
         e = l − l_true,    euclidean = ‖e‖,    mahalanobis = sqrt(eᵀ P⁻¹ e)
+
+    Parameters
+    ----------
+    trace : RunTrace
+        The run.
+    alignment : Alignment, optional
+        A motion of the map before it is compared: e = C l + c − l_true, and C P Cᵀ
+        replaces P.
 
     Returns
     -------
@@ -160,8 +178,12 @@ def landmark_table(trace: RunTrace) -> list[dict[str, Any]]:
         the covariance is singular.
     """
     truth = trace.true_landmarks
-    errors = trace.landmarks - (np.nan if truth is None else truth)
-    squared = nees.normalised_squared_error(errors, trace.landmark_covariances)
+    landmarks, covariances = trace.landmarks, trace.landmark_covariances
+    if alignment is not None:
+        turn = rotation(alignment.angle)
+        landmarks, covariances = alignment.apply(landmarks), turn @ covariances @ turn.T
+    errors = landmarks - (np.nan if truth is None else truth)
+    squared = nees.normalised_squared_error(errors, covariances)
     return [
         {
             "id": landmark_id,
@@ -174,6 +196,16 @@ def landmark_table(trace: RunTrace) -> list[dict[str, Any]]:
             trace.landmark_ids.tolist(), trace.landmarks, errors, squared, strict=True
         )
     ]
+
+
+def _aligned_landmarks(replay: Replay) -> list[dict[str, Any]] | None:
+    """List landmarks with aligned distances where the start is not the true one."""
+    trace = replay.trace
+    if trace.true_landmarks is None or ground_truth.starts_at_truth(replay.log):
+        return None
+    known = np.isfinite(trace.true_landmarks).all(axis=1)
+    pairs = trace.landmarks[known], trace.true_landmarks[known]
+    return landmark_table(trace, exchanged_positions(*pairs).alignment)
 
 
 def nis_summary(trace: RunTrace) -> dict[str, Any] | None:
@@ -350,7 +382,66 @@ def run_warnings(replay: Replay) -> list[str]:
     """
     found = [LOST * bool(replay.probably_lost)]
     found += [_rejections(replay), _nis(replay), _crowded_map(replay)]
+    trace = replay.trace
+    found += exchange_warnings(
+        replay.log, trace.landmark_ids, trace.landmarks, trace.true_landmarks
+    )
     return [sentence for sentence in found if sentence]
+
+
+def exchange_warnings(
+    log: SlamLog, ids: Sequence[int] | Integers, landmarks: Array, truth: Array | None
+) -> list[str]:
+    """Name landmarks of a final map that fit each other's true position.
+
+    Parameters
+    ----------
+    log : SlamLog
+        The log; without identities the ids are the filter's own, and none is named.
+    ids : sequence of int
+        Ids of the landmarks.
+    landmarks, truth : ndarray, shape (n, 2)
+        Their estimated and true positions [m], nan where unknown; no truth is None.
+
+    Returns
+    -------
+    list of str
+        One sentence for each cycle of `exchanged_positions`.
+    """
+    if truth is None or ground_truth.hides_identities(log):
+        return []
+    known = np.isfinite(truth).all(axis=1)
+    names = np.asarray(ids)[known].tolist()
+    found = exchanged_positions(landmarks[known], truth[known]).cycles
+    return [_exchange([names[k] for k in cycle]) for cycle in found]
+
+
+def _exchange(ids: Sequence[int]) -> str:
+    """Write which landmarks fit each other's truth, and the remedy.
+
+    Examples
+    --------
+    >>> _exchange([11, 17])
+    "Landmarks 11 and 17 fit each other's true position: exchange the ids of their ..."
+    >>> _exchange([3, 5, 8])
+    'Landmarks 3, 5 and 8 fit the true positions of 5, 8 and 3: the rows ...'
+    """
+    others = [*ids[1:], ids[0]]
+    rows = [f"`landmark,{i},…`" for i in others]
+    if len(ids) == 2:
+        return (
+            f"Landmarks {_listed(ids)} fit each other's true position: exchange the "
+            f"ids of their rows {_listed(rows[::-1])} in the file of the truth."
+        )
+    return (
+        f"Landmarks {_listed(ids)} fit the true positions of {_listed(others)}: the "
+        f"rows {_listed(rows)} in the file of the truth need the ids {_listed(ids)}."
+    )
+
+
+def _listed(items: Sequence[object]) -> str:
+    *most, last = map(str, items)
+    return f"{', '.join(most)} and {last}"
 
 
 def _rejections(replay: Replay) -> str:

@@ -9,6 +9,7 @@ from slamgym.evaluation.trajectory_error import (
     Alignment,
     align_positions,
     ellipse_areas,
+    exchanged_positions,
     landmark_covariances,
     landmark_distances,
     poses_at,
@@ -227,3 +228,46 @@ def test_positions_at_rest_determine_no_rotation():
     for place in [0.1, 0.2], [451234.5, 4412345.25]:
         still = np.broadcast_to(place, (30, 2))
         assert align_positions(still + noise, still).angle == 0
+
+
+def a_map(size, seed):
+    """Return true positions and estimates in another frame."""
+    rng = np.random.default_rng(seed)
+    truth = rng.uniform(0, 12, size=(size, 2))
+    moved = Alignment(2.0, np.array([300.0, -70.0])).apply(truth)
+    return moved + rng.normal(size=truth.shape) * 0.05, truth
+
+
+@pytest.mark.parametrize(("size", "cycle"), [(5, (0, 3)), (9, (1, 4, 6)), (99, (2, 8))])
+def test_exchanged_positions_are_found_with_the_alignment_of_the_right_ones(
+    size, cycle
+):
+    estimate, truth = a_map(size, seed=3)
+    wrong = truth.copy()
+    wrong[list(np.roll(cycle, -1))] = truth[list(cycle)]
+    found = exchanged_positions(estimate, wrong)
+    assert found.cycles == (cycle,)
+    error = np.linalg.norm(found.alignment.apply(estimate) - truth, axis=1)
+    assert error.max() < 0.2
+
+
+@pytest.mark.parametrize("size", [1, 2, 4, 5, 30])
+def test_right_positions_are_not_exchanged(size):
+    for seed in range(20):
+        estimate, truth = a_map(size, seed)
+        found = exchanged_positions(estimate, truth)
+        assert found.cycles == ()
+        assert found.alignment.angle == align_positions(estimate, truth).angle
+
+
+def test_no_exchange_is_found_in_a_map_whose_others_are_wrong():
+    estimate, truth = a_map(8, seed=4)
+    truth[[0, 5]] = truth[[5, 0]]
+    estimate[[1, 2, 3]] += [(7.0, 1.0), (-3.0, 6.0), (2.0, -9.0)]
+    assert exchanged_positions(estimate, truth).cycles == ()
+
+
+def test_a_landmark_far_from_its_truth_is_no_exchange():
+    estimate, truth = a_map(8, seed=5)
+    estimate[2] += (6.0, 3.0)
+    assert exchanged_positions(estimate, truth).cycles == ()

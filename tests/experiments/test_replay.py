@@ -9,9 +9,10 @@ from rich.console import Console
 
 from slamgym.envs.controllers import make_controller
 from slamgym.estimator import Belief, EkfSlam, UpdateReport, make_estimator
-from slamgym.experiments.command_line.tables import key_figures
+from slamgym.experiments.command_line.tables import key_figures, landmark_table
 from slamgym.experiments.logs.ground_truth import (
     path_accuracy,
+    starts_at_truth,
     true_poses_of,
     without_identities,
 )
@@ -664,3 +665,50 @@ def test_python_takes_the_path_of_a_log_and_the_name_of_a_filter(tmp_path):
     np.testing.assert_array_equal(by_name.poses, by_hand.poses)
     assert by_name.estimator == "ekf"
     assert len(smooth_log(str(path)).poses) == len(by_hand.poses)
+
+
+def turned_away(log):
+    """Return a log that starts at the origin, wherever the truth does."""
+    angle, offset = 1.0, np.array([30.0, -20.0])
+    cos, sin = math.cos(angle), math.sin(angle)
+    turn = np.array([[cos, sin], [-sin, cos]])
+    truth = log.ground_truth.copy()
+    truth[:, 1:3] = truth[:, 1:3] @ turn + offset
+    truth[:, 3] += angle
+    return replace(log, landmarks=log.landmarks @ turn + offset, ground_truth=truth)
+
+
+def test_without_a_true_start_the_distances_are_aligned_ones():
+    log = recorded(30)
+    right = summary_of(log)
+    assert right["aligned_landmarks"] is None
+    summary = summary_of(turned_away(log))
+    assert summary["landmarks"][0]["euclidean"] > 5
+    rows = summary["aligned_landmarks"]
+    square = np.mean([row["euclidean"] ** 2 for row in rows])
+    assert math.sqrt(square) == pytest.approx(summary["landmark_rmse"]["aligned"])
+    assert max(row["mahalanobis"] for row in rows) < 10
+    tables = [landmark_table(found) for found in (right, summary)]
+    assert [str(t.title).endswith("after alignment") for t in tables] == [False, True]
+    shown = list(tables[1].columns[3].cells)
+    assert shown == [f"{row['euclidean']:.7f}" for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_true"),
+    [
+        ({}, True),
+        ({"start": (0.2, 0.0, 0.0)}, False),
+        ({"start": (0.0, 0.0, 0.2)}, False),
+        ({"start": (0.2, 0.0, 0.1), "header": {"start_sigma": "0.1,0.1,0.1"}}, True),
+        ({"header": {"start_from": "origin (no truth then)"}}, False),
+        ({"start": (9.0, 0.0, 0.0), "ground_truth": np.empty((0, 4))}, True),
+        ({"ground_truth": [(0.5, 0, 0, 0), (1, 1, 0, 0)]}, False),
+    ],
+)
+def test_the_start_of_a_log_is_the_true_one(changes, is_true):
+    events = (OdometryRow(0.2, 0.1, 0.0, 0.2), OdometryRow(0.4, 0.1, 0.0, 0.2))
+    truth = np.array([(0, 0, 0, 2 * math.pi), (1, 1, 0, 2 * math.pi)])
+    log = SlamLog("little", events=events, ground_truth=truth)
+    changed = {key: np.array(v) if key != "header" else v for key, v in changes.items()}
+    assert starts_at_truth(replace(log, **changed)) is is_true

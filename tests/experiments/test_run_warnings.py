@@ -1,18 +1,26 @@
 """Warnings about a run that need no ground truth."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from slamgym.envs.controllers import make_controller
 from slamgym.estimator import make_estimator
+from slamgym.experiments.logs.importers import read_log
+from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
+from slamgym.experiments.runs.filter_settings import SMOOTHER, settings_for
 from slamgym.experiments.runs.log_replay import replay
+from slamgym.experiments.runs.log_smoothing import smooth_log, summarise_smoothing
 from slamgym.experiments.runs.summary import (
     abandoned_landmarks,
     association_failure,
     run_warnings,
+    summarise,
 )
+from slamgym.sim_configs import load_scenario
 
 NOISE = {"motion_std": (0.02, 0.02, 0.01), "measurement_std": (0.02, 0.1)}
 PLACES = np.array([(4.0, 1.0), (5.0, -1.0), (3.0, -2.0)])
@@ -104,3 +112,84 @@ def test_association_failed_by_the_alarm_or_the_truth(
     summary = {"probably_lost": is_lost, "association": scores}
     assert re.search(reason or "^$", association_failure(summary))
     assert bool(association_failure(summary | {"association": None})) is bool(is_lost)
+
+
+def recorded(name="loop", steps=60):
+    """Record a drive whose readings have identities."""
+    world = load_scenario(name).with_changes(steps=steps)
+    driver = make_controller("open_loop", world, np.random.default_rng(0))
+    return record_episode(world, driver, seed=5)
+
+
+def exchanged(log, *ids):
+    """Give each of some landmarks the true position of the one before it."""
+    rows = [log.landmark_ids.tolist().index(i) for i in ids]
+    places = log.landmarks.copy()
+    places[rows] = log.landmarks[np.roll(rows, 1)]
+    return replace(log, landmarks=places)
+
+
+def exchange_warnings_of(log, **noise):
+    """Return what a filter and the smoother say about a log with exchanged ids."""
+    filtered = summarise(replay(log, settings_for(log, **noise).make(log.start)))
+    smoothed = summarise_smoothing(
+        smooth_log(log, settings_for(log, estimator=SMOOTHER, **noise))
+    )
+    told = filtered["warnings"], smoothed["warnings"]
+    return [[text for text in found if "true position" in text] for found in told]
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return recorded()
+
+
+def test_landmarks_that_fit_each_others_truth_are_named(drive):
+    ids = sorted(drive.read_ids)
+    one, other = ids[1], ids[-2]
+    for (warning,) in exchange_warnings_of(exchanged(drive, one, other)):
+        assert f"Landmarks {one} and {other} fit each other's true" in warning
+        assert f"`landmark,{one},…` and `landmark,{other},…`" in warning
+
+
+def test_a_cycle_of_three_is_named_with_the_ids_that_its_rows_need(drive):
+    ids = sorted(drive.read_ids)
+    chosen = sorted([ids[0], ids[len(ids) // 2], ids[-1]])
+    wrong = exchanged(drive, *chosen)
+    for (warning,) in exchange_warnings_of(wrong):
+        found = re.search(r"the rows (.*) in the file .* need the ids (.*)\.$", warning)
+        rows, needed = (
+            [int(i) for i in re.findall(r"\d+", part)] for part in found.groups()
+        )
+        truth = dict(zip(wrong.landmark_ids.tolist(), wrong.landmarks, strict=True))
+        places = truth | {
+            new: truth[row] for row, new in zip(rows, needed, strict=True)
+        }
+        mended = [places[i] for i in drive.landmark_ids.tolist()]
+        np.testing.assert_array_equal(mended, drive.landmarks)
+
+
+@pytest.mark.parametrize("name", ["loop", "six_landmarks", "corridor"])
+def test_no_landmark_of_a_right_log_is_named(name):
+    assert exchange_warnings_of(recorded(name)) == [[], []]
+
+
+@pytest.mark.parametrize(
+    ("name", "motion_std", "measurement_std"),
+    [
+        ("raw/cmu16833/data.txt", (0.25, 0.1, 0.1), (0.01, 0.08)),
+        ("freiburg9.csv", (0.1, 0.1, 0.01), (0.1, 0.1)),
+        pytest.param(
+            *("utias_d6_r3.csv", (0.03, 0.08, 0.035), (0.0035, 0.05)),
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_no_landmark_of_a_public_log_is_named(
+    public_logs, name, motion_std, measurement_std
+):
+    log = read_log(public_logs / name)
+    noise = {"motion_std": motion_std, "measurement_std": measurement_std}
+    options = {"gate_probability": 0.999} if "utias" in name else {}
+    found = replay(log, settings_for(log, **noise, options=options).make(log.start))
+    assert not any("true position" in text for text in run_warnings(found))
