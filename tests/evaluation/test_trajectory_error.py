@@ -271,3 +271,11 @@ def test_a_landmark_far_from_its_truth_is_no_exchange():
     estimate, truth = a_map(8, seed=5)
     estimate[2] += (6.0, 3.0)
     assert exchanged_positions(estimate, truth).cycles == ()
+
+
+def test_a_few_others_that_are_far_off_leave_an_exchange_in_doubt():
+    estimate, truth = a_map(40, seed=6)
+    truth[[0, 5]] = truth[[5, 0]]
+    assert exchanged_positions(estimate, truth).cycles == ((0, 5),)
+    estimate[[1, 2, 3]] += [(9.0, 1.0), (-3.0, 9.0), (-6.0, -9.0)]
+    assert exchanged_positions(estimate, truth).cycles == ()
