@@ -72,8 +72,10 @@ TESTS = {
     "evaluation/diagnosis": "diagnosis noise_findings",
     "evaluation/error_bound": "error_bound",
     "evaluation/hypothesis_tests": "hypothesis_tests nees consistency_report diagnosis",
+    "evaluation/map_consistency": "map_consistency",
     "evaluation/nees": "nees consistency_report",
     "evaluation/noise_findings": "noise_findings diagnosis",
+    "evaluation/sequential_tests": "sequential_tests",
     "evaluation/trajectory_error": "trajectory_error",
 }
 KERNELS = ("estimator/filters/drive_likelihood.py", "estimator/filters/gaussian_map.py")

@@ -93,7 +93,7 @@ def test_04_shows_modesty_and_pride(run):
 def test_05_keeps_the_contract_and_shows_a_breach(run):
     printed = run("05_your_own_estimator")
     assert "TextbookEkf keeps the contract" in printed
-    assert "TurnsFirst computes wrong beliefs:\n- predict((d, α)) must drive" in printed
+    assert "TurnsFirst computes wrong beliefs:\n- predict(): it turns before" in printed
 
 
 @pytest.mark.slow
