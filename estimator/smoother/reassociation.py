@@ -123,8 +123,8 @@ def reassociate(
     >>> for k in range(8):  # one landmark by two names
     ...     drive.predict((0.0, 0.0))
     ...     drive.update([(0.0, 5.0)], [k // 4])
-    >>> np.concatenate(reassociate(drive).ids).tolist()
-    [0, 0, 0, 0, 0, 0, 0, 0]
+    >>> reassociate(drive).changed  # so few readings are no evidence beyond chance
+    False
     """
     only_bearing_range(drive.sensor, "the repair of an association")
     search = _Search(drive)

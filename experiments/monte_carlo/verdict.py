@@ -12,10 +12,9 @@ import re
 import textwrap
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 
 from ...arrays import Array, BoolArray, IntArray
 from ...estimator.models.rigid_motion import ERROR_FRAMES, ErrorFrame
@@ -52,6 +51,9 @@ from .run_measures import (
     SMALL_NOISE,
     gaps_of,
 )
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 CONSISTENT = "consistent"
 NEARLY = "nearly consistent"
