@@ -204,7 +204,7 @@ def evaluate_consistency(
     rng : numpy.random.Generator
         Draws the bootstrap.
     landmarks, map_nees, map_dof, landmark_nees : array_like, optional
-        Of the final maps, see :func:`.map_consistency.map_test`. Without ``landmarks``,
+        Of the final maps, see ``map_consistency.map_test``. Without ``landmarks``,
         the pose alone is tested.
 
     Raises

@@ -125,9 +125,9 @@ class ConfidenceSequence:
 
         μ exp(± h / μ),   h = σ √(2 (M ρ² + 1) / (M² ρ²) · log(√(M ρ² + 1) / α))
 
-    with mean μ and deviation σ of M numbers; μ ± h is the sequence of [4]_ of the
-    module. On a log scale, both ends have the same error rate, because the deviation
-    of NEES grows with its mean. The intervals hold asymptotically: below
+    with mean μ and deviation σ of M numbers; μ ± h is that of Waudby-Smith et al. On a
+    log scale, both ends have the same error rate, because the deviation of NEES grows
+    with its mean. The intervals hold asymptotically: below
     `FEWEST_SHOWN` runs they are [0, ∞].
     """
 

@@ -112,7 +112,7 @@ def monte_carlo(
         Run until there is a verdict on every estimator, at most `runs`. Results end
         with the block that decides, whatever the number of workers, and equal those of
         a study with that number of runs. Tests that hold 5 % at all looks together
-        decide; see :mod:`slamgym.evaluation.sequential_tests`.
+        decide; see ``slamgym.evaluation.sequential_tests``.
     assumed : Scenario, mapping, str or Path, optional
         The scenario whose noise the estimators assume; the world's by default.
     out : str or Path, optional
