@@ -14,6 +14,7 @@ from typing import NamedTuple
 from ...sim_configs.scenario_files import replace_when_written
 
 MAX_ID_DIGITS = 18  # every such number fits int64
+LARGEST = 1e100  # number whose square, and a sum of such, is finite
 MAX_SHOWN = 60  # characters of a wrong text that an error repeats
 _COMMENT = re.compile(r"#|%|//")
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
@@ -57,13 +58,15 @@ number, got 'east'
         )
 
     def to_real(self, field: str) -> float:
-        """Read a finite number; raise LogError for anything else."""
+        """Read a number of size 1e100 at most; raise LogError for anything else."""
         try:
             value = float(field)
         except ValueError:
             value = math.nan
-        if not math.isfinite(value) or "_" in field:
-            raise self.error("a finite number", shown(field))
+        if not abs(value) <= LARGEST or "_" in field:
+            is_large = LARGEST < abs(value) < math.inf
+            wanted = f"a number up to {LARGEST:g}" if is_large else "a finite number"
+            raise self.error(wanted, shown(field))
         return value
 
     def to_id(self, field: str) -> int:

@@ -35,7 +35,7 @@ measurement,2.5,,0.3,9,0.35
 groundtruth,0,1,2,3
 groundtruth,0.5,1,2,
 """
-FINITE = st.floats(allow_nan=False, allow_infinity=False)
+FINITE = st.floats(-1e100, 1e100)
 
 
 def saved(folder, text):
@@ -149,7 +149,7 @@ def test_windows_line_ends_and_byte_order_mark_change_nothing(tmp_path):
     assert_same_log(plain, read_slamlog(tmp_path / "copy.csv"))
 
 
-@given(numbers=st.tuples(*[FINITE] * 12), dt=st.floats(0, 1e300))
+@given(numbers=st.tuples(*[FINITE] * 12), dt=st.floats(0, 1e100))
 def test_every_float_survives_the_round_trip(tmp_path_factory, numbers, dt):
     t, d, alpha, bearing, distance, x, y, theta, *start, size = numbers
     log = SlamLog(

@@ -356,6 +356,12 @@ def test_a_truth_with_epoch_stamps_is_set_to_the_clock_of_the_log(folder, file):
         ("".join(f"{k + 50} 1 2 0 0 0 0 1\n" for k in range(3)),
          "expected times of the log, 0 to 3, got 50 to 52: give both on one clock"),
         ("t,x,y,theta\n1,,,\n", "expected a true path with poses, got none"),
+        ("t,x,y,qx,qy,qz,qw\n1,0,0,0,0,0,1\n2,0,0,0,0,0,0\n",
+         r"path.txt, line 3: expected a quaternion .* of unit length, got \(0.0, 0.0, 0"
+         r".0, 0.0\): divide it by its length, or remove its columns"),
+        ("t,x,y,qx,qy,qz,qw\n1,0,0,0,0,9e99,1\n", "line 2: expected a quaternion"),
+        ("t,x,y,theta\n1,0,0,0\n2,1e308,0,0\n",
+         r"path.txt, line 3: expected a number up to 1e\+100, got '1e308'"),
         (TUM + "2.5 8 8 0 0 0 0 1\n",
          "path.txt, pose 4: expected a time >= 3, that of the pose before it, got 2.5"),
     ],

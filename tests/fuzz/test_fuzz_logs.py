@@ -99,7 +99,8 @@ def test_damaged_true_paths_are_refused_or_usable(fuzzer, tmp_path):
         truth.write_text(edited(text, changes), encoding="utf-8")
         attempt(tmp_path, log, truth=truth)
 
-    fuzzer.check(read, st.sampled_from(PATHS), edits, few=50)
+    huge = [(PATHS[2], [("replace", 1, 5, size)]) for size in ("1.34e154", "9e99")]
+    fuzzer.check(read, st.sampled_from(PATHS), edits, few=50, saved=huge)
 
 
 def test_bytes_that_are_no_log_are_refused(fuzzer, tmp_path):

@@ -167,11 +167,12 @@ def read_true_path(path: str | PathLike[str]) -> TruePath:
         raise named_columns.lacking("truth", [table], source)
     if kind == "isam":
         return graph.true_path(log_lines.content_of(lines))
-    numbers = numeric_rows(log_lines.content_of(lines))
+    content = log_lines.content_of(lines)
+    numbers = numeric_rows(content)
     if numbers is not None and (kind != "course" or numbers.shape[1] == 4):
         if kind == "course":
             return TruePath(numbers)  # rows t x y θ
-        return path_of(numbers, kind, str(source))
+        return path_of(numbers, kind, content)
     return _known(TruePath(read_log(path).ground_truth), source)
 
 

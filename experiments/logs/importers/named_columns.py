@@ -536,7 +536,9 @@ def true_path_of(table: Table) -> Array:
     elif {"qx", "qy", "qz", "qw"} <= table.columns.keys():
         parts = ("qx", "qy", "qz", "qw")
         quaternions = [[table.number(row, part) for part in parts] for row in rows]
-        headings = heading_of(str(table.file), np.array(quaternions).reshape(-1, 4))
+        headings = heading_of(
+            np.array(quaternions).reshape(-1, 4), [row.line for row in rows]
+        )
     places = [(table.number(row, "x"), table.number(row, "y")) for row in rows]
     path = np.column_stack([times, np.array(places).reshape(-1, 2), headings])
     return path[np.argsort(times, kind="stable")]
