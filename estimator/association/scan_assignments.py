@@ -33,7 +33,7 @@ from ..models.bearing_range import (
     reading_variances_jit,
     wrap_angle_jit,
 )
-from ..models.sensors import bearing_range_std, only_bearing_range, sensor_in
+from ..models.sensors import DELAYED, bearing_range_std, only_bearing_range, sensor_in
 from ..support import argument_checks
 
 #: Assignments of a scan e^8 times less likely than the best one are not considered.
@@ -325,7 +325,10 @@ class Sensor(NamedTuple):
     @classmethod
     def checked(cls, measurement_std: ArrayLike, options: Mapping[str, Any]) -> Sensor:
         """Read a sensor from the arguments of a filter, which has checked them."""
-        sensor = only_bearing_range(sensor_in(options), "data association")
+        sensor = sensor_in(options)
+        if options.get("landmark_init") == DELAYED:
+            sensor = sensor.delayed()
+        only_bearing_range(sensor, "data association")
         noise = Noise(*sensor.noise(measurement_std))
         return cls(noise, options.get("min_range", 1e-3))
 

@@ -24,6 +24,7 @@ from ..kernels.scan_update import DONE, NOT_USABLE
 from ..models.motions import UNICYCLE, Motion, MotionNoise
 from ..models.sensors import (
     BEARING_RANGE,
+    DELAYED,
     Sensor,
     find_sensor,
     for_sensor,
@@ -44,6 +45,9 @@ from .gaussian_map import (
     move_pose,
     update_map,
 )
+
+#: How a new landmark enters the map.
+LANDMARK_INITS = ("full", "independent", DELAYED)
 
 
 class MapFilter(ObservesPoses):
@@ -246,10 +250,12 @@ class EkfSlam(MapFilter):
         Mean of the first pose (x, y, θ) [m, m, rad].
     initial_pose_std : array_like, shape (3,)
         Its standard deviation; zeros if the first pose defines the map's frame.
-    landmark_init : {"full", "independent"}
+    landmark_init : {"full", "independent", "delayed"}
         "full" correlates a new landmark with the pose from which it was seen.
         "independent" omits this correlation, which makes the filter overconfident;
-        it serves to reproduce published results.
+        it serves to reproduce published results.  "delayed" places a landmark once
+        readings from several poses determine it, see :mod:`.delayed_landmarks`; it is
+        for bearings that are coarse beside the ranges, r σβ²/2 > σr.
     gate_probability : float or None
         Readings of mapped landmarks outside this chi-square region of their own
         innovation are rejected; None accepts all.
@@ -309,7 +315,8 @@ class EkfSlam(MapFilter):
         motion: str | Motion = UNICYCLE,
     ) -> None:
         self._motion_noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
-        self.sensor = find_sensor(sensor)
+        given = find_sensor(sensor)
+        self.sensor = given.delayed() if landmark_init == DELAYED else given
         self._is_default = self.sensor == BEARING_RANGE
         self.waiting = None if self.sensor.places else Waiting()
         self.rules = checked_rules(
@@ -598,11 +605,11 @@ def checked_rules(
 ) -> Rules:
     """Return the rules of an update, from the arguments of :class:`.ekf.EkfSlam`."""
     std = two_stds(sensor, measurement_std)
-    argument_checks.one_of("landmark_init", landmark_init, ("full", "independent"))
+    argument_checks.one_of("landmark_init", landmark_init, LANDMARK_INITS)
     return Rules(
         linearisation=linearisation,
         frame=frame,
-        correlated=landmark_init == "full",
+        correlated=landmark_init != "independent",
         first_std=float(std[0]),
         second_std=float(std[1]) if sensor.size == 2 else 1.0,
         std_per_metre=float(sensor.range_std_per_metre),

@@ -42,6 +42,10 @@ Noise = tuple[float, ...]  # the four numbers of a filter, see `Sensor`
 Slopes = tuple[Real, Real, Real, Real]
 
 
+#: Value of ``landmark_init`` with which readings of new landmarks wait.
+DELAYED = "delayed"
+
+
 def constant_std(noise: Noise, distance: Real) -> Numbers:
     """Return the two standard deviations as given, at any distance."""
     return noise[0] + 0.0 * distance, noise[1] + 0.0 * distance
@@ -187,6 +191,10 @@ class Sensor:
         array([0.02, 0.3 ])
         """
         return replace(self, **numbers)
+
+    def delayed(self) -> Sensor:
+        """Return the sensor as one whose single reading does not place a landmark."""
+        return replace(self, name=f"{self.name} ({DELAYED})", inverse=None)
 
     def noise(self, measurement_std: ArrayLike) -> Noise:
         """Return the four numbers of `std` for a filter's measurement_std (2,)."""

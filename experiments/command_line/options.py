@@ -105,7 +105,7 @@ class Options:
         σx,σy,σθ of the first pose [m, m, rad].
     landmark_init
         How a landmark enters the map: full correlates it with the pose; independent, as
-        in the homework, does not.
+        in the homework, does not; delayed waits until several poses have seen it.
     gate_probability
         Reject readings outside this probability region of their innovation.
     range_std_per_metre
@@ -156,7 +156,7 @@ class Options:
     motion_std: str | None = declared(None, "A,B,C", "from the log")
     measurement_std: str | None = declared(None, "A,B", "from the log")
     initial_pose_std: str | None = declared(None, "A,B,C", "from the log, else 0,0,0")
-    landmark_init: str | None = declared(None, "full|independent", "full")
+    landmark_init: str | None = declared(None, "full|independent|delayed", "full")
     gate_probability: float | None = declared(None, "P", "none rejected")
     range_std_per_metre: float | None = declared(None, "K", "from the log, else 0")
     noise_at_rest: bool | None = declared(

@@ -28,7 +28,7 @@ from ..jobs import replace_own
 from .figures import MOST_DOTS, PURPLE, SKY, grid_steps, report_figures
 from .runner import ASSUMED_FILE, python_call
 from .summary import NOTHING, measures, number, percent
-from .verdict import CONSISTENT, KINDS, NEARLY, NOT_CONSISTENT
+from .verdict import CONSISTENT, KINDS, NEARLY, NOT_CONSISTENT, names_cause
 
 _LARGE = 1e5  # written without three decimals
 _FEW = 3  # estimators; a headline counts more of them
@@ -80,6 +80,7 @@ def html_report(dataset: xr.Dataset, summary: dict[str, Any]) -> str:
         "most_dots": MOST_DOTS,
         "few_averages": FEW_AVERAGES,
         "kinds": KINDS,
+        "names_cause": names_cause,
         "signs": {CONSISTENT: "✓", NEARLY: "≈", NOT_CONSISTENT: "✗"},
         "outcomes": {True: "accepted", False: "rejected", None: NOTHING},
         "inside": {CONSISTENT: "yes", NOT_CONSISTENT: "no, outside"},

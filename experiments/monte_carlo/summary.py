@@ -15,6 +15,7 @@ import xarray as xr
 
 from ...arrays import AnyArray, Array, BoolArray
 from ...estimator.models.rigid_motion import ErrorFrame
+from ...estimator.models.sensors import DELAYED
 from ...evaluation.association_scores import CUTOFF, Gospa
 from ...evaluation.consistency_report import ConsistencyReport
 from ...evaluation.error_bound import Efficiency, efficiency
@@ -238,7 +239,10 @@ def consistency_of(
 
 def _unused_readings(scores: EstimatorScores) -> float | None:
     """Divide the readings that a gate or the least range rejected by all readings."""
-    if KNOWN_IDS_ATE in scores.results or scores.results.attrs.get("readings_may_wait"):
+    options = estimators_of(scores.results).get(scores.label, {}).get("options") or {}
+    may_wait = bool(scores.results.attrs.get("readings_may_wait"))
+    may_wait |= options.get("landmark_init") == DELAYED
+    if KNOWN_IDS_ATE in scores.results or may_wait:
         return None
     corrected = scores.per_run("nis_dof").sum(axis=1) / 2
     added = scores.per_run("relative_map_dof") / 2

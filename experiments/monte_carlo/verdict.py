@@ -18,6 +18,7 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
 from ...estimator.models.rigid_motion import ERROR_FRAMES, ErrorFrame
+from ...estimator.models.sensors import DELAYED
 from ...estimator.support.argument_checks import one_of
 from ...evaluation.consistency_report import (
     FEW_AVERAGES,
@@ -40,7 +41,7 @@ from ...evaluation.hypothesis_tests import EQUIVALENCE_MARGIN, EquivalenceTest
 from ...evaluation.map_consistency import BIAS_MARGIN, TESTS, MapReport, map_test
 from ...evaluation.map_consistency import ERROR_RATE as MAP_ERROR_RATE
 from ...suggestions import counted
-from ..runs.summary import MOST_REJECTED, NIS_RANGE, nis_suspicion
+from ..runs.summary import MOST_REJECTED, NIS_RANGE, coarse_suspicion, nis_suspicion
 from ..runs.trace import finite, quotient
 from .run_measures import (
     DEVIATIONS,
@@ -385,48 +386,42 @@ def _kind(message: str) -> str:
 
 
 def coarse_bearings(scenario: str, entries: Mapping[str, Mapping[str, Any]]) -> str:
-    """Write whether bearings are too coarse for filters, beside fine ranges.
-
-    A reading of deviations (σβ, σr) at the range r lies on an arc, which is r σβ²/2
-    away from its tangent at one σβ.  A filter that places a landmark by one reading
-    takes the tangent for the arc, and is overconfident where this exceeds σr.
+    """Write whether bearings are too coarse for filters, at the maximum range.
 
     Parameters
     ----------
     scenario : str
         The TOML text of the world.
     entries : mapping
-        By label, each with ``verdict``.
+        By label, each with ``verdict``, and ``options`` where known.
 
     Returns
     -------
     str
-        Empty if no filter is refused, or the sensor is accurate or without a limit.
+        See `coarse_suspicion`; empty if no filter is refused whose landmarks are placed
+        by one reading, or if the sensor is without a limit.
 
     Examples
     --------
     >>> world = "sensor = {std = [0.3, 0.1], max_range = 5.0}"
     >>> coarse_bearings(world, {"ekf": {"verdict": "not consistent"}})
-    'At its maximum range, a bearing off by σβ = 0.3 rad moves a reading 0.225 m off...
+    'A bearing that is wrong by σβ = 0.3 rad moves a reading at 5 m by 0.225 m off ...
     >>> coarse_bearings(world, {"ekf": {"verdict": "consistent"}})
     ''
     """
     sensor = tomllib.loads(scenario).get("sensor", {})
     farthest = float(sensor.get("max_range", math.inf))
-    refused = any(entry.get("verdict") == NOT_CONSISTENT for entry in entries.values())
+    refused = any(
+        entry.get("verdict") == NOT_CONSISTENT
+        and (entry.get("options") or {}).get("landmark_init") != DELAYED
+        for entry in entries.values()
+    )
     has_both = sensor.get("kind", "bearing_range") == "bearing_range"
     if not refused or not has_both or math.isinf(farthest) or "std" not in sensor:
         return ""
     bearing, fixed = map(float, sensor["std"])
     range_std = fixed + farthest * float(sensor.get("range_std_per_metre", 0.0))
-    off = farthest * bearing**2 / 2
-    if off < range_std:
-        return ""
-    return (
-        f"At its maximum range, a bearing off by σβ = {bearing:g} rad moves a reading "
-        f"{off:.3g} m off the tangent, and σr is {range_std:.3g} m: a filter that "
-        "places landmarks by one reading is overconfident (docs/filters.md, invariant)."
-    )
+    return coarse_suspicion(bearing, range_std, farthest)
 
 
 def run_warnings(entries: Mapping[str, Mapping[str, Any]], runs: int) -> list[str]:
@@ -627,6 +622,18 @@ def _range(values: Array) -> str:
     return least if least == most else f"{least} to {most}"
 
 
+def names_cause(entry: Mapping[str, Any]) -> bool:
+    """Whether the diagnosis in an entry of the summary says that something is wrong.
+
+    "cannot tell" does not where no test rejects the errors and no run has failed.
+    """
+    found = entry.get("diagnosis")
+    if found is None or found["cause"] == HONEST:
+        return False
+    nothing = entry.get("verdict") == NOT_SHOWN and not entry.get("failed_runs")
+    return not (nothing and found["cause"] == CANNOT_TELL)
+
+
 def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
     """Write the cause in an entry of the summary, and what helps to find it, as lines.
 
@@ -639,7 +646,7 @@ def diagnosis_lines(label: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
     ('ekf: cause: clutter: it is used.',)
     """
     found, lines = entry.get("diagnosis"), []
-    if found is not None and found["cause"] != HONEST:
+    if found is not None and names_cause(entry):
         word = "note" if entry.get("verdict") == CONSISTENT else "cause"
         lines.append(f"{word}: {found['sentence']}")
     lines += [f"check_estimator finds: {text}" for text in entry.get("check", ())]

@@ -15,6 +15,7 @@ from ... import __version__
 from ...arrays import Array
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.rigid_motion import ErrorFrame, rotation
+from ...estimator.models.sensors import BEARING_RANGE, DELAYED
 from ...evaluation import nees
 from ...evaluation.association_scores import oracle_errors, places_of
 from ...evaluation.hypothesis_tests import chi_square_quantile
@@ -86,7 +87,7 @@ def summarise(
         "landmark_rmse": rmse_table(map_accuracy(trace)),
         "association": association_summary(replay, resolution, settings),
         "probably_lost": replay.probably_lost,
-        "warnings": run_warnings(replay),
+        "warnings": run_warnings(replay, settings),
     }
 
 
@@ -372,8 +373,15 @@ def association_failure(summary: Mapping[str, Any]) -> str:
     return "the filter is probably lost" if summary["probably_lost"] else ""
 
 
-def run_warnings(replay: Replay) -> list[str]:
+def run_warnings(replay: Replay, settings: FilterSettings | None = None) -> list[str]:
     """List what is suspicious about a run.
+
+    Parameters
+    ----------
+    replay : Replay
+        The run.
+    settings : FilterSettings, optional
+        Settings of its estimator.
 
     Returns
     -------
@@ -382,6 +390,7 @@ def run_warnings(replay: Replay) -> list[str]:
     """
     found = [LOST * bool(replay.probably_lost)]
     found += [_rejections(replay), _nis(replay), _crowded_map(replay)]
+    found += [_coarse(replay.log, settings)]
     trace = replay.trace
     found += exchange_warnings(
         replay.log, trace.landmark_ids, trace.landmarks, trace.true_landmarks
@@ -488,6 +497,49 @@ def nis_suspicion(ratio: float, *, associates: bool) -> str:
     return (
         f"NIS is {ratio:.3g} per degree of freedom, where 1 is expected: the filter "
         f"assumes {amount} noise{other}."
+    )
+
+
+def _coarse(log: SlamLog, settings: FilterSettings | None) -> str:
+    readings = [scan.measurements for scan in log.scans if len(scan.measurements)]
+    if settings is None or settings.sensor != BEARING_RANGE or not readings:
+        return ""
+    if settings.options.get("landmark_init") == DELAYED:
+        return ""
+    distance = float(np.median(np.concatenate(readings)[:, 1]))
+    std = settings.sensor.stds(settings.measurement_std, distance)
+    return coarse_suspicion(float(std[0]), float(std[1]), distance)
+
+
+def coarse_suspicion(bearing_std: float, range_std: float, distance: float) -> str:
+    """Write whether bearings are too coarse beside fine ranges.
+
+    A reading of deviations (σβ, σr) at the range r lies on an arc, which is r σβ²/2
+    away from its tangent at one σβ.  A filter that places a landmark by one reading
+    takes the tangent for the arc, and is overconfident where this exceeds σr.
+
+    Parameters
+    ----------
+    bearing_std, range_std : float
+        σβ [rad] and σr [m].
+    distance : float
+        r [m].
+
+    Examples
+    --------
+    >>> coarse_suspicion(0.3, 0.1, 5.0)
+    'A bearing that is wrong by σβ = 0.3 rad moves a reading at 5 m by 0.225 m off ...
+    >>> coarse_suspicion(0.1, 0.1, 5.0)
+    ''
+    """
+    off = distance * bearing_std**2 / 2
+    if off <= range_std:
+        return ""
+    return (
+        f"A bearing that is wrong by σβ = {bearing_std:g} rad moves a reading at "
+        f"{distance:.3g} m by {off:.3g} m off its tangent, and σr is {range_std:.3g} "
+        "m: filters that place a landmark by one reading are overconfident; those of "
+        "slamgym wait for several with landmark_init=delayed."
     )
 
 

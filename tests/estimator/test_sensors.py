@@ -545,6 +545,44 @@ def test_landmarks_are_placed_from_several_poses(label, sensor):
     assert squared < 13 * 2.5
 
 
+def test_bearing_and_range_wait_for_several_poses_if_told_so():
+    slam = waiting_filter("invariant", BEARING_RANGE, landmark_init="delayed")
+    pose, _ = drive_past(slam, BEARING_RANGE, 1)
+    assert (slam.landmark_ids, len(slam.waiting.ids)) == ((), 5)
+    rng = np.random.default_rng(5)
+    pose = pose + np.array([0.3 * np.cos(pose[2]), 0.3 * np.sin(pose[2]), 0.15])
+    slam.predict((0.3, 0.15))
+    slam.update(reading(BEARING_RANGE, pose, LANDMARKS, rng), range(5))
+    belief = slam.belief()
+    assert len(belief.landmark_ids) >= 4  # fine bearings: two readings are enough
+    error = belief.error(pose, LANDMARKS[list(belief.landmark_ids)])
+    assert error @ np.linalg.solve(belief.error_covariance(), error) < 2.5 * len(error)
+
+
+def test_delayed_landmarks_of_fine_bearings_are_those_of_the_usual_filter():
+    noise = {"motion_std": (0.01, 0.01, 0.003), "measurement_std": (0.003, 0.01)}
+    slams = [
+        make_estimator("invariant", **noise, landmark_init=how)
+        for how in ("full", "delayed")
+    ]
+    for slam in slams:
+        drive_past(slam, BEARING_RANGE, 12, noise=0.1)
+    full, delayed = (slam.belief(range(5)) for slam in slams)
+    std = np.sqrt(np.diag(full.covariance))
+    assert (np.abs(delayed.mean - full.mean) < 0.1 * std).all()
+    np.testing.assert_allclose(
+        delayed.covariance, full.covariance, atol=0.02 * std.max() ** 2
+    )
+
+
+@pytest.mark.parametrize("name", ["robocentric", "compressed", "submaps", "ideal"])
+def test_filters_that_do_not_wait_refuse_delayed_landmarks(name):
+    with pytest.raises(ValueError, match=r"got 'bearing_range \(delayed\)'"):
+        make_estimator(name, **NOISE, landmark_init="delayed")
+    with pytest.raises(ValueError, match="data association accepts only sensor 'bear"):
+        make_estimator("ekf", **NOISE, landmark_init="delayed", management=True)
+
+
 def test_mirror_images_of_ranges_are_kept_until_they_separate():
     """A straight path cannot tell a landmark on the left from one on the right."""
     slam = waiting_filter("invariant", RANGE)

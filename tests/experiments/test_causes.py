@@ -15,6 +15,7 @@ from slamgym.experiments.monte_carlo import (
 from slamgym.experiments.monte_carlo.filtered_runs import noise_of_runs
 from slamgym.experiments.monte_carlo.report import escaped as escape
 from slamgym.experiments.monte_carlo.report import html_report
+from slamgym.experiments.monte_carlo.verdict import diagnosis_lines
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
@@ -241,6 +242,17 @@ def test_only_a_consistent_filter_is_honest():
     entry = summary_of(WORLD, runs=20)["estimators"]["invariant"]
     is_honest = entry["diagnosis"]["cause"] == "honest"
     assert is_honest == (entry["verdict"] == "consistent")
+
+
+@pytest.mark.parametrize("runs", [8, 20])
+def test_an_honest_filter_that_needs_more_runs_gets_no_line_about_a_cause(runs):
+    results = monte_carlo(WORLD, "invariant", runs, SEED + 1)
+    summary = summarise_monte_carlo(results)
+    entry = summary["estimators"]["invariant"]
+    assert entry["verdict"] == "not shown"
+    assert entry["diagnosis"]["cause"] == "cannot tell"
+    assert not any("cause" in line for line in diagnosis_lines("invariant", entry))
+    assert "Cause:" not in html_report(results, summary)
 
 
 def test_association_is_named_where_landmarks_are_confused_and_not_elsewhere():

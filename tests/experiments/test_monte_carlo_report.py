@@ -30,6 +30,7 @@ from slamgym.experiments.monte_carlo.report import (
 from slamgym.experiments.monte_carlo.summary import summarise_monte_carlo
 from slamgym.experiments.monte_carlo.verdict import (
     KINDS,
+    coarse_bearings,
     diagnosis_lines,
     judge,
     run_warnings,
@@ -638,10 +639,18 @@ def test_readings_that_a_gate_rejects_are_counted():
 
 def test_readings_that_wait_are_not_called_unused():
     world = load_scenario("bearing").with_changes(steps=10)
-    results = monte_carlo(world, "ekf", 2)
-    assert (
-        summarise_monte_carlo(results)["estimators"]["ekf"]["unused_readings"] is None
-    )
+    studies = (world, "ekf"), ("six_landmarks", "ekf[landmark_init=delayed],ekf")
+    summaries = [summarise_monte_carlo(monte_carlo(*study, 2)) for study in studies]
+    found = [entry for each in summaries for entry in each["estimators"].values()]
+    assert [entry["unused_readings"] for entry in found] == [None, None, 0.0]
+
+
+def test_a_filter_that_waits_gets_no_note_about_coarse_bearings():
+    world = "sensor = {std = [0.3, 0.1], max_range = 5.0}"
+    refused = {"verdict": "not consistent", "options": {}}
+    assert "landmark_init=delayed" in coarse_bearings(world, {"ekf": refused})
+    waits = refused | {"options": {"landmark_init": "delayed"}}
+    assert not coarse_bearings(world, {"ekf": waits})
 
 
 @pytest.mark.parametrize("width", [85.0, 170.0])

@@ -11,7 +11,11 @@ from slamgym.estimator import make_estimator
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
-from slamgym.experiments.runs.filter_settings import SMOOTHER, settings_for
+from slamgym.experiments.runs.filter_settings import (
+    SMOOTHER,
+    FilterSettings,
+    settings_for,
+)
 from slamgym.experiments.runs.log_replay import replay
 from slamgym.experiments.runs.log_smoothing import smooth_log, summarise_smoothing
 from slamgym.experiments.runs.summary import (
@@ -74,6 +78,23 @@ def test_innovations_of_a_filter_that_associates_may_be_of_wrong_landmarks():
     slam = make_estimator("ekf", **noise, management=True)
     warnings = run_warnings(replay(standing([PLACES] * 40), slam))
     assert any("too much noise, or associates wrongly." in w for w in warnings)
+
+
+def test_bearings_that_are_coarse_beside_fine_ranges_are_told():
+    """The median distance is 4.1 m: σβ = 0.3 moves a reading by 0.19 m."""
+    done = run(standing([PLACES] * 30, ids=[1, 2, 3]))
+
+    def said(bearing_std, **options):
+        std = bearing_std, 0.1
+        settings = FilterSettings("ekf", NOISE["motion_std"], std, options=options)
+        return run_warnings(done, settings)
+
+    (warning,) = said(0.3)
+    assert "is wrong by σβ = 0.3 rad moves a reading at 4.1" in warning
+    assert "by 0.18" in warning
+    assert warning.endswith("wait for several with landmark_init=delayed.")
+    for silent in said(0.2), said(0.3, landmark_init="delayed"), run_warnings(done):
+        assert silent == []
 
 
 def test_landmarks_that_are_seen_no_longer_are_told():
