@@ -14,6 +14,7 @@ from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.motions import predict_pose
 from slamgym.evaluation.hypothesis_tests import average_band
 from slamgym.evaluation.nees import pose_nees
+from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
@@ -75,6 +76,17 @@ def test_in_the_seed_world_the_ekf_believes_to_know_its_heading():
 @pytest.mark.parametrize("name", ["ekf", "invariant", "first_estimates", "iterated"])
 def test_with_the_frame_anchored_every_filter_is_consistent(name):
     assert 0.9 < study("anchored", name)[0].mean() < 1.1
+
+
+@pytest.mark.parametrize("name", ["robocentric", "compressed", "submaps"])
+def test_a_filter_that_rotates_covariances_has_no_nees_before_its_robot_has_turned(
+    name,
+):
+    """Without noise to its side, the robot's y is certain until the heading errs."""
+    world = load_scenario("corridor").with_changes(steps=3)
+    nees = monte_carlo(world, ["ekf", name], runs=10).pose_nees_invariant.values
+    np.testing.assert_array_equal(np.isnan(nees[1]), np.isnan(nees[0]))
+    assert np.nanmax(nees) < 30
 
 
 @pytest.mark.slow

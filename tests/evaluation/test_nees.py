@@ -121,6 +121,18 @@ def test_a_covariance_singular_within_rounding_has_no_nees(size):
     assert np.isnan(nees[1])
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("frame", ["additive", "invariant"])
+def test_a_variance_of_rounding_beside_that_of_the_other_axis_gives_no_nees(
+    axis, frame
+):
+    covariances = np.tile(np.diag([1e-4, 1e-4, 1e-4]), (3, 1, 1))
+    covariances[:, axis, axis] = 0.0, 1e-22, 1e-14
+    poses = np.zeros((3, 3))
+    nees = pose_nees(poses + 0.01, poses, covariances, frame=frame)
+    np.testing.assert_array_equal(np.isfinite(nees), [False, False, True])
+
+
 @pytest.mark.parametrize(
     "function", [pose_nees, position_nees, state_nees, landmark_nees]
 )
