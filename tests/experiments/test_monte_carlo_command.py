@@ -192,6 +192,36 @@ def test_a_filter_of_ones_own_that_is_not_consistent_is_checked(here, monkeypatc
     assert len(entries["careless:Careless"]["check"]) <= 2
 
 
+SURE_OF_ITS_MAP = """
+from slamgym.estimator import Belief, EkfSlam
+
+class Sure(EkfSlam):
+    def belief(self, landmark_ids=None):
+        own = super().belief(landmark_ids)
+        covariance = own.covariance.copy()
+        covariance[3:] /= 10
+        covariance[:, 3:] /= 10
+        return Belief(own.mean, covariance, own.landmark_ids)
+
+    def predict(self, odometry, dt=1.0):
+        super().predict(odometry, dt)
+"""
+
+
+def test_of_a_filter_whose_map_alone_is_wrong_no_finding_about_the_pose_is_quoted(
+    here, monkeypatch
+):
+    (here / "sure.py").write_text(SURE_OF_ITS_MAP)
+    monkeypatch.syspath_prepend(here)
+    result = slamgym("monte-carlo", "anchored", "-e", "sure:Sure", "--runs", 20)
+    assert result.exit_code == 0, result.stderr
+    (file,) = here.glob("results/*/summary.json")
+    entry = json.loads(file.read_text())["estimators"]["sure:Sure"]
+    assert entry["diagnosis"]["cause"] == "map"
+    assert all("of l1" in text for text in entry["check"])
+    assert entry["check"]
+
+
 def test_a_study_until_decided_stops_and_states_its_runs_and_evidence(here):
     result = slamgym(
         *("monte-carlo", "six_landmarks", "-e", "ekf", "--runs", 64),
