@@ -1,5 +1,7 @@
 """Tests whether the covariances of final maps agree with their errors: `map_test`.
 
+:class:`MapEvidence` does the same after every run of a study that grows.
+
 A landmark is judged by its position relative to the robot, which a rotation or
 translation of the world does not change. Linearisation raises the NEES even of a good
 filter by some percent, which many landmarks and runs would show with certainty.
@@ -15,15 +17,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtr, chdtrc, chndtr
 
-from ..arrays import Array, IntArray
+from ..arrays import Array, BoolArray, IntArray
 from ..estimator.support.argument_checks import shaped
 from .hypothesis_tests import EQUIVALENCE_MARGIN, EquivalenceTest, equivalence_test
+from .sequential_tests import EProcess, MeanEProcess, average_of
 
 #: Length of a mean error that counts as zero, in deviations.
 BIAS_MARGIN = 0.25
 #: Rate at which all its tests together may reject a consistent map.
 ERROR_RATE = 0.005
 _POINT = 2  # degrees of freedom of a landmark
+_LARGEST = 1e100  # NEES that counts
 #: Tests that share it: of the whole map, of each landmark, seen from the robot and in
 #: the frame of the map, and of the mean error of each.
 TESTS = 4
@@ -204,6 +208,75 @@ def map_test(
             1 - chndtr(counts * (means**2).sum(axis=1), _POINT, counts * BIAS_MARGIN**2)
         ),
     )
+
+
+class MapEvidence:
+    """Evidence against the final maps, after each of many runs.
+
+    It is the average of four e-processes, which ask what :func:`map_test` asks: about
+    the whole map, about each landmark seen from the robot and in the frame of the map,
+    and about the mean error of each. A map whose matrix has a negative eigenvalue is
+    certain evidence.
+    """
+
+    def __init__(self) -> None:
+        self._whole, self._from_robot, self._in_map = (
+            EProcess(EQUIVALENCE_MARGIN) for _ in range(TESTS - 1)
+        )
+        self._means = MeanEProcess(BIAS_MARGIN, EQUIVALENCE_MARGIN.high)
+        self._is_indefinite = False
+        #: Number of maps so far without a NEES, as of a singular covariance.
+        self.undefined = 0
+
+    def update(
+        self,
+        deviations: Array,
+        nees: Array,
+        degrees_of_freedom: IntArray,
+        landmark_nees: Array,
+    ) -> tuple[Array, Array]:
+        """Add runs, and return log e after each of them, and their ratios.
+
+        Parameters
+        ----------
+        deviations, nees, degrees_of_freedom, landmark_nees
+            As in :func:`map_test`. Runs with 0 degrees of freedom have no map.
+
+        Returns
+        -------
+        ndarray, shape (runs,)
+        ndarray, shape (runs,)
+            NEES of the whole map by its degrees of freedom; nan where it has none.
+        """
+        squares = (deviations**2).sum(axis=2)
+        has_map = degrees_of_freedom > 0
+        finite = ~np.isinf(squares).any(axis=1)
+        defined = has_map & np.isfinite(nees) & finite
+        indefinite = has_map & np.isposinf(nees)
+        self.undefined += int((has_map & ~defined & ~indefinite).sum())
+        known = np.isfinite(squares) & defined[:, None]
+        known_in_map = np.isfinite(landmark_nees) & defined[:, None]
+        totals, freedom = np.where(defined, nees, 0.0), degrees_of_freedom * defined
+        each = (
+            self._whole.update(_kept(totals, defined)[:, None], freedom),
+            self._from_robot.update(_kept(squares, known), _POINT * known),
+            self._in_map.update(
+                _kept(landmark_nees, known_in_map), _POINT * known_in_map
+            ),
+            self._means.update(np.where(known[:, :, None], deviations, np.nan)),
+        )
+        certain = np.logical_or.accumulate(indefinite) | self._is_indefinite
+        self._is_indefinite |= bool(indefinite.any())
+        ratios = totals / np.where(defined, freedom, 1)
+        return (
+            np.where(certain, np.inf, average_of(each)),
+            np.where(defined, ratios, np.nan),
+        )
+
+
+def _kept(nees: Array, known: BoolArray) -> Array:
+    """Return known NEES, at most as large that no sum overflows, and 0 for others."""
+    return np.where(known, np.minimum(nees, _LARGEST), 0.0)
 
 
 def farthest(ratios: Array) -> int:

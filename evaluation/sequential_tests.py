@@ -3,9 +3,9 @@
 A test with a fixed number of runs loses its error rate if more runs are added until it
 decides. An e-process does not. It is a product of likelihood ratios, at least 0 and 1
 on average if the filter is consistent, so that it ever reaches 1/α with a probability
-of at most α, however long one waits [1]_ [2]_ [3]_. :class:`EProcess` rejects, and
-:class:`ConfidenceSequence` shows that a ratio is near 1; the latter is asymptotic [4]_
-and must not reject.
+of at most α, however long one waits [1]_ [2]_ [3]_. :class:`EProcess` and
+:class:`MeanEProcess` reject, and :class:`ConfidenceSequence` shows that a ratio is near
+1; the latter is asymptotic [4]_ and must not reject.
 
 References
 ----------
@@ -30,6 +30,8 @@ from ..arrays import Array
 
 #: Factors c by which squared errors may differ, each of equal weight.
 SCALES = np.delete(np.geomspace(0.3, 20.0, 43), 12)
+#: Lengths m of mean errors, in deviations, and number of their directions.
+MEANS, _DIRECTIONS = np.array([0.5, 1.0, 2.0, 4.0]), 8
 #: Number of runs below which a confidence sequence shows nothing.
 FEWEST_SHOWN = 30
 #: Rate of both ends together. Each end then stays below 5 % also for the skewed
@@ -39,21 +41,53 @@ _LARGEST_LOG = 700.0
 _SQUARED_RHO = 0.1  # narrowest after about 70 runs
 
 
-class EProcess:
+class _Mixture:
+    """Average of products of likelihood ratios, which is 1 before the first run."""
+
+    def __init__(self) -> None:
+        self._logs: Array | None = None
+
+    def _multiplied(self, gains: Array) -> Array:
+        """Multiply by likelihood ratios of M runs, and return log e after each of them.
+
+        Parameters
+        ----------
+        gains : ndarray, shape (M, k, c)
+            Their logarithms, for k sums of evidence and c alternatives.
+        """
+        if self._logs is None:
+            self._logs = np.zeros(gains.shape[1:])
+        logs = np.cumsum(np.concatenate([self._logs[None], gains]), axis=0)
+        self._logs = logs[-1].copy()  # a view would keep all of them
+        flat = logs[1:].reshape(len(gains), -1)
+        top = flat.max(axis=1, initial=-np.inf)
+        return np.asarray(top + np.log(np.exp(flat - top[:, None]).mean(axis=1)))
+
+
+class EProcess(_Mixture):
     """Evidence against χ² distributed NEES at some steps, after each of many runs.
 
     ::
 
-        eₖ(M) = mean over c of Πᵢ c^(−nᵢ/2) exp(−xᵢₖ (1/c − 1) / 2),   i = 1 … M
+        eₖ(M) = mean over c of Πᵢ c^(−nᵢₖ/2) exp(−xᵢₖ (1/c − 1) / (2 r)),   i = 1 … M
         e(M)  = mean over k of eₖ(M)
 
-    xᵢₖ is the NEES of run i at step k, with nᵢ degrees of freedom. Each factor is the
-    ratio of the densities of c χ²(n) and χ²(n). Runs must be independent. Steps may be
-    correlated in any way, because an average of e-processes is one.
+    xᵢₖ is the NEES of run i at step k, with nᵢₖ degrees of freedom. Each factor is the
+    ratio of the densities of r c χ²(n) and r χ²(n). Runs must be independent. Steps may
+    be correlated in any way, because an average of e-processes is one.
+
+    Parameters
+    ----------
+    margin : (float, float)
+        Ratios that are no reason to reject: r is the larger one for c > 1, the smaller
+        one for c < 1. The average of each factor is then at most 1 for all NEES that
+        are a ratio inside the margin times χ².
     """
 
-    def __init__(self) -> None:
-        self._logs: Array | None = None
+    def __init__(self, margin: tuple[float, float] = (1.0, 1.0)) -> None:
+        super().__init__()
+        low, high = margin
+        self._slopes = (1 / SCALES - 1) / np.where(SCALES > 1, high, low)
 
     def update(self, nees: ArrayLike, degrees_of_freedom: ArrayLike) -> Array:
         """Add runs, and return log e after each of them.
@@ -63,7 +97,8 @@ class EProcess:
         nees : array_like, shape (M, k)
             NEES of M runs at k steps that are chosen beforehand.
         degrees_of_freedom : array_like
-            One number, or one per run, shape (M,). A run with 0 adds no evidence.
+            One number, one per run, shape (M,), or all, shape (M, k). NEES with 0 add
+            no evidence.
 
         Returns
         -------
@@ -86,17 +121,63 @@ class EProcess:
                 f"nees must have the {len(self._logs)} steps of earlier runs, "
                 f"got {values.shape[1]}"
             )
-        freedom = np.broadcast_to(degrees_of_freedom, len(values))[:, None, None]
-        gains = np.asarray(
-            -0.5 * (freedom * np.log(SCALES) + values[:, :, None] * (1 / SCALES - 1))
-        )
-        if self._logs is None:
-            self._logs = np.zeros(gains.shape[1:])
-        logs = np.cumsum(np.concatenate([self._logs[None], gains]), axis=0)
-        self._logs = logs[-1].copy()  # a view would keep all of them
-        flat = logs[1:].reshape(len(values), -1)
-        top = flat.max(axis=1, initial=-np.inf)
-        return np.asarray(top + np.log(np.exp(flat - top[:, None]).mean(axis=1)))
+        freedom = np.asarray(degrees_of_freedom)
+        if freedom.ndim < 2:
+            freedom = np.broadcast_to(freedom, len(values))[:, None]
+        gains = freedom[:, :, None] * np.log(SCALES) + values[:, :, None] * self._slopes
+        return self._multiplied(-0.5 * np.where(freedom[:, :, None] > 0, gains, 0.0))
+
+
+class MeanEProcess(_Mixture):
+    """Evidence against mean errors of about 0, after each of many runs.
+
+    ::
+
+        eₖ(M) = mean over u, m of Πᵢ exp(((m − δ) u·wᵢₖ − (m² − δ²) / 2) / v)
+        e(M)  = mean over k of eₖ(M)
+
+    wᵢₖ is the whitened error (2 numbers) of landmark k in run i. Each factor is the
+    ratio of the densities of N(m, v) and N(δ, v) of an error in the direction u. Its
+    average is at most 1 if the mean error is at most δ, and the variance at most v.
+
+    Parameters
+    ----------
+    largest_mean : float
+        δ, length of a mean error that is no reason to reject, in deviations.
+    largest_variance : float
+        v, the same for the variance of a whitened error.
+    """
+
+    def __init__(self, largest_mean: float, largest_variance: float) -> None:
+        super().__init__()
+        angles = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+        toward = np.array([np.cos(angles), np.sin(angles)])  # (2, directions)
+        over = (MEANS - largest_mean) / largest_variance
+        self._slopes = (toward[:, :, None] * over).reshape(2, -1)
+        offsets = (MEANS**2 - largest_mean**2) / (2 * largest_variance)
+        self._offsets = np.tile(offsets, _DIRECTIONS)
+
+    def update(self, errors: ArrayLike) -> Array:
+        """Add runs, and return log e after each of them.
+
+        Parameters
+        ----------
+        errors : array_like, shape (M, k, 2)
+            Whitened errors of k landmarks in M runs; nan adds no evidence.
+
+        Returns
+        -------
+        ndarray, shape (M,)
+
+        Examples
+        --------
+        >>> errors = [[[1.0, 0.0]], [[np.nan, np.nan]], [[3.0, -0.5]]]
+        >>> MeanEProcess(0.25, 1.25).update(errors).round(1)
+        array([-0.7, -0.7,  0.1])
+        """
+        values = np.asarray(errors, dtype=np.float64)
+        gains = values @ self._slopes - self._offsets
+        return self._multiplied(np.where(np.isnan(gains), 0.0, gains))
 
 
 def average_of(logs: Sequence[Array], weights: Sequence[float] | None = None) -> Array:

@@ -7,6 +7,8 @@ in 5 % of cases. Later verdicts therefore follow from the tests of
 :mod:`slamgym.evaluation.sequential_tests`, which hold their error rates at all looks
 together: :class:`Watch` applies them to the runs in their order. If a study is
 extended, its first verdict has 4 % of the 5 %, and all later ones have 1 % together.
+
+Both cover the pose and, where it is known, the map, whose evidence weighs a tenth.
 """
 
 from __future__ import annotations
@@ -17,11 +19,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...arrays import AnyArray, BoolArray, IntArray
+from ...arrays import AnyArray, Array, BoolArray, IntArray
 from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation.consistency_report import FEW_RUNS, ConsistencyReport
 from ...evaluation.diagnosis import p_text
 from ...evaluation.hypothesis_tests import EQUIVALENCE_MARGIN, Band
+from ...evaluation.map_consistency import ERROR_RATE as MAP_ERROR_RATE
+from ...evaluation.map_consistency import MapEvidence, MapReport
 from ...evaluation.sequential_tests import (
     FEWEST_SHOWN,
     SHOWN_ERROR_RATE,
@@ -30,6 +34,7 @@ from ...evaluation.sequential_tests import (
     average_of,
 )
 from ...suggestions import counted
+from ..runs.trace import finite
 from .run_measures import Block, gaps_of
 from .verdict import (
     CONSISTENT,
@@ -41,7 +46,9 @@ from .verdict import (
     EstimatorScores,
     Verdict,
     judge,
+    map_not_shown,
     map_refusal,
+    map_scores,
     report_of,
     squared_errors,
     with_failures,
@@ -52,7 +59,12 @@ DECIDED = "decided"
 #: Shares of the 5 % of a study that is extended: of its first verdict, and of all later
 #: ones together.
 _FIRST_SHARE, _LATER_SHARE = 0.04, 0.01
+_ERROR_RATE = 0.05
+#: Weight of the evidence against the map.
+MAP_SHARE = MAP_ERROR_RATE / _ERROR_RATE
 _STEPS = 10
+_MOST_NUMBERS = 2**14  # of NEES at once, which limits the memory
+_LARGEST_LOG = 700.0
 _MARGIN = f"[{EQUIVALENCE_MARGIN.low:g}, {EQUIVALENCE_MARGIN.high:g}]"
 _INTERVAL = f"{1 - SHOWN_ERROR_RATE:.0%} confidence sequence".replace("%", " %")
 
@@ -93,39 +105,90 @@ def error_rate_after(looks: Sequence[Look]) -> float:
     A first verdict on a number of runs that was chosen beforehand keeps 4 %. Others
     follow from the same anytime-valid test, and take nothing.
     """
-    return _LATER_SHARE if looks and not looks[0].until else 0.05
+    return _LATER_SHARE if looks and not looks[0].until else _ERROR_RATE
+
+
+class _Shown:
+    """Whether a ratio was shown to be near 1, and after how many runs."""
+
+    def __init__(self) -> None:
+        #: Number of runs after which the interval was inside the margin for the first
+        #: time; None as long as it has not happened.
+        self.after: int | None = None
+        #: The interval at this time, else the last one.
+        self.interval = Band(0.0, np.inf)
+        #: Number of ratios.
+        self.runs = 0
+        self._sequence = ConfidenceSequence()
+
+    def update(self, ratios: Array, numbers: IntArray) -> None:
+        """Add the ratios of some runs, which have these numbers."""
+        self.runs += len(ratios)
+        if self.after is not None or not len(ratios):
+            return
+        low, high = self._sequence.update(ratios)
+        inside = (low >= EQUIVALENCE_MARGIN.low) & (high <= EQUIVALENCE_MARGIN.high)
+        at = int(inside.argmax()) if inside.any() else -1
+        self.interval = Band(float(low[at]), float(high[at]))
+        self.after = int(numbers[at]) if inside.any() else None
+
+    def text(self) -> str:
+        """Write the interval."""
+        low, high = self.interval
+        return f"[{low:.3f}, {high:.3f}]"
 
 
 class Watch:
     """The state of the sequential tests of one estimator, to which runs are added."""
 
-    def __init__(self, error_rate: float = 0.05) -> None:
+    def __init__(self, error_rate: float = _ERROR_RATE) -> None:
         self._limit = -np.log(error_rate)
-        #: Numbers of runs after which a test rejected, or the interval was inside the
-        #: margin, for the first time; None as long as it has not happened.
+        #: Number of runs after which the tests rejected; None as long as they have not.
         self.rejected_after: int | None = None
-        self.shown_after: int | None = None
-        #: Largest e-value so far, as a logarithm.
-        self.log_evidence = 0.0
-        #: That of the ratio, at the first time inside the margin, else the last one.
-        self.interval = Band(0.0, np.inf)
+        #: Largest e-value so far, as a logarithm: of all tests, and of the map.
+        self.log_evidence = self.log_map_evidence = 0.0
+        #: The ratios of pose and map.
+        self.pose, self.map = _Shown(), _Shown()
         self._runs = self._good = 0
         self._steps: IntArray | None = None
-        self._evidence, self._ratios = EProcess(), ConfidenceSequence()
+        self._on_pose, self._on_map = EProcess(), MapEvidence()
+        #: Whether any run has a map.
+        self.has_map = False
+        #: Whether the evidence against pose or map alone suffices.
+        self.rejects_pose = self.rejects_map = False
+
+    @property
+    def shown_after(self) -> int | None:
+        """Number of runs after which both ratios were shown to be near 1, if they are.
+
+        That of the pose counts alone if fewer than 2 runs have a map.
+        """
+        if self._on_map.undefined or not self._is_settled:
+            return None
+        return max(self.pose.after or 0, self.map.after or 0)
 
     @property
     def decided(self) -> bool:
         """Whether more runs are not needed: decided, or all runs so far failed."""
-        decided = (self.rejected_after or self.shown_after) is not None
-        return decided or (self._good < 2 and self._runs >= FEW_RUNS)
+        if self._good < 2:
+            return self._runs >= FEW_RUNS
+        return self.rejected_after is not None or self._is_settled
+
+    @property
+    def _is_settled(self) -> bool:
+        has_map = self.map.runs > 1
+        return self.pose.after is not None and (not has_map or bool(self.map.after))
 
     def add_block(self, block: Block) -> None:
         """Add the runs of a block of results, by their NEES in the invariant frame."""
         first, gaps = gaps_of(block)
         good = ~(block["failed"].astype(bool) | gaps.any(axis=1))
-        self.update(block["pose_nees_invariant"], good, first)
+        maps = map_scores(block, "invariant")
+        self.update(block["pose_nees_invariant"], good, first, **maps)
 
-    def update(self, nees: AnyArray, good: BoolArray, first: int) -> None:
+    def update(
+        self, nees: AnyArray, good: BoolArray, first: int, **maps: AnyArray
+    ) -> None:
         """Add runs.
 
         Parameters
@@ -136,7 +199,19 @@ class Watch:
             Which runs succeeded; others do not count.
         first : int
             First step that has a NEES.
+        **maps : ndarray
+            Result of :func:`.verdict.map_scores`: empty if the pose alone is judged.
         """
+        width = max(nees.shape[1], *(each[0].size for each in maps.values()), 1)
+        size = max(1, _MOST_NUMBERS // width)
+        for start in range(0, len(good), size):
+            part = slice(start, start + size)
+            chosen = {name: each[part] for name, each in maps.items()}
+            self._add(nees[part], good[part], first, chosen)
+
+    def _add(
+        self, nees: AnyArray, good: BoolArray, first: int, maps: dict[str, AnyArray]
+    ) -> None:
         numbers = self._runs + 1 + np.flatnonzero(good)
         self._runs += len(good)
         if not len(numbers):
@@ -146,21 +221,30 @@ class Watch:
             grid = np.linspace(first, nees.shape[1] - 1, _STEPS + 1).round()[1:]
             self._steps = np.unique(grid.astype(np.int64))
         values = nees[good]
-        logs = self._evidence.update(values[:, self._steps], POSE_FREEDOM)
-        evidence = average_of([logs])
+        logs = self._on_pose.update(values[:, self._steps], POSE_FREEDOM)
+        self.pose.update(values[:, first:].mean(axis=1) / POSE_FREEDOM, numbers)
+        share = 0.0
+        if maps:
+            share = MAP_SHARE
+            self.has_map |= bool((maps["map_dof"][good] > 0).any())
+            of_map, ratios = self._on_map.update(
+                *(each[good] for each in maps.values())
+            )
+            known = ~np.isnan(ratios)
+            self.map.update(ratios[known], numbers[known])
+            self.log_map_evidence = max(self.log_map_evidence, float(of_map.max()))
+            self.rejects_map |= bool((of_map + np.log(share) >= self._limit).any())
+        evidence = average_of([logs, of_map], [1 - share, share]) if maps else logs
         self.log_evidence = max(self.log_evidence, float(evidence.max()))
-        if self.rejected_after is None:
-            rejected = np.flatnonzero(evidence >= self._limit)
-            self.rejected_after = int(numbers[rejected[0]]) if len(rejected) else None
-        low, high = self._ratios.update(values[:, first:].mean(axis=1) / POSE_FREEDOM)
-        if self.shown_after is None:
-            inside = (low >= EQUIVALENCE_MARGIN.low) & (high <= EQUIVALENCE_MARGIN.high)
-            at = int(inside.argmax()) if inside.any() else -1
-            self.interval = Band(float(low[at]), float(high[at]))
-            self.shown_after = int(numbers[at]) if inside.any() else None
+        self.rejects_pose |= bool((logs + np.log1p(-share) >= self._limit).any())
+        rejected = np.flatnonzero(evidence >= self._limit)
+        if self.rejected_after is None and len(rejected):
+            self.rejected_after = int(numbers[rejected[0]])
 
 
-def verdict_of(scores: EstimatorScores, frame: ErrorFrame) -> Verdict:
+def verdict_of(
+    scores: EstimatorScores, frame: ErrorFrame, watch: Watch | None = None
+) -> Verdict:
     """Return the verdict on one estimator, which holds 5 % over all looks together.
 
     Parameters
@@ -170,12 +254,15 @@ def verdict_of(scores: EstimatorScores, frame: ErrorFrame) -> Verdict:
         looks; without them, this is the verdict of :func:`.verdict.judge`.
     frame : {"invariant", "additive"}
         Error coordinates of the NEES.
+    watch : Watch, optional
+        Result of :func:`watched`, if it is known.
     """
     failed, runs = len(scores.failures), len(scores.good)
     report = report_of(scores, frame) if scores.good.sum() > 1 else None
     if report is None or not is_sequential(scores):
         return judge(report, failed, runs)
-    verdict = _sequential_verdict(scores, frame, report)
+    watch = watch or watched(scores, frame)
+    verdict = _sequential_verdict(scores, frame, report, watch)
     return with_failures(verdict, failed, runs)
 
 
@@ -185,23 +272,36 @@ def is_sequential(scores: EstimatorScores) -> bool:
     return bool(attrs.get("until") or attrs.get("looks"))
 
 
-def looks_summary(scores: EstimatorScores, frame: ErrorFrame) -> dict[str, Any]:
+def watched(scores: EstimatorScores, frame: ErrorFrame) -> Watch:
+    """Apply the sequential tests to all runs of an estimator."""
+    watch = Watch(error_rate_after(_looks(scores)))
+    nees = np.asarray(scores.results[f"pose_nees_{frame}"].values)
+    maps = map_scores(scores.results, frame)
+    watch.update(nees, scores.good, scores.first, **maps)
+    return watch
+
+
+def looks_summary(scores: EstimatorScores, watch: Watch) -> dict[str, Any]:
     """Return the sequential decision as plain JSON types.
 
     Returns
     -------
     dict
-        ``rejected_after`` and ``shown_after``, numbers of runs or None; ``e_value``,
-        the largest one, and ``interval``, see :class:`Watch`; ``earlier_looks``, the
-        numbers of runs of earlier verdicts.
+        ``rejected_after`` and ``shown_after``, numbers of runs or None; ``e_value`` and
+        ``map_e_value``, the largest ones; ``interval`` and ``map_interval``, see
+        :class:`Watch`; ``earlier_looks``, the numbers of runs of earlier verdicts. Of
+        the map, both are unknown if the pose alone is judged.
     """
-    watch = _watched(scores, frame)
-    ends = [end if np.isfinite(end) else None for end in watch.interval]
+    map_ends = watch.map.interval if watch.has_map else Band(np.nan, np.nan)
     return {
         "rejected_after": watch.rejected_after,
         "shown_after": watch.shown_after,
-        "e_value": float(np.exp(min(watch.log_evidence, 700.0))),
-        "interval": ends,
+        "e_value": float(np.exp(min(watch.log_evidence, _LARGEST_LOG))),
+        "map_e_value": float(np.exp(min(watch.log_map_evidence, _LARGEST_LOG)))
+        if watch.has_map
+        else None,
+        "interval": [finite(end) for end in watch.pose.interval],
+        "map_interval": [finite(end) for end in map_ends],
         "earlier_looks": [look.runs for look in _looks(scores)],
     }
 
@@ -210,75 +310,100 @@ def _looks(scores: EstimatorScores) -> list[Look]:
     return [Look(*look) for look in json.loads(scores.results.attrs.get("looks", "[]"))]
 
 
-def _watched(scores: EstimatorScores, frame: ErrorFrame) -> Watch:
-    watch = Watch(error_rate_after(_looks(scores)))
-    nees = np.asarray(scores.results[f"pose_nees_{frame}"].values)
-    watch.update(nees, scores.good, scores.first)
-    return watch
-
-
 def _sequential_verdict(
-    scores: EstimatorScores, frame: ErrorFrame, report: ConsistencyReport
+    scores: EstimatorScores, frame: ErrorFrame, report: ConsistencyReport, watch: Watch
 ) -> Verdict:
-    watch, looks = _watched(scores, frame), _looks(scores)
-    low, high = watch.interval
-    inside = low >= EQUIVALENCE_MARGIN.low and high <= EQUIVALENCE_MARGIN.high
-    lies = f"lies inside {_MARGIN}" if inside else f"is not inside {_MARGIN}"
-    interval = f"the {_INTERVAL} of the ratio, [{low:.3f}, {high:.3f}], {lies}"
-    if not np.isfinite(high):
-        interval = f"{counted(FEWEST_SHOWN, 'run')} or more are needed to show it"
-    refusal, by_map = _refusal(scores, frame, report, watch, looks)
-    if by_map:
-        return Verdict(NOT_CONSISTENT, refusal, by_map)
-    if refusal:
+    looks, maps = _looks(scores), report.map
+    refusal = _refusal(scores, frame, report, watch)
+    intervals = _intervals(watch, maps)
+    if refusal is not None:
         steps = (report.final_step.statistic, *report.family.statistic)
         least, most = EQUIVALENCE_MARGIN
-        if inside and all(least <= ratio <= most for ratio in steps):
-            return Verdict(NEARLY, f"{refusal}; the difference is small: {interval}")
-        return Verdict(NOT_CONSISTENT, refusal)
+        is_near = watch.pose.after is not None and not refusal.of_map
+        if not is_near or not all(least <= ratio <= most for ratio in steps):
+            by_map = not refusal.of_pose
+            return Verdict(NOT_CONSISTENT, refusal.reason, by_map)
+        word = NOT_CONSISTENT if watch.shown_after is None else NEARLY
+        small = f"{refusal.reason}; the difference is small: {intervals}"
+        return Verdict(word, small)
+    what = "the pose" if maps is None else "pose or map"
     evidence = f"{_evidence(watch.log_evidence)}; 5 % over all looks"
-    only = f"; {POSE_ONLY}"
-    kept = f"no anytime-valid test rejects the pose ({evidence}), "
-    if inside:
-        after = f"after {counted(watch.shown_after or 0, 'run')}, "
-        return Verdict(CONSISTENT, f"{after}{kept}and {interval}{_after(looks)}{only}")
-    more = "more runs are needed"
-    return Verdict(NOT_SHOWN, f"{kept}but {interval}: {more}{_after(looks)}{only}")
+    kept = f"no anytime-valid test rejects {what} ({evidence}), "
+    only = f"; {POSE_ONLY}" if maps is None else ""
+    if watch.shown_after is not None:
+        after = f"after {counted(watch.shown_after, 'run')}, "
+        return Verdict(CONSISTENT, f"{after}{kept}and {intervals}{_after(looks)}{only}")
+    return Verdict(NOT_SHOWN, f"{kept}but {intervals}{_after(looks)}{only}")
+
+
+def _intervals(watch: Watch, maps: MapReport | None) -> str:
+    """Write whether the ratios of pose and map are shown to be near 1."""
+    if watch.pose.after is None:
+        lies = f"{watch.pose.text()}, is not inside {_MARGIN}"
+        interval = f"the {_INTERVAL} of the ratio, {lies}"
+        if not np.isfinite(watch.pose.interval.high):
+            interval = f"{counted(FEWEST_SHOWN, 'run')} or more are needed to show it"
+        return f"{interval}: more runs are needed"
+    interval = (
+        f"the {_INTERVAL} of the ratio, {watch.pose.text()}, lies inside {_MARGIN}"
+    )
+    if maps is None:
+        return interval
+    if maps.undefined:
+        return f"{interval}; {map_not_shown(maps)}"
+    if watch.map.after is not None:
+        return f"{interval}, as does that of the map, {watch.map.text()}"
+    of_map = f"that of the map, {watch.map.text()}, is not"
+    return f"{interval}, and {of_map}: more runs are needed"
+
+
+class _Refusal(NamedTuple):
+    """Which look rejects the filter, and how wrong it is."""
+
+    reason: str
+    of_pose: bool
+    of_map: bool
 
 
 def _refusal(
-    scores: EstimatorScores,
-    frame: ErrorFrame,
-    report: ConsistencyReport,
-    watch: Watch,
-    looks: Sequence[Look],
-) -> tuple[str, bool]:
-    """Write which look rejects the filter, and how wrong it is; "" for none.
+    scores: EstimatorScores, frame: ErrorFrame, report: ConsistencyReport, watch: Watch
+) -> _Refusal | None:
+    if watch.rejected_after is None:
+        return _first_refusal(scores, frame, report)
+    after = f"after {counted(watch.rejected_after, 'run')}, an anytime-valid test"
+    of_pose, of_map = watch.rejects_pose or not watch.rejects_map, watch.rejects_map
+    how = f"{_evidence(watch.log_map_evidence)}; 5 % over all looks"
+    errors = f"({how})" if report.map is None else map_refusal(report.map, how)
+    if not of_pose:
+        return _Refusal(f"{after} rejects the map: {errors}", of_pose, of_map)
+    also = f"; of the map, {errors}" if of_map else ""
+    how = f"{_evidence(watch.log_evidence)}; 5 % over all looks"
+    reason = f"{after} rejects it ({how}); {squared_errors(report)}{also}"
+    return _Refusal(reason, of_pose, of_map)
 
-    Also return whether the first verdict rejected the map alone.
-    """
-    what = squared_errors(report)
-    if watch.rejected_after is not None:
-        values = f"{_evidence(watch.log_evidence)}; 5 % over all looks"
-        after = counted(watch.rejected_after, "run")
-        return (
-            f"after {after}, an anytime-valid test rejects it ({values}); {what}",
-            False,
-        )
-    if looks and not looks[0].until:
-        part = np.arange(len(scores.good)) < looks[0].runs
-        first = scores._replace(good=scores.good & part)
-        found = report_of(first, frame) if first.good.sum() > 1 else None
-        if found is not None and found.p_value < _FIRST_SHARE:
-            after = counted(looks[0].runs, "run")
-            by_map = found.pose_p_value >= _FIRST_SHARE
-            if found.map is not None and by_map:
-                what = f"of the map, {map_refusal(found.map)}"
-            else:
-                what = f"{p_text(found.p_value)}; 5 % over all looks); {what}"
-            start = f"the first verdict, after {after}, rejected it, and stands"
-            return f"{start}{': ' if by_map else ' ('}{what}", by_map
-    return "", False
+
+def _first_refusal(
+    scores: EstimatorScores, frame: ErrorFrame, report: ConsistencyReport
+) -> _Refusal | None:
+    """Return whether a first verdict on a chosen number of runs rejected the filter."""
+    looks = _looks(scores)
+    if not looks or looks[0].until:
+        return None
+    part = np.arange(len(scores.good)) < looks[0].runs
+    first = scores._replace(good=scores.good & part)
+    found = report_of(first, frame) if first.good.sum() > 1 else None
+    if found is None or found.p_value >= _FIRST_SHARE:
+        return None
+    after = counted(looks[0].runs, "run")
+    start = f"the first verdict, after {after}, rejected it, and stands"
+    of_pose = found.pose_p_value < _FIRST_SHARE
+    of_map = found.map is not None and found.map.p_value < MAP_SHARE * _FIRST_SHARE
+    errors = "" if found.map is None else f"of the map, {map_refusal(found.map)}"
+    if not of_pose:
+        return _Refusal(f"{start}: {errors}", of_pose, of_map)
+    how = f"{p_text(found.p_value)}; 5 % over all looks"
+    also = f"; {errors}" if of_map else ""
+    return _Refusal(f"{start} ({how}); {squared_errors(report)}{also}", of_pose, of_map)
 
 
 def _after(looks: Sequence[Look]) -> str:

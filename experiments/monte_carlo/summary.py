@@ -27,7 +27,7 @@ from ...evaluation.hypothesis_tests import (
 from ...evaluation.map_consistency import ERROR_RATE as MAP_ERROR_RATE
 from ...evaluation.map_consistency import MapReport, farthest
 from ..runs.trace import finite, mean, quotient, root_mean_square
-from .looks import is_sequential, looks_summary, verdict_of
+from .looks import is_sequential, looks_summary, verdict_of, watched
 from .run_measures import (
     ALARM,
     COUNTS,
@@ -175,12 +175,13 @@ def summarise_estimator(
     claimed = found["heading_std_end"]["claimed"]
     decides = scores.good.sum() > 1 and not scores.is_fitted
     report = report_of(scores, frame) if decides else None
-    verdict = FITTED if scores.is_fitted else verdict_of(scores, frame)
+    watch = watched(scores, frame) if report and is_sequential(scores) else None
+    verdict = FITTED if scores.is_fitted else verdict_of(scores, frame, watch)
     accepted = report and report.accepted
     sequential: dict[str, Any] = {}
-    if report and is_sequential(scores):
+    if watch is not None:
         accepted = verdict.word not in (NOT_CONSISTENT, NEARLY) and not scores.failures
-        sequential["sequential"] = looks_summary(scores, frame)
+        sequential["sequential"] = looks_summary(scores, watch)
     return {
         "verdict": verdict.word,
         "reason": verdict.reason,

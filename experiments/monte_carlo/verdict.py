@@ -196,10 +196,10 @@ def _verdict_on_successes(report: ConsistencyReport) -> Verdict:
         low, high = _interval(maps.equivalence)
         both = f"that of the map, [{low:.3f}, {high:.3f}]"
         return Verdict(pose.word, f"{pose.reason}, as does {both}")
-    return Verdict(NOT_SHOWN, f"{pose.reason}; {_map_not_shown(maps)}")
+    return Verdict(NOT_SHOWN, f"{pose.reason}; {map_not_shown(maps)}")
 
 
-def _map_not_shown(maps: MapReport) -> str:
+def map_not_shown(maps: MapReport) -> str:
     """Write why a map that no test rejects is not shown to be consistent."""
     if maps.undefined:
         singular = "its covariance is singular or no covariance"
@@ -214,16 +214,19 @@ def _map_not_shown(maps: MapReport) -> str:
     )
 
 
-def map_refusal(maps: MapReport) -> str:
-    """Write how wrong a rejected map is, by the test that shows it best."""
-    p_value, ratio = p_text(maps.p_value), maps.equivalence.statistic
+def map_refusal(maps: MapReport, evidence: str = "") -> str:
+    """Write how wrong a rejected map is, by the test that shows it best.
+
+    The evidence is the p-value of this test by default.
+    """
+    evidence, ratio = evidence or p_text(maps.p_value), maps.equivalence.statistic
     if maps.indefinite:
         return f"its covariance has a negative eigenvalue in {_of_runs(maps)}"
     each = np.append(maps.landmark_p_values, 1.0)
     if maps.joint_p_value <= max(each.min(), _CERTAIN):
         cautious = ": the map is too cautious" if ratio < 1 else ""
         times = f"{_number(ratio)} times what the covariances state"
-        return f"the squared errors are {times} ({p_value}){cautious}"
+        return f"the squared errors are {times} ({evidence}){cautious}"
     worst = int(each.argmin())
     name, many = maps.landmarks[worst], np.count_nonzero(TESTS * each < MAP_ERROR_RATE)
     others = f", the worst of {many} landmarks" if many > 1 else ""
@@ -238,7 +241,7 @@ def map_refusal(maps: MapReport) -> str:
             f"the squared errors of landmark {name}{seen} are "
             f"{_number(ratios[worst])} times what its covariances state"
         )
-    return f"{what}{others} ({p_value})"
+    return f"{what}{others} ({evidence})"
 
 
 def _interval(verdict: EquivalenceTest) -> tuple[float, float]:
@@ -555,7 +558,7 @@ def diagnosis_summary(
         "sentence": found.sentence,
         "others": list(found.others),
     }
-    if maps is None or maps.accepted:
+    if maps is None or (maps.accepted and not verdict.by_map):
         return entry
     named = f"{MAP}: {_map_cause(maps)}"
     if verdict.by_map and found.cause in (HONEST, CANNOT_TELL):
@@ -886,29 +889,38 @@ def report_of(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport:
         dof=POSE_FREEDOM,
         frame=frame,
         rng=np.random.default_rng(_BOOTSTRAP_SEED),
-        **_map_scores(scores, frame),
+        **map_scores(scores.results, frame),
     )
 
 
 def maps_of(scores: EstimatorScores, frame: ErrorFrame) -> MapReport | None:
     """Decide about the maps of one estimator as :func:`report_of` does."""
-    found = _map_scores(scores, frame)
+    found = map_scores(scores.results, frame)
     return map_test(*(each[scores.good] for each in found.values())) if found else None
 
 
-def _map_scores(scores: EstimatorScores, frame: ErrorFrame) -> dict[str, Array]:
-    """Return what the verdict on the maps needs, of all runs.
+def map_scores(results: Any, frame: ErrorFrame) -> dict[str, Array]:
+    """Return what the verdict on the maps needs, of all runs of one estimator.
 
-    Empty where identities are hidden, and for results of an older version.
+    Parameters
+    ----------
+    results : mapping or Dataset
+        Results by name, of one estimator.
+    frame : {"invariant", "additive"}
+        Error coordinates of the NEES.
+
+    Returns
+    -------
+    dict
+        Empty where identities are hidden, and for results of an older version.
     """
-    if KNOWN_IDS_ATE in scores.results or not {*DEVIATIONS} <= {*scores.results}:
+    if KNOWN_IDS_ATE in results or not {*DEVIATIONS} <= {*results}:
         return {}
-    pair = [scores.results[name].values for name in DEVIATIONS]
     return {
-        "landmarks": np.stack(pair, axis=-1),
-        "map_nees": scores.results["relative_map_nees"].values,
-        "map_dof": scores.results["relative_map_dof"].values,
-        "landmark_nees": scores.results[f"landmark_nees_{frame}"].values,
+        "landmarks": np.stack([np.asarray(results[k]) for k in DEVIATIONS], axis=-1),
+        "map_nees": np.asarray(results["relative_map_nees"]),
+        "map_dof": np.asarray(results["relative_map_dof"]),
+        "landmark_nees": np.asarray(results[f"landmark_nees_{frame}"]),
     }
 
 

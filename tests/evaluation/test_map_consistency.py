@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slamgym.evaluation.map_consistency import map_test
+from slamgym.evaluation.map_consistency import MapEvidence, map_test
 
 HONEST = np.random.default_rng(4).standard_normal((100, 20, 2))
 
@@ -48,3 +48,79 @@ def test_a_map_without_nees_is_not_shown_to_be_consistent():
     found = map_test(errors)
     assert found.accepted
     assert not found.shown
+
+
+# after every run
+
+
+def scores_of(errors):
+    """Final maps of landmarks whose errors are independent; nan where unknown."""
+    squares = (errors**2).sum(axis=2)
+    freedom = 2 * np.isfinite(squares).sum(axis=1)
+    return errors, np.nansum(squares, axis=1), freedom, squares
+
+
+def evidence(errors):
+    return MapEvidence().update(*scores_of(errors))[0]
+
+
+@pytest.mark.parametrize("factor", [np.sqrt(0.8), 1.0, np.sqrt(1.25)])
+def test_maps_inside_the_margin_are_rarely_rejected_at_any_look(factor):
+    rng = np.random.default_rng(12)
+    shape, most = (60, 8, 2), []
+    for _ in range(60):
+        errors = factor * rng.standard_normal(shape)
+        errors[rng.random(shape[:2]) < 0.3] = np.nan
+        most.append(evidence(errors).max())
+    assert np.mean(np.array(most) > np.log(20)) < 0.1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda errors: 2 * errors,
+        lambda errors: 0.5 * errors,
+        lambda errors: errors + np.array([0.0, 1.2]),
+        lambda errors: errors * np.where(np.arange(20) == 7, 3.0, 1.0)[:, None],
+    ],
+)
+def test_wrong_maps_are_rejected_soon(change):
+    assert evidence(HONEST).max() < np.log(20)
+    assert evidence(change(HONEST))[30] > np.log(200)
+
+
+@pytest.mark.parametrize("which", [1, 3])
+def test_errors_that_only_the_whole_map_or_its_own_frame_shows_are_rejected(which):
+    parts = list(scores_of(HONEST))
+    parts[which] = 3 * parts[which]
+    assert MapEvidence().update(*parts)[0][30] > np.log(200)
+
+
+def test_a_negative_eigenvalue_is_certain_evidence_from_its_run_on():
+    parts = scores_of(HONEST.copy())
+    parts[1][5] = np.inf
+    watched = MapEvidence()
+    found, ratios = watched.update(*(part[:10] for part in parts))
+    assert np.isfinite(found[:5]).all()
+    assert np.isinf(found[5:]).all()
+    assert np.flatnonzero(np.isnan(ratios)).tolist() == [5]
+    assert np.isinf(watched.update(*(part[10:] for part in parts))[0]).all()
+    assert watched.undefined == 0
+
+
+def test_runs_without_a_map_or_its_nees_add_no_evidence_and_the_latter_are_counted():
+    errors = 5 * HONEST[:4]
+    parts = scores_of(errors)
+    parts[2][1], parts[1][2] = 0, np.nan
+    watched = MapEvidence()
+    found, ratios = watched.update(*parts)
+    assert found[0] == found[1] == found[2] < found[3]
+    assert np.isnan(ratios).tolist() == [False, True, True, False]
+    assert watched.undefined == 1
+
+
+def test_huge_errors_of_a_map_are_evidence_without_an_overflow():
+    errors = np.concatenate([np.full((3, 20, 2), 1e150), HONEST])
+    found = evidence(errors)
+    assert np.isfinite(found).all()
+    assert found[0] > np.log(200)

@@ -8,6 +8,7 @@ from slamgym.evaluation.sequential_tests import (
     FEWEST_SHOWN,
     ConfidenceSequence,
     EProcess,
+    MeanEProcess,
     average_of,
 )
 
@@ -47,6 +48,44 @@ def test_evidence_is_1_on_average_over_honest_errors(freedom):
     assert total == pytest.approx(1, rel=1e-6)
 
 
+@pytest.mark.parametrize("freedom", [2, 40])
+@pytest.mark.parametrize(("ratio", "fair"), [(0.8, 1), (1, 1), (1.25, 1), (2, 0)])
+def test_evidence_against_a_margin_is_at_most_1_on_average_inside_it(
+    ratio, fair, freedom
+):
+    def weighed(nees):
+        evidence = EProcess((0.8, 1.25)).update([[nees]], freedom)[0]
+        return np.exp(evidence + stats.chi2.logpdf(nees, freedom, scale=ratio))
+
+    total = sum(integrate.quad(weighed, *ends)[0] for ends in ((0, 100), (100, 3000)))
+    assert (total <= 1 + 1e-6) == bool(fair)
+
+
+@pytest.mark.parametrize(
+    ("mean", "variance", "fair"),
+    [(0.25, 1.25, 1), (0.1, 1.25, 1), (0.25, 0.8, 1), (1, 1.25, 0), (0.25, 2, 0)],
+)
+def test_evidence_against_a_mean_error_is_at_most_1_on_average_up_to_the_margin(
+    mean, variance, fair
+):
+    points, weights = np.polynomial.hermite_e.hermegauss(40)
+    total = 0.0
+    for x, at_x in zip(points, weights / weights.sum(), strict=True):
+        errors = np.sqrt(variance) * np.stack([np.full(40, x), points], axis=1)
+        errors[:, 0] += mean  # one of the directions of the mixture: the worst case
+        found = [MeanEProcess(0.25, 1.25).update([[error]])[0] for error in errors]
+        total += at_x * np.exp(found) @ (weights / weights.sum())
+    assert (total <= 1 + 1e-6) == bool(fair)
+
+
+@pytest.mark.parametrize("angle", np.linspace(0, 2 * np.pi, 9)[:-1] + 0.2)
+def test_a_mean_error_is_found_in_every_direction(angle):
+    errors = np.random.default_rng(2).standard_normal((60, 1, 2))
+    shift = [1.2 * np.cos(angle), 1.2 * np.sin(angle)]
+    assert MeanEProcess(0.25, 1.25).update(errors).max() < REJECTED
+    assert MeanEProcess(0.25, 1.25).update(errors + shift)[-1] > REJECTED
+
+
 @pytest.mark.parametrize(
     ("ratio", "most"), [(0.5, 40), (1.5, 80), (2.0, 30), (5.0, 8), (30.0, 4)]
 )
@@ -69,10 +108,13 @@ def test_an_error_at_a_single_step_is_found():
 def test_runs_added_in_blocks_give_the_same_evidence_and_intervals_to_the_bit():
     rng = np.random.default_rng(5)
     nees, freedom = correlated(rng, 0.5), rng.integers(0, 40, RUNS)
-    whole, parts = EProcess(), EProcess()
+    whole, parts = EProcess((0.8, 1.25)), EProcess((0.8, 1.25))
     blocks = np.split(np.arange(RUNS), [1, 7, 64, 65])
     found = [parts.update(nees[block], freedom[block]) for block in blocks]
     assert np.array_equal(np.concatenate(found), whole.update(nees, freedom))
+    errors, means = rng.standard_normal((RUNS, 4, 2)), MeanEProcess(0.25, 1.25)
+    found = np.concatenate([means.update(errors[block]) for block in blocks])
+    assert np.array_equal(found, MeanEProcess(0.25, 1.25).update(errors))
     sequence = ConfidenceSequence()
     ends = [sequence.update(nees[block, 0]) for block in blocks]
     expected = ConfidenceSequence().update(nees[:, 0])
@@ -89,6 +131,14 @@ def test_evidence_counts_the_degrees_of_freedom_of_each_run():
 
 def test_a_run_without_degrees_of_freedom_adds_no_evidence():
     found = EProcess().update([[30.0], [0.0], [30.0]], [3, 0, 3])
+    assert found[0] == found[1] < found[2]
+
+
+def test_steps_without_degrees_of_freedom_and_unknown_errors_add_no_evidence():
+    with_gap = EProcess().update([[30.0, 3.0]], [[3, 0]])
+    np.testing.assert_allclose(with_gap, EProcess().update([[30.0, 0.0]], [[3, 0]]))
+    errors = [[[2.0, 1.0]], [[np.nan, np.nan]], [[2.0, 1.0]]]
+    found = MeanEProcess(0.25, 1.25).update(errors)
     assert found[0] == found[1] < found[2]
 
 

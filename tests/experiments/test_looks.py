@@ -14,7 +14,7 @@ from slamgym.experiments.monte_carlo import (
     monte_carlo,
     summarise_monte_carlo,
 )
-from slamgym.experiments.monte_carlo.looks import Look, Watch, verdict_of
+from slamgym.experiments.monte_carlo.looks import Look, Watch, verdict_of, watched
 from slamgym.experiments.monte_carlo.runner import python_call
 from slamgym.experiments.monte_carlo.verdict import scores_of
 
@@ -31,8 +31,9 @@ def honest(rng, runs, steps=12, memory=0.9):
     return np.stack(nees, axis=1)
 
 
-def verdict(nees, *looks, failed=()):
-    results = simulated(nees, [Look(0, runs, until) for runs, until in looks], failed)
+def verdict(nees, *looks, failed=(), landmarks=None):
+    seen = [Look(0, runs, until) for runs, until in looks]
+    results = simulated(nees, seen, failed, landmarks)
     return verdict_of(scores_of(results, "mine", "invariant"), "invariant")
 
 
@@ -67,6 +68,12 @@ def test_it_runs_the_same_runs_with_any_number_of_workers(decided):
             **JOB, runs=MOST, until="decided", jobs=jobs, backend="threading"
         )
         xr.testing.assert_identical(found, decided)
+
+
+@pytest.mark.slow
+def test_it_runs_the_same_runs_in_processes_of_loky(decided):
+    found = monte_carlo(**JOB, runs=MOST, until="decided", jobs=2, backend="loky")
+    xr.testing.assert_identical(found, decided)
 
 
 def test_an_interrupted_study_until_decided_continues(decided, tmp_path):
@@ -122,6 +129,177 @@ def test_a_watch_counts_failed_runs_in_the_number_after_which_it_decides():
     watch = Watch()
     watch.update(nees, np.arange(10) >= 4, 1)
     assert watch.rejected_after == 5
+
+
+# the map
+
+
+def some_landmarks(rng, runs, count=6):
+    errors = rng.standard_normal((runs, count, 2))
+    errors[rng.random((runs, count)) < 0.2] = np.nan
+    return errors
+
+
+UNTIL = 10, "decided"
+
+
+def test_a_verdict_without_a_map_states_that_it_covers_the_pose_only():
+    found = verdict(honest(np.random.default_rng(20), 200), UNTIL)
+    assert found.word == "consistent"
+    assert found.reason.endswith("; this covers the pose only")
+
+
+def test_a_verdict_with_a_map_shows_the_ratios_of_pose_and_map():
+    rng = np.random.default_rng(20)
+    found = verdict(honest(rng, 200), UNTIL, landmarks=some_landmarks(rng, 200))
+    assert found.word == "consistent"
+    assert "no anytime-valid test rejects pose or map (e" in found.reason
+    assert "lies inside [0.8, 1.25], as does that of the map, [" in found.reason
+    assert "pose only" not in found.reason
+
+
+@pytest.mark.parametrize("wrong", [lambda e: 1.6 * e, lambda e: e + 1.1])
+def test_a_wrong_map_beside_a_correct_pose_is_rejected_as_the_map(wrong):
+    rng = np.random.default_rng(21)
+    nees, landmarks = honest(rng, 60), wrong(some_landmarks(rng, 60))
+    for looks in ([UNTIL], [(4, "")]):
+        found = verdict(nees, *looks, landmarks=landmarks)
+        assert found.word == "not consistent"
+        assert found.by_map
+        assert "rejects the map: " in found.reason or "rejected it" in found.reason
+
+
+def test_a_wrong_pose_beside_a_wrong_map_is_rejected_for_both():
+    rng = np.random.default_rng(22)
+    landmarks = 2 * some_landmarks(rng, 60)
+    found = verdict(2 * honest(rng, 60), UNTIL, landmarks=landmarks)
+    assert found.word == "not consistent"
+    assert not found.by_map
+    assert "the squared errors of the pose are " in found.reason
+    assert "; of the map, the squared errors are 4" in found.reason
+
+
+def test_a_study_is_not_decided_before_the_map_is():
+    rng = np.random.default_rng(23)
+    nees, landmarks = honest(rng, 100, memory=0.0), some_landmarks(rng, 100)
+    landmarks[:80] = np.nan  # no map
+    found = verdict(nees, UNTIL, landmarks=landmarks)
+    assert found.word == "not shown"
+    assert "that of the map, [0.000, inf], is not: more runs are needed" in found.reason
+    assert verdict(nees, UNTIL).word == "consistent"
+
+
+def test_a_map_without_a_nees_is_not_shown_to_be_consistent():
+    rng = np.random.default_rng(24)
+    nees, landmarks = honest(rng, 200), some_landmarks(rng, 200)
+    landmarks[3, 2] = np.inf
+    found = verdict(nees, UNTIL, landmarks=landmarks)
+    assert found.word == "not shown"
+    assert "the map has no NEES at the end of 1 run: its covariance" in found.reason
+
+
+def test_runs_that_have_no_nees_of_the_map_are_not_repeated_for_ever():
+    rng = np.random.default_rng(25)
+    results = simulated(honest(rng, 200), landmarks=np.full((200, 6, 2), np.inf))
+    scores = scores_of(results, "mine", "invariant")
+    watch = watched(scores, "invariant")
+    assert watch.decided
+    assert watch.shown_after is None
+
+
+def test_a_wrong_map_that_a_later_verdict_shows_is_rejected():
+    rng = np.random.default_rng(26)
+    nees, landmarks = honest(rng, 200), 1.35 * some_landmarks(rng, 200)
+    assert verdict(nees[:4], landmarks=landmarks[:4]).word == "not shown"
+    found = verdict(nees, (4, ""), (8, ""), landmarks=landmarks)
+    assert found.word == "not consistent"
+    assert "an anytime-valid test rejects the map: " in found.reason
+
+
+def test_a_first_verdict_that_rejects_the_map_stands():
+    rng = np.random.default_rng(30)
+    nees, landmarks = honest(rng, 400), some_landmarks(rng, 400)
+    landmarks[:25] *= 1.3
+    found = verdict(nees, (25, ""), landmarks=landmarks)
+    assert found.word == "not consistent"
+    assert found.by_map
+    assert "the first verdict, after 25 runs, rejected it" in found.reason
+    assert verdict(nees, (25, "decided"), landmarks=landmarks).word == "consistent"
+
+
+def test_a_small_error_of_the_pose_is_no_excuse_for_a_wrong_map():
+    rng = np.random.default_rng(28)
+    nees, landmarks = 1.1 * honest(rng, 1500), some_landmarks(rng, 1500)
+    found = verdict(nees, UNTIL, landmarks=landmarks)
+    assert found.word == "nearly consistent"
+    assert "as does that of the map, [" in found.reason
+    found = verdict(nees, UNTIL, landmarks=1.3 * landmarks)
+    assert found.word == "not consistent"
+    assert not found.by_map
+
+
+def test_honest_studies_of_pose_and_map_are_rarely_rejected_at_any_look():
+    rng, rejected, studies = np.random.default_rng(29), 0, 100
+    for _ in range(studies):
+        results = simulated(honest(rng, 60), landmarks=some_landmarks(rng, 60))
+        watch = watched(scores_of(results, "mine", "invariant"), "invariant")
+        rejected += watch.rejected_after is not None
+    assert stats.binom.sf(rejected - 1, studies, 0.05) > 1e-3
+
+
+WRONG_MAPS = """
+from slamgym import Belief
+from slamgym.estimator.filters.ekf import InvariantEkfSlam
+
+
+class Alone(InvariantEkfSlam):
+    def predict(self, odometry, dt=1.0):  # not in a batch, which has its own belief
+        super().predict(odometry, dt)
+
+
+class Scaled(Alone):
+    def belief(self, landmark_ids=None):
+        own = super().belief(landmark_ids)
+        covariance = own.covariance.copy()
+        covariance[3:] *= 0.1
+        covariance[:, 3:] *= 0.1
+        return Belief(own.mean, covariance, own.landmark_ids, own.frame)
+
+
+class Shifted(Alone):
+    def belief(self, landmark_ids=None):
+        own = super().belief(landmark_ids)
+        mean = own.mean.copy()
+        mean[3::2] += 0.2
+        return Belief(mean, own.covariance, own.landmark_ids, own.frame)
+"""
+
+
+@pytest.mark.parametrize("name", ["Scaled", "Shifted"])
+def test_a_filter_with_a_wrong_map_is_rejected_within_few_runs(
+    name, tmp_path, monkeypatch
+):
+    (tmp_path / "wrong_maps.py").write_text(WRONG_MAPS)
+    monkeypatch.syspath_prepend(tmp_path)
+    label = f"wrong_maps:{name}"
+    found = monte_carlo("anchored", label, runs=60, until="decided", block_size=4)
+    assert found.sizes["run"] <= 8
+    entry = summarise_monte_carlo(found)["estimators"][label]
+    assert entry["verdict"] == "not consistent"
+    assert entry["sequential"]["map_e_value"] > 200
+    assert "an anytime-valid test rejects the map: " in entry["sentence"]
+    assert entry["diagnosis"]["cause"] == "map"
+    assert not entry["accepted"]
+
+
+def test_a_study_that_is_rejected_has_the_2_runs_that_a_report_needs():
+    watch = Watch()
+    nees = np.insert(100 * honest(np.random.default_rng(0), 2), 0, np.nan, axis=1)
+    watch.update(nees[:1], np.ones(1, dtype=bool), 1)
+    assert watch.rejected_after == 1
+    assert not watch.decided
+    watch.update(nees[1:], np.ones(1, dtype=bool), 1)
+    assert watch.decided
 
 
 # extend a folder

@@ -39,8 +39,12 @@ def with_failures(dataset, failures):
     return changed
 
 
-def simulated(nees, looks=(), failed=()):
-    """Results of an estimator "mine" that has NEES, (runs, steps), and nothing else."""
+def simulated(nees, looks=(), failed=(), landmarks=None):
+    """Results of an estimator "mine" that has NEES, (runs, steps), and nothing else.
+
+    It has a map if given whitened errors of landmarks, (runs, landmarks, 2): nan where
+    unknown, infinite where the covariance is singular.
+    """
     runs, steps = nees.shape
     flags = np.isin(np.arange(runs), failed)
     over_time = {
@@ -53,10 +57,22 @@ def simulated(nees, looks=(), failed=()):
         "failed_at": np.where(flags, 1, -1),
         "message": np.where(flags, "boom", "").astype(object),
     }
-    dims = "estimator", "run", "step"
+    dims, each = ("estimator", "run", "step"), {}
+    if landmarks is not None:
+        squares = (landmarks**2).sum(axis=2)
+        each["landmark_deviation_x"], each["landmark_deviation_y"] = landmarks.T
+        each = {name: values.T for name, values in each.items()}
+        each["landmark_nees_invariant"] = squares
+        total = np.nansum(squares, axis=1)
+        per_run["relative_map_nees"] = np.where(np.isinf(total), np.nan, total)
+        per_run["relative_map_dof"] = 2 * (~np.isnan(squares)).sum(axis=1)
     return xr.Dataset(
         {name: (dims, values[None]) for name, values in over_time.items()}
-        | {name: (dims[:2], values[None]) for name, values in per_run.items()},
+        | {name: (dims[:2], values[None]) for name, values in per_run.items()}
+        | {
+            name: ((*dims[:2], "landmark"), values[None])
+            for name, values in each.items()
+        },
         {"estimator": ["mine"], "run": np.arange(runs)},
         {"looks": json.dumps(looks)} if looks else {},
     )
