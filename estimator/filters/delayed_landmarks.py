@@ -45,6 +45,7 @@ import numpy as np
 
 from ...arrays import LARGEST, Array, BoolArray, IntArray
 from ..kernels.kalman_gain import AT_ESTIMATE, INVARIANT, BeliefArrays, Rules
+from ..models.rigid_motion import seen_from
 from ..models.sensors import Sensor
 from ..support import saved_states
 from ..support.argument_checks import LOWEST_ID, RESERVED_IDS
@@ -52,8 +53,10 @@ from ..support.saved_states import NUMBERS, WHOLE, Table, with_prefix, without_p
 from .conditioning import moves_of, retracted
 from .gaussian_map import GaussianMap
 
-#: Past poses kept; beyond it, the one nearest to the pose before it goes.
+#: Past poses kept; beyond it, the one nearest to the pose before it goes, or the
+#: oldest of several such.
 MOST_POSES = 40
+ALIKE = 1e-3  # equal distances of poses, beyond their rounding far from the origin
 CERTAIN = 10.0  # distance of a placed landmark, in its standard deviations
 BENT = 0.1  # second-order change of its readings, in theirs
 UNLIKELY = 23.0  # 2 log 10⁵: excess of the cost of other places
@@ -193,7 +196,8 @@ def _forget_poses(gaussian: GaussianMap, waiting: Waiting) -> Waiting:
         at = [3 + 2 * gaussian.slots[_names(pose)[0]] for pose in kept]
         points = np.array([gaussian.mean[c : c + 4] for c in at])
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        crowded = kept[1 + int(np.argmin(steps[:-1]))]
+        nearest = steps[:-1] <= (1 + ALIKE) * steps[:-1].min()
+        crowded = kept[1 + int(np.argmax(nearest))]
         gone.append(crowded)
         waiting = waiting.where(waiting.ids[:, 1] != crowded)
     if gone:
@@ -356,13 +360,20 @@ class _Fit(NamedTuple):
 def _place(
     gaussian: GaussianMap, sensor: Sensor, rules: Rules, mine: Waiting, landmark: int
 ) -> bool:
-    """Add a landmark to the map if its readings determine it."""
-    mean, P, reference = gaussian.used
+    """Add a landmark to the map if its readings determine it.
+
+    The fit is relative to the robot: far from the world's origin, points that turn
+    about it would lose their digits.
+    """
+    world, P, reference = gaussian.used
+    here = world[:2].copy()
+    mean = seen_from(here, world)
     firsts = [3 + 2 * gaussian.slots[_names(k)[0]] for k in mine.ids[:, 1].tolist()]
     columns = np.array(firsts)[:, None] + np.arange(4)
     std = rules.first_std, rules.second_std
     seen = SeenLandmark(sensor, std, mine.readings, columns)
-    at = mean if rules.linearisation == AT_ESTIMATE else reference
+    at_estimate = rules.linearisation == AT_ESTIMATE
+    at = mean if at_estimate else seen_from(here, reference)
     try:
         best = _best_fit(seen, mean, P, at, rules)
     except np.linalg.LinAlgError:
@@ -370,14 +381,16 @@ def _place(
     if best is None:
         return False
     columns = np.append(columns, 2)
-    grown = _conditioned(mean, P, best, columns, rules.frame == INVARIANT)
-    point, axes = grown.mean[-2:], _spread(grown.mean, grown.covariance)
-    if _is_vague(axes, seen.nearest(grown.mean, point)):
+    way, P = _conditioned(P, best, columns, rules.frame == INVARIANT)
+    mean = np.append(mean, best.point) + way
+    point, axes = mean[-2:], _spread(mean, P)
+    if _is_vague(axes, seen.nearest(mean, point)):
         return False
-    if seen.bend(grown.mean, point, axes) > BENT:
+    if seen.bend(mean, point, axes) > BENT:
         return False
-    first = np.concatenate([reference, grown.mean[-2:]])
-    _hold(gaussian, BeliefArrays(grown.mean, grown.covariance, first), (landmark,))
+    world = np.append(world, best.point + here) + way
+    first = np.append(reference, world[-2:])
+    _hold(gaussian, BeliefArrays(world, P, first), (landmark,))
     return True
 
 
@@ -459,21 +472,16 @@ def _guesses(seen: SeenLandmark, state: Array) -> list[Array]:
 
 
 def _conditioned(
-    mean: Array, P: Array, fit: _Fit, columns: IntArray, turns: bool
-) -> BeliefArrays:
-    """Return the belief with the landmark, after all of its readings."""
+    P: Array, fit: _Fit, columns: IntArray, turns: bool
+) -> tuple[Array, Array]:
+    """Return the way of state and landmark by all readings, and their covariance."""
     cross, shift = fit.Hc @ P[columns], fit.shift(P[columns])
     to_landmark = -cross.T @ fit.G.T
     P = np.block(
         [[P - cross.T @ fit.left() @ cross, to_landmark], [to_landmark.T, fit.M]]
     )
     P = (P + P.T) / 2
-    mean = np.append(mean, fit.point)
-    if turns:
-        mean, P = retracted(mean, P, shift)
-    else:
-        mean = mean + shift
-    return BeliefArrays(mean, P, mean)
+    return retracted(np.zeros(len(P)), P, shift) if turns else (shift, P)
 
 
 def _moved(mean: Array, shift: Array, turns: bool) -> Array:

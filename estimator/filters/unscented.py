@@ -58,16 +58,17 @@ def predict_through_points(
     for k in range(2 * points):
         sign, e = 1.0 if k < points else -1.0, deviations[:, k % points]
         poses[0, k], poses[1, k], poses[2, k], _, _ = composed_jit(
-            mean[0] + sign * e[0],
-            mean[1] + sign * e[1],
+            sign * e[0],  # from the mean: an average of large numbers loses digits
+            sign * e[1],
             mean[2] + sign * e[2],
             forward + sign * e[3],
             sideways + sign * e[4],
             turn + sign * e[5],
         )
     for i in range(3):
-        mean[i] = poses[i].mean()
-        poses[i] -= mean[i]
+        way = poses[i].mean()
+        poses[i] -= way
+        mean[i] = way if i == 2 else mean[i] + way
     cross = (poses[:, :size] - poses[:, points : points + size]) @ root
     for i in range(3):
         for j in range(3):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from comparison import assert_close_beliefs, assert_same_bits, digest
 from dense_ekf import DenseEkf
+from far_origins import far_origins, rounding, shifted
 from numeric_jacobian import numeric_jacobian
 from scipy.optimize import least_squares
 
@@ -514,9 +515,11 @@ def waiting_filter(label, sensor, **settings):
     return make_estimator(label, **noise, sensor=sensor, **settings)
 
 
-def drive_past(slam, sensor, steps, *, landmarks=LANDMARKS, noise=1.0, turn=0.15):
+def drive_past(
+    slam, sensor, steps, *, landmarks=LANDMARKS, noise=1.0, turn=0.15, start=(0, 0, 0)
+):
     """Drive on a circle, or straight on, past landmarks; return the true pose."""
-    rng, pose = np.random.default_rng(0), np.zeros(3)
+    rng, pose = np.random.default_rng(0), np.array(start, dtype=float)
     for _ in range(steps):
         pose = pose + np.array([0.3 * np.cos(pose[2]), 0.3 * np.sin(pose[2]), turn])
         slam.predict((0.3, turn))
@@ -734,6 +737,40 @@ def test_an_update_that_fails_leaves_the_readings_waiting():
     assert digest(slam) == before
     slam.reset((0, 0, 0), (0, 0, 0))
     assert len(slam.waiting.ids) == 0
+
+
+@far_origins
+@pytest.mark.parametrize("sensor", [BEARING, RANGE], ids=lambda s: s.name)
+@pytest.mark.parametrize("label", ORACLES)
+def test_landmarks_far_from_the_origin_are_placed_as_at_the_origin(label, sensor, far):
+    steps, std, found = 35, (0.1, 0.1, 0.1), []
+    for origin in ((0, 0), far):
+        start = {"initial_pose": (*origin, 0), "initial_pose_std": std}
+        slam = waiting_filter(label, sensor, **start)
+        _, report = drive_past(slam, sensor, steps, start=(0.05, -0.1, 0.1))
+        found.append((slam.belief(), report.nis))
+    (near, nis), (there, nis_there) = found
+    assert len(near.landmark_ids) == 5
+    assert there.landmark_ids == near.landmark_ids
+    slack, noise = rounding(far, steps), STD[sensor.name][0]
+    if label == "unscented":  # roots of a singular covariance have half its digits
+        slack += 1e-9
+    np.testing.assert_allclose(there.mean, shifted(near.mean, far), atol=slack, rtol=0)
+    stds = np.sqrt(near.covariance.diagonal())
+    change = (there.covariance - near.covariance) / np.outer(stds, stds)
+    assert np.abs(change).max() < slack / noise
+    assert np.sqrt(nis_there) == pytest.approx(np.sqrt(nis), abs=slack / noise)
+
+
+@far_origins
+def test_past_poses_at_equal_distances_are_forgotten_in_the_same_order(far):
+    """Rounding decided which of them is nearest to the one before it."""
+    left = []
+    for origin in ((0, 0), far):
+        slam = waiting_filter("ekf", BEARING, initial_pose=(*origin, 0))
+        drive_past(slam, BEARING, 55, landmarks=np.array([[1e5, 1e5]]))
+        left.append(slam.waiting.ids[:, 1])
+    np.testing.assert_array_equal(*left)
 
 
 def test_past_poses_do_not_exceed_their_limit():
