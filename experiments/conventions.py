@@ -356,15 +356,25 @@ def _in_other_units(truth: Array, poses: Array, covariances: Array) -> Iterator[
         scale = float(np.sqrt(spread[0] / spread[1]))
     if not (np.isfinite(scale) and scale > 0 and abs(np.log(scale)) > _ALIKE):
         return
-    name = f"positions in a unit of {scale:.3g} m"
-    known = {f"positions in {unit}": size for unit, size in _UNITS.items()}
-    known |= {f"a truth in {unit}": 1 / size for unit, size in _UNITS.items()}
-    for words, size in known.items():
-        if abs(np.log(scale / size)) < _ALIKE:
-            scale, name = size, words
-            break
+    name, scale = unit_of(scale)
     matrix = np.diag([scale, scale, 1.0])
     yield name, poses @ matrix.T, covariances, matrix
+
+
+def unit_of(scale: float) -> tuple[str, float]:
+    """Return name and exact size of the known unit nearest to a scale of positions.
+
+    Examples
+    --------
+    >>> unit_of(0.0102), unit_of(0.7)
+    (('positions in centimetres', 0.01), ('positions in a unit of 0.7 m', 0.7))
+    """
+    known = {f"positions in {unit}": size for unit, size in _UNITS.items()}
+    known |= {f"a truth in {unit}": 1 / size for unit, size in _UNITS.items()}
+    for name, size in known.items():
+        if abs(np.log(scale / size)) < _ALIKE:
+            return name, size
+    return f"positions in a unit of {scale:.3g} m", scale
 
 
 def _between_steps(

@@ -15,11 +15,13 @@ References
    robotics, arXiv:1812.01537, 2018: the appendix on SE(3).
 """
 
+from __future__ import annotations
+
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -28,6 +30,7 @@ from ..arrays import Array
 from ..estimator.support.argument_checks import one_of
 from ..evaluation.consistency_report import evaluate_consistency
 from ..evaluation.nees import normalised_squared_error
+from .conventions import unit_of
 from .estimate_files import (
     content_lines,
     files_in,
@@ -41,6 +44,10 @@ from .estimate_files import (
     tum_table,
 )
 from .monte_carlo import verdict
+from .runs.trace import finite
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Place = str | PathLike[str]
 
@@ -49,6 +56,9 @@ ORDERS = ("translation-first", "rotation-first")
 _SMALL = 1e-4  # angle of a rotation below which series are exact [rad]
 _SYMMETRIC = 1e-6  # relative difference of two entries
 _NEAR, _FAR, _ERRORS = 1.5, 2.5, 3.0  # as for poses in the plane, see conventions
+_UNIT = 0.1  # largest difference of the length of a quaternion from 1
+_SMALLER = 4.0  # by which errors fall in the right convention of the poses
+_SHIFTS = (-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0)  # of time stamps, in steps
 _GAIN = 0.25  # of log-likelihood of a pose [nats]
 _DEGREES = np.diag([1.0] * 3 + [np.pi / 180] * 3)
 _SWAP = np.eye(6)[[3, 4, 5, 0, 1, 2]]
@@ -61,6 +71,10 @@ class Pose(NamedTuple):
     positions: Array
     #: Shape (..., 3, 3).
     rotations: Array
+
+
+#: Times of true poses (T,) [s], None if pose k is that of pose k of the estimate.
+_Path = tuple[Array | None, Pose]
 
 
 class SpaceEstimate(NamedTuple):
@@ -159,7 +173,9 @@ def judge_in_space(
         npz with ``belief_poses`` (T, 7), as x y z qx qy qz qw, and
         ``belief_pose_covariances`` (T, 6, 6).
     truth : path or sequence of paths
-        True paths as TUM, with the names of the estimates.
+        True paths with the names of the estimates: TUM, or npz with ``poses`` (T, 7).
+        An npz of truth or estimates may hold ``times`` (T,) [s]; without them, pose k
+        belongs to pose k of the other.
     covariances : {"left", "right", "decoupled"}
         The error whose covariances the files hold.
     order : {"translation-first", "rotation-first"}
@@ -169,9 +185,10 @@ def judge_in_space(
     -------
     dict
         ``verdict``, ``reason`` and ``sentence``; ``nees`` per degree of freedom of
-        ``pose``, ``position`` and ``rotation``; ``cause``, the convention that explains
-        the errors, or ""; ``runs``, ``steps``, and ``left_out``, the number of poses
-        without truth.
+        ``pose``, ``position`` and ``rotation``, and ``nees_over_time``, the same for
+        each step, None where undefined; ``cause``, the convention that explains
+        the errors, or ""; ``runs``, ``steps``, ``tested_steps``, how many steps are
+        tested together, and ``left_out``, the number of poses without truth.
 
     Raises
     ------
@@ -182,7 +199,12 @@ def judge_in_space(
     one_of("order", order, ORDERS)
     (true_places,) = paths_by_label(truth).values()
     named = paths_by_label(estimates)
-    true = {name_of(path): _true_path(path) for path in files_in(true_places)}
+    if len(named) > 1:
+        raise ValueError(
+            "estimates in space must be those of one estimator, in one folder, got "
+            f"{' and '.join(named)}"
+        )
+    true = dict(pair for path in files_in(true_places) for pair in _true_paths(path))
     read = dict(
         pair
         for paths in named.values()
@@ -205,7 +227,11 @@ def judge_in_space(
     readings = dict(_readings(exact, poses, claims, order))
     error, matrices = readings[_name(covariances, order)]
     nees = normalised_squared_error(error, matrices)
-    decided, reason = verdict.NOT_SHOWN, "one drive is too few to decide"
+    ratios = {"pose": nees / 6}
+    for name, part in (("position", slice(0, 3)), ("rotation", slice(3, 6))):
+        own = matrices[..., part, part]
+        ratios[name] = normalised_squared_error(error[..., part], own) / 3
+    decided, reason, tested = verdict.NOT_SHOWN, "one drive is too few to decide", 0
     if len(nees) > 1:
         none = np.zeros_like(nees)
         rng = np.random.default_rng(0)
@@ -213,26 +239,58 @@ def judge_in_space(
             nees, none, none, dof=6, frame="invariant", rng=rng
         )
         decided, reason = verdict.judge(report, len(report.failed_runs), len(nees))[:2]
-    label = next(iter(named))
-    parts = {"position": slice(0, 3), "rotation": slice(3, 6)}
+        tested = len(report.family_steps)
+    (label,) = named
     return {
+        "estimator": label,
         "verdict": decided,
         "reason": reason,
         "sentence": f"{label}: {decided}: {reason}.",
-        "nees": {"pose": float(np.nanmean(nees) / 6)}
-        | {
-            name: _mean_ratio(error[..., part], matrices[..., part, part])
-            for name, part in parts.items()
+        "nees": {name: float(np.nanmean(each)) for name, each in ratios.items()},
+        "nees_over_time": {
+            name: [finite(ratio) for ratio in _means(each)]
+            for name, each in ratios.items()
         },
-        "cause": "" if decided == verdict.CONSISTENT else _cause(readings, error, nees),
+        "cause": ""
+        if decided == verdict.CONSISTENT
+        else _cause(readings, error, nees) or _nearer(exact, poses),
         "runs": len(nees),
         "steps": nees.shape[1],
+        "tested_steps": tested,
         "left_out": left_out,
     }
 
 
-def _mean_ratio(errors: Array, covariances: Array) -> float:
-    return float(np.nanmean(normalised_squared_error(errors, covariances)) / 3)
+def _means(ratios: Array) -> Array:
+    """Return averages over runs (M, K) of each step; nan where no run has any."""
+    known = np.isfinite(ratios)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(known, ratios, 0).sum(axis=0) / known.sum(axis=0))
+
+
+def nees_in_space_figure(found: Mapping[str, Any], width_mm: float = 85.0) -> Figure:
+    """Draw the NEES per degree of freedom over time, of what `judge_in_space` returns.
+
+    Parameters
+    ----------
+    found : mapping
+        The result of `judge_in_space`.
+    width_mm : float, default 85
+        Width of the figure [mm].
+    """
+    from .figures.style import new_figure  # noqa: PLC0415
+    from .monte_carlo import figures  # noqa: PLC0415
+
+    figure = new_figure(width_mm / 25.4, 2.9)
+    axes = figure.subplots()
+    shown = [figures.draw_bands(axes, found["runs"], 6, found["tested_steps"])]
+    for place, (name, means) in enumerate(found["nees_over_time"].items()):
+        ratios = np.array(means, dtype=np.float64)  # nan for None
+        shown.append(ratios[np.isfinite(ratios)])
+        steps = np.arange(len(ratios))
+        axes.plot(*figures.thinned(steps, ratios), **figures.look_of(place).line(name))
+    figures.scale_ratios(axes, np.concatenate(shown))
+    return figures.finished(figure, axes, "ANEES / n", found["estimator"])
 
 
 def _name(kind: str, order: str) -> str:
@@ -292,6 +350,71 @@ def _cause(
     )
 
 
+def _nearer(truth: Pose, poses: Pose) -> str:
+    """Name the convention of the poses that makes their errors far smaller."""
+    before = _median_errors(truth, poses)
+    read = {name: _median_errors(*pair) for name, *pair in _pose_readings(truth, poses)}
+    sizes = {name: np.log(np.maximum(each, 1e-9)).sum() for name, each in read.items()}
+    best = min(sizes, key=lambda name: sizes[name])
+    if sizes[best] > np.log(np.maximum(before, 1e-9)).sum() - np.log(_SMALLER):
+        return ""
+    (place, turn), (was_place, was_turn) = read[best], before
+    return (
+        f"convention: {best}: read so, the median errors are {place:.2g} m and "
+        f"{turn:.2g} rad instead of {was_place:.2g} m and {was_turn:.2g} rad."
+    )
+
+
+def _median_errors(truth: Pose, poses: Pose) -> tuple[float, float]:
+    """Return the median errors of positions [m] and rotations [rad]."""
+    gaps = np.linalg.norm(truth.positions - poses.positions, axis=-1)
+    turns = np.linalg.norm(logarithm(between(poses, truth))[..., 3:], axis=-1)
+    return float(np.median(gaps)), float(np.median(turns))
+
+
+def _pose_readings(truth: Pose, poses: Pose) -> Iterator[tuple[str, Pose, Pose]]:
+    """Yield truth and estimates as they are in other conventions of the poses."""
+    origin = Pose(np.zeros_like(poses.positions), np.eye(3) + 0 * poses.rotations)
+    inverse = "poses of the world as the robot sees it (inverse)"
+    yield inverse, truth, between(poses, origin)
+    yield f"{inverse}, in the truth", between(truth, origin), poses
+    first = "quaternions that begin with qw"
+    yield first, truth, _rolled(poses)
+    yield f"{first}, in the truth", _rolled(truth), poses
+    spreads = [
+        np.square(each.positions - each.positions.mean(axis=1, keepdims=True)).sum()
+        for each in (truth, poses)
+    ]
+    if min(spreads) > 0:
+        name, scale = unit_of(float(np.sqrt(spreads[0] / spreads[1])))
+        yield name, truth, poses._replace(positions=poses.positions * scale)
+    steps = np.arange(truth.positions.shape[1])
+    for shift in _SHIFTS:
+        side = "late" if shift > 0 else "early"
+        places = np.clip(steps - shift, 0, steps[-1])
+        after = np.clip(np.ceil(places).astype(int), 1, None)
+        ends = [
+            Pose(truth.positions[:, rows], truth.rotations[:, rows])
+            for rows in (after - 1, after)
+        ]
+        then = interpolated(ends[0], ends[1], places - after + 1)
+        yield f"time stamps that are {abs(shift):.2g} steps too {side}", then, poses
+
+
+def _rolled(poses: Pose) -> Pose:
+    """Return poses whose quaternions were written as qw qx qy qz."""
+    flat = Rotation.from_matrix(poses.rotations.reshape(-1, 3, 3)).as_quat()
+    turned = Rotation.from_quat(flat[:, [1, 2, 3, 0]]).as_matrix()
+    return poses._replace(rotations=turned.reshape(poses.rotations.shape))
+
+
+def interpolated(start: Pose, end: Pose, share: Array) -> Pose:
+    """Return poses on the twists between two poses, at a share in [0, 1] of each."""
+    return composed(
+        start, exponential(share[..., None] * logarithm(between(start, end)))
+    )
+
+
 def _fit(errors: Array, covariances: Array) -> tuple[bool, Array, float]:
     """Return whether errors are honest, log-likelihoods of runs, and NEES / 6."""
     order = [3, 4, 5, 0, 1, 2]  # rotations first: fewer frames change them
@@ -319,11 +442,16 @@ def _poses_of(rows: Array) -> Pose:
     return Pose(rows[:, :3], Rotation.from_quat(rows[:, 3:7]).as_matrix())
 
 
-def _true_path(path: Path) -> tuple[Array, Pose]:
+def _true_paths(path: Path) -> Iterator[tuple[Any, _Path]]:
+    """Yield names, and times and poses; an npz needs no times."""
+    if path.suffix == ".npz":
+        for name, (rows,), times in _npz_drives(path, {"poses": (7,)}):
+            yield name, (times, _poses_of(rows))
+        return
     lines = content_lines(path)
     rows = np.array([tum_row(line)[:8] for line in lines])
     kept = growing_rows(rows, [f"{path}, line {line.number}" for line in lines])
-    return rows[kept, 0], _poses_of(rows[kept, 1:])
+    yield name_of(path), (rows[kept, 0], _poses_of(rows[kept, 1:]))
 
 
 def _estimates_in(path: Path) -> Iterator[tuple[Any, SpaceEstimate]]:
@@ -342,30 +470,59 @@ def _estimates_in(path: Path) -> Iterator[tuple[Any, SpaceEstimate]]:
 
 
 def _of_npz(path: Path) -> Iterator[tuple[Any, SpaceEstimate]]:
-    names = "belief_poses", "belief_pose_covariances"
+    wanted = {"belief_poses": (7,), "belief_pose_covariances": (6, 6)}
+    for name, (rows, claims), times in _npz_drives(path, wanted):
+        matrices = _checked(str(path), claims)
+        yield name, SpaceEstimate(str(path), _poses_of(rows), matrices, times)
+
+
+def _npz_drives(
+    path: Path, wanted: Mapping[str, tuple[int, ...]]
+) -> Iterator[tuple[Any, list[Array], Array | None]]:
+    """Yield names, arrays (T, ...) of these shapes, poses first, and times, if any."""
+    names, seeds, times = " and ".join(wanted), None, None
     try:
         with path.open("rb") as stream, np.load(stream) as archive:
-            rows, matrices = (np.asarray(archive[n], np.float64) for n in names)
-            seeds = archive["seed"].tolist() if "seed" in archive.files else None
+            arrays = [np.asarray(archive[name], np.float64) for name in wanted]
+            if "seed" in archive.files:
+                seeds = np.atleast_1d(archive["seed"]).tolist()
+            if "times" in archive.files:
+                times = np.asarray(archive["times"], np.float64)
     except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} must hold {' and '.join(names)}: {error}") from None
+        raise ValueError(f"{path} must hold {names}: {error}") from None
     if seeds is None:
-        rows, matrices, seeds = rows[None], matrices[None], [name_of(path)]
-    wanted = (*rows.shape[:2], 6, 6)
-    if rows.ndim != 3 or rows.shape[2] != 7 or matrices.shape != wanted:
+        arrays, seeds = [array[None] for array in arrays], [name_of(path)]
+        times = None if times is None else times[None]
+    _check_npz(path, wanted, arrays, times, len(seeds))
+    for k, name in enumerate(seeds):
+        own = None if times is None else times[k]
+        yield name, [array[k] for array in arrays], own
+
+
+def _check_npz(
+    path: Path,
+    wanted: Mapping[str, tuple[int, ...]],
+    arrays: Sequence[Array],
+    times: Array | None,
+    drives: int,
+) -> None:
+    """Refuse arrays (E, T, ...) of other shapes, or with other poses or times."""
+    names, (count, steps) = " and ".join(wanted), (*arrays[0].shape, 0)[:2]
+    due = [(drives, steps, *shape) for shape in wanted.values()]
+    if [array.shape for array in arrays] != due:
+        sizes = [f"(T, {', '.join(map(str, shape))})" for shape in wanted.values()]
+        got = " and ".join(str(array.shape[1:]) for array in arrays)
         raise ValueError(
-            f"{path}: {names[0]} must be (T, 7) and {names[1]} (T, 6, 6) for each "
-            f"drive, got {rows.shape[1:]} and {matrices.shape[1:]}"
+            f"{path}: {names} must be {' and '.join(sizes)} for each drive, got {got} "
+            f"for {drives} seeds"
         )
-    lengths = np.linalg.norm(rows[..., 3:], axis=-1)
-    if len(seeds) != len(rows) or not (abs(lengths - 1) < 0.1).all():
-        raise ValueError(
-            f"{path}: every array must have a row for each seed, and quaternions the "
-            "length 1"
-        )
-    for seed, drive, claims in zip(seeds, rows, matrices, strict=True):
-        checked = _checked(str(path), claims)
-        yield seed, SpaceEstimate(str(path), _poses_of(drive), checked)
+    lengths = np.linalg.norm(arrays[0][..., 3:], axis=-1)
+    if not (abs(lengths - 1) < _UNIT).all():
+        raise ValueError(f"{path}: quaternions qx qy qz qw must have the length 1")
+    if times is None:
+        return
+    if times.shape != (count, steps) or not (np.diff(times) > 0).all():
+        raise ValueError(f"{path}: times must be (T,) for each drive, and grow")
 
 
 def _checked(file: str, matrices: Array) -> Array:
@@ -382,15 +539,16 @@ def _checked(file: str, matrices: Array) -> Array:
 
 
 def _within(
-    estimate: SpaceEstimate, due: Array, path: Pose
+    estimate: SpaceEstimate, due: Array | None, path: Pose
 ) -> tuple[Pose, SpaceEstimate, int]:
     """Return the truth at the times of estimates, these, and how many have none."""
-    if estimate.times is None:
-        count = len(estimate.covariances)
-        if count != len(due):
+    if estimate.times is None or due is None:
+        count, others = len(estimate.covariances), len(path.positions)
+        if count != others:
+            what = estimate.file if estimate.times is None else "the truth"
             raise ValueError(
-                f"{estimate.file} has no times and must have as many poses as its "
-                f"truth, {len(due)}, got {count}"
+                f"{what} has no times, so {estimate.file} and its truth must have "
+                f"equally many poses, got {count} and {others}"
             )
         return path, estimate, 0
     inside = np.flatnonzero(near_truth(estimate.times, due))
@@ -404,10 +562,9 @@ def _within(
     after = np.clip(np.searchsorted(due, times), 1, len(due) - 1)
     start, end = (_at(path, rows) for rows in (after - 1, after))
     share = (times - due[after - 1]) / (due[after] - due[after - 1])
-    step = exponential(share[:, None] * logarithm(between(start, end)))
     poses = _at(estimate.poses, inside)
     kept = estimate._replace(poses=poses, covariances=estimate.covariances[inside])
-    return composed(start, step), kept, len(estimate.times) - len(inside)
+    return interpolated(start, end, share), kept, len(estimate.times) - len(inside)
 
 
 def _at(poses: Pose, rows: Any) -> Pose:

@@ -108,18 +108,26 @@ def judge(files: FilesOfEstimates, *, given: JudgeOptions) -> int:
 
 
 def _judge_in_space(files: FilesOfEstimates, given: JudgeOptions, space: str) -> int:
-    """Print the verdict on poses in space."""
-    from ..space_poses import ERRORS, ORDERS, judge_in_space
+    """Print the verdict on poses in space, and write summary.json and nees.svg."""
+    from ..figures.style import save_figure
+    from ..space_poses import ERRORS, ORDERS, judge_in_space, nees_in_space_figure
+    from .output_folder import default_folder, output_folder, write_summary
+    from .tables import written
 
     kind, _, order = space.partition(",")
     if kind not in ERRORS or (order and order not in ORDERS):
         raise BadInputError(unknown_choice("--space", space, ERRORS))
-    others = (given.drives, given.covariances, given.frame, given.align, given.out)
+    others = given.drives, given.covariances, given.frame, given.align
     if given.truths is None or any(each is not None for each in others):
-        raise BadInputError("--space needs --truth, and accepts no other option")
+        raise BadInputError("--space needs --truth, and accepts only --out beside it")
     found = judge_in_space(
         files, given.truths, covariances=kind, order=order or ORDERS[0]
     )
+    found["command"] = shlex.join(["slamgym", *sys.argv[1:]])
+    place = given.out or default_folder("judge", found["estimator"])
+    with output_folder(place) as folder:
+        save_figure(nees_in_space_figure(found), folder / "nees.svg")
+        found = write_summary(folder, found)
     reporter, nees = given.reporter(), found["nees"]
     lines = [
         found["sentence"],
@@ -131,8 +139,9 @@ def _judge_in_space(files: FilesOfEstimates, given: JudgeOptions, space: str) ->
         lines.append(f"cause: {found['cause']}")
     if found["left_out"]:
         lines.append(f"{found['left_out']} poses without truth are left out.")
-    reporter.show(*map(Text, lines))
-    reporter.finish(found)
+    reporter.show(*map(Text, lines), "")
+    reporter.show(written(str(place), found["files"]))
+    reporter.finish({**found, "out": str(place)})
     return 0
 
 

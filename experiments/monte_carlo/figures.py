@@ -147,24 +147,50 @@ def nees_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
     figure = new_figure(study.width, 2.9)
     axes = figure.subplots()
     runs = max(int(scores.good.sum()) for scores, _ in shown)
-    band = np.array(average_band(runs, POSE_FREEDOM)) / POSE_FREEDOM
-    axes.axhspan(*band, color=GREY, alpha=0.25, lw=0, label="95 % band")
-    if times := grid_steps(summary):
-        wide = np.array(family_band(runs, POSE_FREEDOM, times)) / POSE_FREEDOM
-        label = f"95 % band, {counted(times, 'step')}"
-        for end, name in zip(wide, (label, None), strict=True):
-            axes.axhline(end, color=GREY, lw=0.8, label=name)
-    extremes = [band]
+    extremes = [draw_bands(axes, runs, POSE_FREEDOM, grid_steps(summary))]
     for scores, look in shown:
         average = np.maximum(scores.ratios(frame).mean(axis=0), _LEAST_RATIO)
         steps = np.arange(scores.first, scores.first + len(average))
         axes.plot(*thinned(steps, average), **look.line(plain(scores.label)))
         _mark_grid(axes, summary["estimators"][scores.label]["decisions"], look)
         extremes.append(average)
-    everything = np.concatenate(extremes)
-    if everything.max() > _LOG_FROM or everything.min() < 1 / _LOG_FROM:
+    scale_ratios(axes, np.concatenate(extremes))
+    return finished(figure, axes, "ANEES / 3", study.title)
+
+
+def draw_bands(axes: Axes, runs: int, freedom: int, times: int) -> Array:
+    """Draw the 95 % bands of an average NEES / n, and return that of one step.
+
+    Parameters
+    ----------
+    axes : Axes
+        Where to draw.
+    runs : int
+        Number of runs that are averaged.
+    freedom : int
+        n, degrees of freedom of the NEES.
+    times : int
+        Number of steps that are tested together; 0 for none.
+
+    Returns
+    -------
+    ndarray, shape (2,)
+        Ends of the band.
+    """
+    band = np.array(average_band(runs, freedom)) / freedom
+    axes.axhspan(*band, color=GREY, alpha=0.25, lw=0, label="95 % band")
+    if times:
+        wide = np.array(family_band(runs, freedom, times)) / freedom
+        label = f"95 % band, {counted(times, 'step')}"
+        for end, name in zip(wide, (label, None), strict=True):
+            axes.axhline(end, color=GREY, lw=0.8, label=name)
+    return band
+
+
+def scale_ratios(axes: Axes, ratios: Array) -> None:
+    """Use a logarithmic scale if a ratio (n,) is far from 1."""
+    if ratios.max() > _LOG_FROM or ratios.min() < 1 / _LOG_FROM:
         log_ticks(axes, "y")
-    return _finished(figure, axes, "ANEES / 3", study.title)
 
 
 def runs_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
@@ -261,7 +287,7 @@ def rmse_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
         least = thinned(shown[0][0].steps, np.sqrt(bound))
         axes.plot(*least, color=GREY, ls=":", lw=1.5, label="bound of any filter")
     axes.set_ylim(bottom=0)
-    return _finished(figure, axes, "RMS error, raw [m]", study.title)
+    return finished(figure, axes, "RMS error, raw [m]", study.title)
 
 
 def name_world(axes: Axes, title: str) -> None:
@@ -269,7 +295,7 @@ def name_world(axes: Axes, title: str) -> None:
     axes.set_title(title, loc="right", fontsize=8, color=GREY, pad=3)
 
 
-def _finished(figure: Figure, axes: Axes, ylabel: str, title: str) -> Figure:
+def finished(figure: Figure, axes: Axes, ylabel: str, title: str) -> Figure:
     """Dress and label the axes of a number over the steps."""
     dress(axes)
     name_world(axes, title)

@@ -18,9 +18,11 @@ from slamgym.experiments.space_poses import (
     hat,
     judge_in_space,
     logarithm,
+    nees_in_space_figure,
 )
 
 RUNS, STEPS = 40, 25
+INVERSE = "poses of the world as the robot sees it (inverse)"
 SWAP = np.eye(6)[[3, 4, 5, 0, 1, 2]]
 
 
@@ -57,20 +59,20 @@ def test_the_adjoint_moves_a_twist_to_the_other_side():
     np.testing.assert_allclose(whole(one), whole(other), atol=1e-12)
 
 
-def drives(seed, runs=RUNS, tilt=0.0):
+def drives(seed, runs=RUNS, tilt=0.0, noise=1.0):
     """Dead reckoning with an honest covariance of the left error."""
     rng = np.random.default_rng(seed)
-    std = np.array([0.02, 0.02, 0.02, 0.01, 0.01, 0.01])
+    std = noise * np.array([0.02, 0.02, 0.02, 0.01, 0.01, 0.01])
     step = exponential(np.array([0.5, 0, 0.05, 0.02, -0.05, 0.12]))
     back = adjoint(between(step, Pose(np.zeros(3), np.eye(3))))
     for _ in range(runs):
         true = estimate = exponential(np.array([1, 2, 0, tilt, 0, 0.0]))
-        P, rows = 1e-4 * np.eye(6), []
-        true = composed(true, exponential(1e-2 * rng.normal(size=6)))
+        P, rows = (1e-2 * noise) ** 2 * np.eye(6), []
+        true = composed(true, exponential(1e-2 * noise * rng.normal(size=6)))
         for _ in range(STEPS):
             rows.append((true, estimate, P))
-            noise = exponential(std * rng.normal(size=6))
-            true = composed(composed(true, step), noise)
+            shift = exponential(std * rng.normal(size=6))
+            true = composed(composed(true, step), shift)
             estimate = composed(estimate, step)
             P = back @ P @ back.T + np.diag(std**2)
         yield rows
@@ -93,8 +95,8 @@ WRITTEN = {
 }
 
 
-def write(folder, seed, change, runs=RUNS, tilt=0.0, start=0.0):
-    for k, rows in enumerate(drives(seed, runs, tilt)):
+def write(folder, seed, change, runs=RUNS, *, tilt=0.0, start=0.0, noise=1.0):
+    for k, rows in enumerate(drives(seed, runs, tilt, noise)):
         for name in "et":
             (folder / name).mkdir(exist_ok=True)
             lines = []
@@ -134,6 +136,47 @@ def test_honest_poses_in_space_are_not_rejected(kind, order, tmp_path):
     assert all(0.8 < ratio < 1.25 for ratio in found["nees"].values())
 
 
+def inverse(rows):
+    quaternions = Rotation.from_quat(rows[:, 4:8]).inv()
+    rows[:, 1:4] = -quaternions.apply(rows[:, 1:4])
+    rows[:, 4:8] = quaternions.as_quat()
+
+
+def first_w(rows):
+    rows[:, 4:8] = rows[:, [7, 4, 5, 6]]
+
+
+def centimetres(rows):
+    rows[:, 1:4] *= 100
+
+
+def late(rows):
+    rows[:, 0] += 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "folder", "name"),
+    [
+        (inverse, "e", INVERSE),
+        (inverse, "t", f"{INVERSE}, in the truth"),
+        (first_w, "e", "quaternions that begin with qw"),
+        (first_w, "t", "quaternions that begin with qw, in the truth"),
+        (centimetres, "e", "positions in centimetres"),
+        (centimetres, "t", "a truth in centimetres"),
+        (late, "e", "time stamps that are 0.5 steps too late"),
+    ],
+)
+def test_a_convention_of_the_poses_in_space_is_named(change, folder, name, tmp_path):
+    places = write(tmp_path, 13, WRITTEN["left"], runs=3, noise=1e-2)
+    for path in (tmp_path / folder).iterdir():
+        rows = np.loadtxt(path)
+        change(rows)
+        np.savetxt(path, rows, fmt="%.17g")
+    found = judge_in_space(*places)
+    assert found["verdict"] == "not consistent"
+    assert found["cause"].startswith(f"convention: {name}: read so, the median errors")
+
+
 def test_left_and_right_error_in_space_have_the_same_nees(tmp_path):
     found = []
     for kind in "left", "right":
@@ -170,6 +213,21 @@ def test_an_npz_of_poses_in_space_is_judged_like_tum(tmp_path):
     found = judge_in_space(tmp_path / "all.npz", truth)
     same = judge_in_space(estimates, truth)["nees"]
     assert found["nees"] == pytest.approx(same, rel=1e-12)
+    true = [np.loadtxt(path)[:, 1:] for path in sorted(truth.iterdir())]
+    times = np.tile(np.arange(STEPS), (3, 1))
+    np.savez(tmp_path / "truth.npz", seed=[0, 1, 2], poses=true, times=times)
+    for theirs in tmp_path / "all.npz", estimates:
+        again = judge_in_space(theirs, tmp_path / "truth.npz")["nees"]
+        assert again == pytest.approx(same, rel=1e-12)
+    np.savez(tmp_path / "truth.npz", seed=[0, 1, 2], poses=true, times=times[:, ::-1])
+    with pytest.raises(ValueError, match=r"truth\.npz: times must be \(T,\) for each"):
+        judge_in_space(estimates, tmp_path / "truth.npz")
+    np.savez(tmp_path / "truth.npz", seed=[0, 1, 2], poses=poses[0])
+    with pytest.raises(ValueError, match=r"truth\.npz: poses must be \(T, 7\) for"):
+        judge_in_space(estimates, tmp_path / "truth.npz")
+    np.savez(tmp_path / "truth.npz", seed=[0, 1, 2], poses=np.array(true)[:, 1:])
+    with pytest.raises(ValueError, match=r"truth has no times, so .*, got 25 and 24"):
+        judge_in_space(estimates, tmp_path / "truth.npz")
     np.savez(tmp_path / "all.npz", seed=[0, 1, 2], belief_poses=poses)
     with pytest.raises(ValueError, match=r"all\.npz must hold belief_poses and"):
         judge_in_space(tmp_path / "all.npz", truth)
@@ -202,15 +260,40 @@ def test_what_is_no_pose_in_space_is_refused(tmp_path):
 
 def test_the_command_judges_poses_in_space(tmp_path):
     estimates, truth = write(tmp_path, 11, WRITTEN["right"])
-    done = slamgym("judge", estimates, "--truth", truth, "--space", "left", "--json")
+    call = "judge", estimates, "--truth", truth, "--out", tmp_path / "out"
+    done = slamgym(*call, "--space", "left", "--json")
     found = json.loads(done.stdout)
     assert found["cause"].startswith(said_of("right"))
-    done = slamgym("judge", estimates, "--truth", truth, "--space", "left")
+    saved = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert saved == {name: found[name] for name in found if name != "out"}
+    assert saved["files"] == ["nees.svg", "summary.json"]
+    for name, ratio in saved["nees"].items():
+        assert np.mean(saved["nees_over_time"][name]) == pytest.approx(ratio)
+    assert "ANEES / n" in (tmp_path / "out" / "nees.svg").read_text()
+    done = slamgym(*call, "--space", "left")
     printed = " ".join(done.stdout.split())
     assert "e: not consistent: the squared errors of the pose" in printed
     assert f"cause: {said_of('right')}" in printed
-    done = slamgym("judge", estimates, "--truth", truth, "--space", "up")
+    done = slamgym(*call, "--space", "up")
     assert "--space must be one of left, right, decoupled, got 'up'" in done.stderr
+
+
+def test_the_figure_in_space_shows_steps_without_nees_as_gaps(tmp_path):
+    """The covariance of a known start is 0."""
+    places = write(tmp_path, 14, lambda X, P: P * (P[0, 0] > 1.5e-4), runs=3)
+    found = judge_in_space(*places)
+    assert found["nees_over_time"]["pose"][0] is None
+    axes = nees_in_space_figure(found).axes[0]
+    lines = {line.get_label(): line.get_ydata() for line in axes.lines}
+    shown = np.asarray(lines["pose"], dtype=float)
+    assert np.nanmean(shown) == pytest.approx(found["nees"]["pose"])
+    assert {"pose", "position", "rotation"} <= set(lines)
+
+
+def test_two_estimators_in_space_are_refused(tmp_path):
+    estimates, truth = write(tmp_path, 15, WRITTEN["left"], runs=2)
+    with pytest.raises(ValueError, match=r"must be those of one estimator, .* e and t"):
+        judge_in_space([estimates, truth], truth)
 
 
 def test_left_errors_are_normalised_by_their_own_covariance():
