@@ -2,8 +2,10 @@
 
 A log with clockwise bearings, degrees or shifted rows looks like a log with much noise.
 `mistake_in` reads a part of the log in each of the conventions that are often confused,
-and names the one in which its readings agree with its odometry. It names nothing if the
-log agrees as given, or in no convention. No truth is needed.
+and names the one in which its readings agree with its odometry. Where they agree as
+given, a longer part still shows whether the robot turns before it drives, or the scans
+stand a row too late. It names nothing if no convention explains the log. No truth is
+needed.
 
 Symbols
 -------
@@ -15,6 +17,7 @@ d, α   odometry: distance driven, and turn [m, rad]
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -36,6 +39,7 @@ from .runs.summary import MOST_REJECTED
 #: Size of the part of a log that is read in other conventions: its first landmarks and
 #: rows of odometry, and blocks of scans spread over them.
 _LANDMARKS, _ROWS, _READINGS, _BLOCK = 40, 8000, 800, 12
+_UNREAD = -1  # id of the landmarks beyond these
 _FEWEST = 30  # readings that are enough to recognise a convention
 #: Gain in log likelihood per reading [nats], and in all, that names a mistake; and by
 #: how much it leads over the next one.
@@ -53,6 +57,13 @@ _FACTORS = np.array(list(product(_SIZES, _SIZES)))
 _FEW = np.array([(1, 1), (4, 4), (0.25, 0.25), (1, 0.25), (4, 1), (0.25, 0.0625)])
 _FINALISTS = 3
 _LARGEST = 4.0  # factor of the noise with which a mistake explains a log
+#: Where the noise hides a mistake: readings of a longer part, its pieces, the rise of
+#: the log likelihood of a reading [nats], by how many standard errors of the pieces it
+#: differs from 0, and in which share of them it rises.
+_MANY, _PIECES, _RISE, _ERRORS, _MOST = 6000, 30, 0.08, 3.0, 0.95
+_NOTABLE = 2.0  # change of a piece that counts [nats]
+_APART = 2.0  # standard errors by which two hidden mistakes differ
+_FINE, _SEARCHES = np.array(list(product((0.5, 1.0, 2.0), repeat=2))), 3
 _DEGREE = np.pi / 180
 #: Durations of a step that turn velocities into increments where rows hold none [s].
 _DURATIONS = (0.5, 0.25, 0.2, 0.1, 0.05, 0.04, 1 / 30, 0.02, 0.01)
@@ -113,6 +124,8 @@ class Reading(NamedTuple):
     start: float
     #: Logarithm of the volume of a measurement as read, by that in the file.
     log_volume: float = 0.0
+    #: Rows of odometry by which the scans are moved.
+    moved: int = 0
 
 
 def mistake_in(log: slamlog.SlamLog, settings: FilterSettings) -> Mistake | None:
@@ -149,7 +162,7 @@ def mistake_in(log: slamlog.SlamLog, settings: FilterSettings) -> Mistake | None
     if not is_usual or ground_truth.hides_identities(log) or not log.scans:
         return None
     given = part_of(log)
-    if given is None or len(given.measurements) < _FEWEST or not len(given.rows):
+    if given is None or is_used(given).sum() < _FEWEST or not len(given.rows):
         return None
     with one_blas_thread():
         return _Comparison(log, settings, given).mistake()
@@ -170,42 +183,56 @@ def explaining(log: slamlog.SlamLog, settings: FilterSettings) -> Iterator[None]
 def part_of(log: slamlog.SlamLog) -> Reading | None:
     """Return the part of a log that is read in other conventions, as it is given.
 
-    None if it has no scan, as the first one comes late or shows too many landmarks.
+    It ends with the first scan that shows none of its landmarks; other landmarks count
+    as `_UNREAD`. None if it has no scan, as the first one comes late.
     """
     rows: list[tuple[float, float, float]] = []
-    row_steps, scans, steps, seen = [], [], [], set[int]()
+    row_steps, scans, steps, sizes = [], [], [], []
+    known = dict[int, int]()
     count = 0
     for step in recording.steps_of(log):
         scan = step.scan
         ids = None if scan is None else scan.landmark_ids
         named = [] if ids is None else ids.tolist()
-        if len(rows) > _ROWS or len(seen | set(named)) > _LANDMARKS:
+        room = _LANDMARKS - len(known)
+        known |= {i: i for i in [i for i in named if i not in known][:room]}
+        shown = sum(i in known for i in named)
+        if len(rows) > _ROWS or (named and not shown):
             break
-        seen |= set(named)
         rows += [(row.d, row.alpha, row.dt) for row in step.motions]
         row_steps += [count] * len(step.motions)
         if scan is not None:
             scans.append(scan)
             steps.append(count)
+            sizes.append(shown)
         count += 1
     if not scans:
         return None
-    sizes = [len(scan.measurements) for scan in scans]
     every = -(-sum(sizes) // _READINGS)
     is_read = np.zeros(count, dtype=bool)
     is_read[np.array(steps)[np.arange(len(steps)) // _BLOCK % max(every, 1) == 0]] = (
         True
     )
+    ids = np.concatenate([scan.landmark_ids for scan in scans])
     return Reading(
         np.array(rows, dtype=np.float64).reshape(-1, 3),
         np.array(row_steps, dtype=np.int64),
         np.concatenate([scan.measurements for scan in scans]),
-        np.concatenate([scan.landmark_ids for scan in scans]),
-        np.repeat(np.array(steps, dtype=np.int64), sizes),
+        np.where(np.isin(ids, list(known)), ids, _UNREAD),
+        np.repeat(
+            np.array(steps, dtype=np.int64), [len(scan.measurements) for scan in scans]
+        ),
         is_read,
         log.motion,
         float(log.start[2]),
     )
+
+
+def unbroken(given: Reading) -> Reading:
+    """Return a part of a log with its first readings, without gaps between them."""
+    read = np.flatnonzero(given.landmarks != _UNREAD)[:_MANY]
+    last = given.steps[read[-1]]
+    return given._replace(is_read=np.arange(len(given.is_read)) <= last)
 
 
 def events_of(reading: Reading) -> DriveEvents:
@@ -232,6 +259,7 @@ def is_used(reading: Reading) -> BoolArray:
     """Return which measurements are read, each landmark once in a scan, (M,)."""
     steps = reading.steps
     used = (steps >= 0) & (steps < len(reading.is_read))
+    used &= reading.landmarks != _UNREAD
     used[used] = reading.is_read[steps[used]]
     named = np.column_stack([steps, reading.landmarks])
     is_first = np.zeros(len(used), dtype=bool)
@@ -252,6 +280,8 @@ class _Fit(NamedTuple):
     nis: Array
     #: Share of the readings.
     rejected: Array
+    #: Log likelihood of the scan of each step, (B, S), where it stands in the log.
+    by_step: Array
 
     @property
     def best(self) -> int:
@@ -275,8 +305,11 @@ class _Comparison:
     def mistake(self) -> Mistake | None:
         """Return the mistake that explains the log, or None."""
         before = self.fit(self.given, _FACTORS)
-        if not _is_far_off(before):
-            return None
+        found = self.plain_mistake(before) if _is_far_off(before) else None
+        return found or self.hidden_mistake(_FACTORS[before.best])
+
+    def plain_mistake(self, before: _Fit) -> Mistake | None:
+        """Return the mistake that explains a log whose NIS is far off."""
         screened = [(self.fit(it.reading, _FEW).most, it) for it in others(self.given)]
         screened.sort(key=lambda pair: -pair[0])
         fits = [(self.fit(it.reading, _FACTORS), it) for _, it in screened[:_FINALISTS]]
@@ -286,23 +319,45 @@ class _Comparison:
         explains = after.rejected[k] <= max(MOST_REJECTED, before.rejected[k] / 2)
         if not explains or _FACTORS[k].max() > _LARGEST:
             return None
-        return self.named(near, before)
-
-    def named(self, found: list[tuple[_Fit, Other]], before: _Fit) -> Mistake | None:
-        """Return mistakes that have the same effect, if the likelihood rises enough."""
-        after = found[0][0]
-        k, gain = after.best, after.most - before.most
-        if gain < max(_GAIN, _TOTAL / len(self.given.measurements)):
+        gain = after.most - before.most
+        if gain < max(_GAIN, _TOTAL / is_used(self.given).sum()):
             return None
-        factors = _FACTORS[k]
-        return Mistake(
-            " or ".join(it.name for _, it in found),
-            ", or ".join(it.remedy for _, it in found),
-            gain,
-            (float(after.nis[k]), float(before.nis[k])),
-            (float(after.rejected[k]), float(before.rejected[k])),
-            (float(factors[0]), float(factors[1])),
-        )
+        return _named(near, before, _FACTORS[k])
+
+    def hidden_mistake(self, factors: Array) -> Mistake | None:
+        """Return the mistake that the noise hides from NIS, but not from the log.
+
+        Two conventions are compared piece by piece of a longer part, both with the best
+        noise of the log as given, near some factors. The rise of the log likelihood
+        must be significant by its scatter over the pieces [1]_, which holds for a wrong
+        noise, too.
+
+        References
+        ----------
+        .. [1] Q. H. Vuong, Likelihood ratio tests for model selection and non-nested
+           hypotheses, Econometrica 57(2), 1989.
+        """
+        whole = unbroken(self.given)
+        for _ in range(_SEARCHES):
+            near_by = factors * _FINE
+            start, factors = factors, near_by[self.fit(whole, near_by).best]
+            if np.array_equal(factors, start):
+                break
+        before = self.fit(whole, factors[None])
+        fits = [(self.fit(it.reading, factors[None]), it) for it in hidden(whole)]
+        better = [pair for pair in fits if self.is_better(pair[0], before)]
+        better.sort(key=lambda pair: -pair[0].most)
+        near = [it for it in better if not _rise(better[0][0], it[0])[0] > _APART]
+        if not near or near[0][0].rejected[0] > MOST_REJECTED:
+            return None
+        return _named(near, before, factors)
+
+    def is_better(self, after: _Fit, before: _Fit) -> bool:
+        """Return whether the log likelihood rises far enough, and nearly everywhere."""
+        errors, share = _rise(after, before)
+        least = max(_RISE, _TOTAL / is_used(self.given).sum())
+        is_far = after.most - before.most >= least and errors >= _ERRORS
+        return is_far and share >= _MOST
 
     def fit(self, reading: Reading, factors: Array) -> _Fit:
         """Compare the readings with the odometry, under multiples of the noise."""
@@ -317,6 +372,7 @@ class _Comparison:
             np.where(np.isnan(total), -np.inf, total / count + reading.log_volume),
             (record.nis.sum(axis=1) + GATE * lost) / (2 * count),
             lost / count,
+            np.roll(record.log_likelihoods, -reading.moved, axis=1),
         )
 
     @cached_property
@@ -377,6 +433,42 @@ class _Comparison:
         if not finite.any():
             return np.nan
         return position_accuracy(estimate[finite], true[finite]).aligned_rmse
+
+
+def _named(found: list[tuple[_Fit, Other]], before: _Fit, factors: Array) -> Mistake:
+    """Return mistakes that have the same effect as one."""
+    after = found[0][0]
+    k = after.best
+    return Mistake(
+        " or ".join(it.name for _, it in found),
+        ", or ".join(it.remedy for _, it in found),
+        after.most - before.most,
+        (float(after.nis[k]), float(before.nis[k])),
+        (float(after.rejected[k]), float(before.rejected[k])),
+        (float(factors[0]), float(factors[1])),
+    )
+
+
+def _rise(after: _Fit, before: _Fit) -> tuple[float, float]:
+    """Return the rise of the log likelihood over the pieces of a log.
+
+    Returns
+    -------
+    errors : float
+        Their sum by its standard error.
+    share : float
+        The share of pieces in which it rises, among those in which it changes notably.
+    """
+    scans = np.flatnonzero(before.by_step[0])
+    with np.errstate(invalid="ignore"):  # of passes that failed
+        rises = after.by_step[0, scans] - before.by_step[0, scans]
+    if not np.isfinite(rises).all():
+        return 0.0, 0.0
+    pieces = np.array([part.sum() for part in np.array_split(rises, _PIECES)])
+    error = float(pieces.std()) * math.sqrt(_PIECES)
+    differ = pieces[abs(pieces) > _NOTABLE]
+    share = float((differ > 0).mean()) if len(differ) else 0.0
+    return float(rises.sum()) / error if error else 0.0, share
 
 
 def _is_far_off(fit: _Fit) -> bool:
@@ -544,9 +636,20 @@ def _shifted(given: Reading) -> Iterator[Other]:
         )
         name = f"the ids stand one row too {word}"
         yield Other(name, f"move the ids of the measurements one row {back}", moved)
-        by = -1 if word == "late" else 1
+    yield from _moved(given)
+
+
+def _moved(given: Reading) -> Iterator[Other]:
+    """Yield a part of a log with its scans a row of odometry earlier or later."""
+    for word, back, by in (("late", "up", -1), ("early", "down", 1)):
         moved = given._replace(
-            steps=given.steps + by, is_read=np.roll(given.is_read, by)
+            steps=given.steps + by, is_read=np.roll(given.is_read, by), moved=by
         )
         name = f"the measurements stand one row of odometry too {word}"
         yield Other(name, f"move the scans one row of odometry {back}", moved)
+
+
+def hidden(given: Reading) -> Iterator[Other]:
+    """Yield a part of a log in the conventions that large noise hides."""
+    yield from _of_motion(given)
+    yield from _moved(given)

@@ -27,9 +27,9 @@ PUBLIC = ("cmu16833", "utias_d6_r3")
 HALF = np.pi / 2
 
 
-def simulated(name, seed, steps=200):
+def simulated(name, seed, steps=200, **changes):
     world = load_scenario(name)
-    world = world.with_changes(steps=min(steps, world.steps))
+    world = world.with_changes(steps=min(steps, world.steps), **changes)
     driver = OpenLoop(action_sequence(world), world.robot)
     return record_episode(world, driver, seed=seed)
 
@@ -203,9 +203,47 @@ def test_outliers_are_no_mistake_of_conventions(corridor):
     assert mistake_of(of_scans(spoilt)(corridor)) is None
 
 
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("loop", turned_first, "the robot turns before it drives"),
+        ("corridor", turned_first, "the robot turns before it drives"),
+        ("corridor", with_scans_a_row_late, "the measurements stand one row of"),
+    ],
+)
+def test_a_mistake_that_nis_does_not_show_is_named(name, change, words):
+    found = mistake_of(change(simulated(name, seed=11, steps=1000)))
+    assert found.name.startswith(words)
+
+
+@pytest.mark.parametrize("factors", [(1, 1), (2, 2), (0.5, 2), (2, 0.5)])
+@pytest.mark.parametrize("name", ["loop", "corridor", "slippery", "dropout"])
+def test_nothing_is_named_where_only_the_noise_is_wrong(name, factors):
+    log = simulated(name, seed=12, steps=1000)
+    right = settings_for(log)
+    motion, sensor = (
+        tuple(factor * s for s in std)
+        for factor, std in zip(
+            factors, (right.motion_std, right.measurement_std), strict=True
+        )
+    )
+    settings = replace(right, motion_std=motion, measurement_std=sensor)
+    assert mistake_in(log, settings) is None
+
+
+def test_a_mistake_is_named_where_a_scan_shows_many_landmarks():
+    log = simulated("dense", seed=1, steps=60, sensor={"max_range": 12.0})
+    assert min(len(scan.measurements) for scan in log.scans) > 40
+    for name in ("clockwise", "degrees"):
+        change, words = FAR[name]
+        assert words in mistake_of(change(log)).name
+    assert mistake_of(log) is None
+    assert "ids stand" in mistake_of(with_the_ids_of_the_row_before(log)).name
+
+
 @pytest.mark.filterwarnings("ignore:.*does not specify")
-@pytest.mark.parametrize(("landmarks", "late"), [(60, 1), (3, 9000)])
-def test_a_log_without_a_scan_in_its_first_part_has_nothing_to_name(landmarks, late):
+def test_a_log_without_a_scan_in_its_first_part_has_nothing_to_name():
+    landmarks, late = 3, 9000
     ids, readings = np.arange(landmarks), np.full((landmarks, 2), (0.1, 5.0))
     events = [OdometryRow(float(k), 0.1, 0.0, 1.0) for k in range(1, late + 20)]
     for k in reversed(range(late, late + 19)):
