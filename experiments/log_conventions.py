@@ -328,9 +328,9 @@ class _Comparison:
         """Return the mistake that the noise hides from NIS, but not from the log.
 
         Two conventions are compared piece by piece of a longer part, both with the best
-        noise of the log as given, near some factors. The rise of the log likelihood
-        must be significant by its scatter over the pieces [1]_, which holds for a wrong
-        noise, too.
+        noise of the log as given, near some factors; a larger one would hide anything.
+        The rise of the log likelihood must be significant by its scatter over the
+        pieces [1]_, which holds for a wrong noise, too.
 
         References
         ----------
@@ -339,7 +339,7 @@ class _Comparison:
         """
         whole = unbroken(self.given)
         for _ in range(_SEARCHES):
-            near_by = factors * _FINE
+            near_by = np.minimum(factors * _FINE, _LARGEST)
             start, factors = factors, near_by[self.fit(whole, near_by).best]
             if np.array_equal(factors, start):
                 break
