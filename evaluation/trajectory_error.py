@@ -21,6 +21,7 @@ _ROUNDING = 4 * np.finfo(np.float64).eps
 _LEAST_TO_EXCHANGE = 5  # positions, so that most of them are right
 _FAR = 10.0  # standard deviations between a position and an exchanged truth
 _NEARER = 5.0  # factor between the distances to the own truth and to the other one
+_APART = 2.5  # standard deviations between two truths that an estimate tells apart
 _MOST_TRIED = 64  # positions whose pairs are tried as alignments
 
 
@@ -169,7 +170,12 @@ def exchanged_positions(estimate: ArrayLike, truth: ArrayLike) -> Exchange:
     holds for every i of a cycle π that is found, with j = π(i) and ẽ the positions
     after alignment with the truth in the order π.  The aligned map must thus be good
     for all others.  π is the best assignment of the positions that lie far from their
-    own truths after the alignment with the least median error [1]_.
+    own truths after the alignment with the least median error [1]_.  No other order may
+    be nearly as good ::
+
+        (ẽᵢ − ẽₖ)ᵀ (g_π(i) − g_π(k)) > (2.5 s)²    for all k ≠ i,
+
+    half the increase of the sum of squares if i and k change places in π.
 
     Parameters
     ----------
@@ -205,6 +211,10 @@ def exchanged_positions(estimate: ArrayLike, truth: ArrayLike) -> Exchange:
     own, other = (np.linalg.norm(moved - there, axis=1) for there in (g, g[order]))
     scale = np.sqrt(np.sum(other**2) / max(2 * n - 3, 1))
     is_sure = own > np.maximum(_FAR * scale, _NEARER * other)
+    for i in np.flatnonzero(is_sure):
+        margins = ((moved[i] - moved) * (g[order[i]] - g[order])).sum(axis=1)
+        margins[i] = np.inf
+        is_sure[i] = margins.min() > (_APART * scale) ** 2
     cycles = tuple(cycle for cycle in _cycles(order) if is_sure[list(cycle)].all())
     order = np.arange(n)
     for cycle in cycles:

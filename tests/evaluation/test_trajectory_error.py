@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slamgym.estimator.models.rigid_motion import rotation
 from slamgym.evaluation.trajectory_error import (
     Alignment,
     align_positions,
@@ -24,8 +25,8 @@ def kabsch(estimate, truth):
     e_mean, g_mean = estimate.mean(axis=0), truth.mean(axis=0)
     left, _, right = np.linalg.svd((truth - g_mean).T @ (estimate - e_mean))
     sign = np.diag([1.0, np.linalg.det(left @ right)])
-    rotation = left @ sign @ right
-    return rotation, g_mean - rotation @ e_mean
+    turn = left @ sign @ right
+    return turn, g_mean - turn @ e_mean
 
 
 @given(angle=st.floats(-3.1, 3.1), x=st.floats(-1e3, 1e3), y=st.floats(-1e3, 1e3))
@@ -249,6 +250,24 @@ def test_exchanged_positions_are_found_with_the_alignment_of_the_right_ones(
     assert found.cycles == (cycle,)
     error = np.linalg.norm(found.alignment.apply(estimate) - truth, axis=1)
     assert error.max() < 0.2
+
+
+@pytest.mark.parametrize("neighbour", [4, 5])
+@pytest.mark.parametrize(("gap", "is_named"), [(0.02, False), (1.0, True)])
+def test_an_exchange_is_named_whole_or_not_at_all(neighbour, gap, is_named):
+    """Two truths closer than the noise leave open which of them is exchanged."""
+    cycle, named = (1, 4, 6), []
+    for seed in range(20):
+        estimate, truth = a_map(12, seed)
+        place = truth[1] + (gap, 0.0)
+        estimate[neighbour] += rotation(2.0) @ (place - truth[neighbour])
+        truth[neighbour] = place
+        wrong = truth.copy()
+        wrong[list(np.roll(cycle, -1))] = truth[list(cycle)]
+        found = exchanged_positions(estimate, wrong).cycles
+        assert found in ((), (cycle,))
+        named.append(bool(found))
+    assert np.mean(named) > 0.8 if is_named else not any(named)
 
 
 @pytest.mark.parametrize("size", [1, 2, 4, 5, 30])
