@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from comparison import assert_close_beliefs, assert_same_bits, part_of
+from far_origins import far_origins, rounding, shifted
 from inner_parts import cached_submaps, closed_submaps, graph_of, present_submap
 from numeric_jacobian import numeric_jacobian
 from scipy.linalg import block_diag
@@ -168,6 +169,33 @@ def test_the_uncertainty_of_the_start_moves_the_map_as_a_whole():
     G = numeric_jacobian(moved, np.array(START))
     expected = one.covariance + G @ np.diag(np.square(std)) @ G.T
     np.testing.assert_allclose(other.covariance, expected, rtol=1e-6, atol=1e-9)
+
+
+@far_origins
+@pytest.mark.parametrize("base", BASES)
+def test_submaps_far_from_the_origin_are_joined_as_at_the_origin(base, far):
+    drive, std, found = list(laps(60)), (0.2, 0.1, 0.15), []
+    for origin in ((0, 0), far):
+        pose = shifted(START, origin)
+        slam = run(made(base=base, initial_pose=pose, initial_pose_std=std), drive[:40])
+        slam.join()
+        other = made(base=base)
+        other.load_state_dict(slam.state_dict())
+        run(other, drive[40:])
+        view = other.local_view(5.0)
+        other.predict((0.5, 0.1))
+        beliefs = other.belief(), other.local_belief()
+        found.append((*beliefs, other.pose, view.mean[:3].copy()))
+    slack = rounding(far, 20)
+    for near, there in zip(*found, strict=True):
+        mean = near if isinstance(near, np.ndarray) else near.mean
+        mean_there = there if isinstance(there, np.ndarray) else there.mean
+        gap = shifted(mean_there, -np.array(far)) - mean
+        np.testing.assert_allclose(gap, 0, atol=slack, rtol=0)
+    for near, there in zip(found[0][:2], found[1][:2], strict=True):
+        np.testing.assert_allclose(
+            there.covariance, near.covariance, rtol=1e-9, atol=1e-12
+        )
 
 
 def test_a_part_of_the_belief_is_that_part_of_the_whole(driven):

@@ -25,6 +25,7 @@ from ...models.rigid_motion import (
     compose,
     invariant_covariance,
     points_of,
+    seen_from,
     state_of,
 )
 from ...support import argument_checks
@@ -66,6 +67,7 @@ class SubmapGraph:
     def pose(self) -> Array:
         """(x, y, θ) of the robot in the world, without a join, shape (3,)."""
         x, y, heading = compose(self.chain.pose, self.active.pose)[0]
+        x, y = np.add(self.chain.origin, (x, y))
         return np.array([x, y, wrap_angle(float(heading))])
 
     def belief(self, ids: tuple[int, ...], *, remember: bool) -> Belief:
@@ -88,8 +90,7 @@ class SubmapGraph:
         world = Gaussian(self.chain.pose, self.chain.covariance)
         local = self.active.gaussian()
         fused = fuse(world, local, self.active.frame, (NO_SLOTS, NO_SLOTS))
-        ids = self.active_ids()
-        return part_of(fused, self._active_slots, self.index.slots_of(ids), ids)
+        return self._belief(fused, self._active_slots, self.active_ids())
 
     def active_ids(self) -> tuple[int, ...]:
         """Return the landmarks of the active submap."""
@@ -179,7 +180,13 @@ class SubmapGraph:
         fused = fuse(world, active.gaussian(), active.frame, (in_world, in_local))
         fused = with_uncertain_start(fused, *self.chain.start)
         order = np.concatenate([closed, np.delete(slots, in_local)])
-        return part_of(fused, order, self.index.slots_of(ids), ids)
+        return self._belief(fused, order, ids)
+
+    def _belief(self, map_: Gaussian, order: IntArray, ids: tuple[int, ...]) -> Belief:
+        """Return a part of a map, in the coordinates of the world."""
+        mean = seen_from(-self.chain.origin, map_.mean)
+        map_ = map_._replace(mean=mean)
+        return part_of(map_, order, self.index.slots_of(ids), ids)
 
 
 # --------------------------------------------------------------------------------------
@@ -494,11 +501,12 @@ class ClosingRule(NamedTuple):
 
 
 class Chain:
-    """The frame of the active submap in the world, without a join.
+    """The frame of the active submap, without a join.
 
     The frame is the composition of the last poses of all submaps since the start of the
     run or the last join.  Its covariance is consistent, but does not account for loops
-    closed since then.
+    closed since then.  All frames, and the joined map, are relative to the position of
+    the start: a map that turns about a far origin loses its digits.
 
     Parameters
     ----------
@@ -507,10 +515,12 @@ class Chain:
     """
 
     def __init__(self, pose: Array, covariance: Array) -> None:
-        self.start = (pose.copy(), covariance.copy())
+        #: Position of the start in the world, shape (2,) [m].
+        self.origin = pose[:2].copy()
+        self.start = (np.array([0.0, 0.0, pose[2]]), covariance.copy())
         self.pose, self.covariance = self.start
         #: Frames of the last join, shape (J + 1, 3).
-        self.joined = pose[None].copy()
+        self.joined = self.pose[None].copy()
 
     def extend(self, pose: Array, covariance: Array) -> None:
         """Append a submap by its last pose, shape (3,), and that pose's covariance."""
@@ -525,8 +535,9 @@ class Chain:
 
     def state_dict(self) -> dict[str, Array]:
         """Return copies of the whole state, as arrays."""
+        pose, covariance = self.start
         return {
-            "start": np.vstack(self.start),
+            "start": np.vstack([seen_from(-self.origin, pose), covariance]),
             "present": np.vstack([self.pose, self.covariance]),
             "joined": self.joined.copy(),
         }
