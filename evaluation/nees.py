@@ -27,7 +27,7 @@ from ..estimator.support.argument_checks import one_of
 SINGULAR = 1e-10
 
 _ROUNDING = 1e-9  # of eigenvalues of correlations, per row
-_ROUNDED = 1e-14  # share of the variance of x that counts as zero for y, or reverse
+_ROUNDED = 1e-14  # share of the larger variance of x and y that counts as zero
 _FEW = 4  # up to this size, all covariances are factored together
 
 
@@ -315,17 +315,25 @@ def _in_frame(
 
 
 def _without_rounding(covariances: Array) -> Array:
-    """Return covariances with the variance 0 of x or y where rounding made another one.
+    """Return covariances without the position's variances where they are rounding.
 
-    A robot without noise to its side has none along y at first.  A filter that rotates
-    covariances reports about 1e-18 times that along x.
+    A robot without noise to its side is certain of its y at first, but for the heading.
+    A filter that rotates covariances, or solves for them, makes about 1e-18 times the
+    variance of x of this zero, in any direction.  Therefore, the least variance of the
+    position given the heading decides.
     """
-    variances = np.diagonal(covariances, axis1=-2, axis2=-1)[..., :2]
-    rounded = variances < _ROUNDED * variances.max(axis=-1, keepdims=True)
+    P = covariances[..., :3, :3]
+    heading = P[..., 2, 2]
+    inverse = np.divide(1, heading, out=np.zeros(heading.shape), where=heading > 0)
+    given = P[..., :2, :2] - P[..., :2, 2:] * P[..., 2:, :2] * inverse[..., None, None]
+    x, y = given[..., 0, 0], given[..., 1, 1]
+    largest = np.maximum(P[..., 0, 0], P[..., 1, 1])
+    area = x * y - given[..., 0, 1] * given[..., 1, 0]
+    rounded = area < _ROUNDED * largest * (x + y)
     if not rounded.any():
         return covariances
     cleared = covariances.copy()
-    cleared[..., [0, 1], [0, 1]] = np.where(rounded, 0.0, variances)
+    cleared[rounded, :2, :2] = 0.0
     return cleared
 
 

@@ -133,6 +133,17 @@ def test_a_variance_of_rounding_beside_that_of_the_other_axis_gives_no_nees(
     np.testing.assert_array_equal(np.isfinite(nees), [False, False, True])
 
 
+def test_a_position_certain_in_a_slanted_direction_has_no_nees():
+    """A certain y seen along a heading that is a little off, rounded by a solution."""
+    rng = np.random.default_rng(4)
+    basis = np.zeros((2000, 3, 2))
+    basis[:, 0, 0] = basis[:, 2, 1] = 0.01
+    basis[:, 1] = 0.01 * 10.0 ** rng.uniform(-8, 0, (2000, 2))
+    covariances = basis @ basis.mT * (1 + 1e-16 * rng.standard_normal((2000, 3, 3)))
+    poses = np.zeros((2000, 3))
+    assert np.isnan(pose_nees(poses + 0.01, poses, covariances, frame="additive")).all()
+
+
 @pytest.mark.parametrize(
     "function", [pose_nees, position_nees, state_nees, landmark_nees]
 )
