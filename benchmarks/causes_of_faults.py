@@ -34,6 +34,8 @@ from slamgym.sim_configs import Scenario, load_scenario
 Array = NDArray[np.float64]
 TEXTBOOK = Path(__file__).parents[1] / "examples" / "05_your_own_estimator.py"
 MODEL, COVARIANCE, CANNOT_TELL = "wrong model", "wrong covariance", "cannot tell"
+#: A fault of the covariances that only the map shows.
+WRONG_COVARIANCES_OF_MAPS = "map: scale: ", "map: covariances between "
 
 
 def mirrored(runs: Any) -> Any:
@@ -570,6 +572,8 @@ def rating(fault: Fault, entry: dict[str, Any]) -> str:
     """Rate an answer: "right", "undecided" or "wrong"."""
     cause = entry["diagnosis"]["cause"]
     is_accepted = entry["verdict"] in ("consistent", "nearly consistent")
+    if entry["diagnosis"]["sentence"].startswith(WRONG_COVARIANCES_OF_MAPS):
+        cause = COVARIANCE
     if cause in fault.right or (is_accepted and cause in ("honest", CANNOT_TELL)):
         return "right"
     return "undecided" if cause == CANNOT_TELL else "wrong"

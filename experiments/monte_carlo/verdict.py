@@ -522,6 +522,7 @@ def _failed(label: str, entry: Mapping[str, Any], runs: int) -> str:
 CONVENTION = "convention"
 #: The cause where the map alone is rejected.
 MAP = "map"
+_WRONGLY = "; the filter computes or reports them wrongly"
 _MOSTLY = 0.5  # share of the squared errors that an offset makes
 _NEARLY = 1.5  # ratio of a landmark that agrees, beside others that do not
 _ALIKE = 2.0  # largest by smallest ratio of landmarks with one scale
@@ -601,7 +602,7 @@ def _common_cause(maps: MapReport, alone: Array, whole: str) -> str:
         size = "large" if np.median(alone) < 1 else "small"
         return (
             f"scale: the covariances are too {size}; the squared errors of the "
-            f"landmarks are {_range(alone)} times what they state, {whole}."
+            f"landmarks are {_range(alone)} times what they state, {whole}{_WRONGLY}."
         )
     agree = f"the squared errors of each landmark are {_range(alone)} times what"
     if alone.min() <= 1 / _NEARLY or alone.max() >= _NEARLY:
@@ -610,9 +611,11 @@ def _common_cause(maps: MapReport, alone: Array, whole: str) -> str:
             "landmark explains this."
         )
     if low <= ratios.min() and ratios.max() <= high:
-        return f"covariances between the landmarks: {agree} they state, {whole}."
+        between = "covariances between the landmarks"
+        return f"{between}: {agree} they state, {whole}{_WRONGLY}."
     from_robot = f"seen from the robot, they are {_range(ratios)} times"
-    return f"covariances between pose and map: {agree} they state, but {from_robot}."
+    between = "covariances between pose and map"
+    return f"{between}: {agree} they state, but {from_robot}{_WRONGLY}."
 
 
 def _of_runs(maps: MapReport) -> str:
@@ -708,7 +711,7 @@ def diagnosis_of(
     if found.cause != HONEST or verdict.word == CONSISTENT:
         return found
     failed, runs = len(scores.failures), len(scores.good)
-    why = "the errors agree with the covariances so far, and more runs are needed"
+    why = "no test shows a cause so far, and more runs are needed"
     if failed:
         why = f"{failed} of {runs} runs failed; the others are honest"
     elif verdict.word == NEARLY:

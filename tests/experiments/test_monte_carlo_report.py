@@ -183,7 +183,9 @@ def test_a_map_of_wrong_scale_is_refused_by_name(factor, size):
     assert not entry["accepted"]
     assert "of the pose agree with the covariances (5 %), but" in entry["reason"]
     assert entry["diagnosis"]["cause"] == "map"
-    assert f"scale: the covariances are too {size}" in entry["diagnosis"]["sentence"]
+    cause = entry["diagnosis"]["sentence"]
+    assert f"scale: the covariances are too {size}" in cause
+    assert cause.endswith("; the filter computes or reports them wrongly.")
     assert entry["decisions"]["final_step"]["accepted"]
 
 
