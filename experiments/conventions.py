@@ -6,7 +6,7 @@ in every other convention, and names the one that makes their errors honest, or 
 smaller. An honest filter has nothing to name, nor has one that is wrong in any reading.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import permutations
 from typing import Any, NamedTuple
 
@@ -26,6 +26,7 @@ _STEPS, _SHIFT = 24, 3
 #: An honest square is within a factor _NEAR of 1 or _ERRORS standard errors, not beyond
 #: the factor _FAR.
 _NEAR, _FAR, _ERRORS = 1.5, 2.5, 3.0
+_ROUNDED = 1e-9  # of a pose [m, m, rad]
 _GAIN = 1.0  # of log-likelihood of a pose [nats]
 #: NEES / 3 of a drive that another truth may fit, and how many of them are compared.
 _LOST, _MOST_LOST = 10.0, 50
@@ -69,6 +70,7 @@ def mistake_in(
     frame: str = "additive",
     *,
     decides: str = "invariant",
+    truth_at: Callable[[float], Array] | None = None,
 ) -> str:
     """Return the convention that poses of B drives break as a sentence; empty if none.
 
@@ -84,6 +86,9 @@ def mistake_in(
         The error whose covariance the file is declared to hold.
     decides : {"invariant", "additive"}
         The error whose NEES counts where covariances are of the additive error.
+    truth_at : callable, optional
+        ``truth_at(steps)`` returns the true poses some steps later (B, T, 3), nan where
+        unknown. By default they are interpolated.
 
     Examples
     --------
@@ -94,13 +99,14 @@ def mistake_in(
     >>> print(mistake_in(truth, poses, claims, truth[:, 0]))
     standard deviations in place of variances: read so, NEES / 3 is 1.0..., not ...
     """
-    if np.array_equal(truth, poses, equal_nan=True):
+    if _are_same(truth, poses):
         return "the poses are the true ones to the last digit, not estimates."
     drives = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))[:MOST_DRIVES]
     if not len(drives) or truth.shape[1] < 2:
         return ""
     posed = truth[drives], poses[drives], claims[drives]
-    exact, read = _all_readings(*posed, starts[drives], _Errors(frame, decides))
+    later = None if truth_at is None else lambda steps: truth_at(steps)[drives]
+    exact, read = _all_readings(*posed, starts[drives], _Errors(frame, decides, later))
     (declared, *its_own), others = read[0], read[1:]
     before = _fit(exact, declared)
     if before.is_honest:
@@ -118,11 +124,20 @@ def mistake_in(
     return _nearer(exact, [own[0] for own in others], before)
 
 
+def _are_same(truth: Array, poses: Array) -> bool:
+    """Whether poses are the true ones, but for the rounding of an interpolation."""
+    gaps = abs(rigid_motion.additive_error(truth, poses))
+    known = np.isfinite(gaps)
+    return bool(known.any() and (gaps[known] < _ROUNDED).all())
+
+
 class _Errors(NamedTuple):
     """The error of the covariances in a file, and the one whose NEES counts."""
 
     frame: str
     decides: str
+    #: As in `mistake_in`.
+    truth_at: Callable[[float], Array] | None = None
 
 
 def _all_readings(
@@ -304,10 +319,23 @@ FRAMES = {
 _LINEAR = {
     "headings in degrees instead of radians": _TURN,
     "headings that grow clockwise": np.diag([1.0, 1.0, -1.0]),
+    "y to the right of x": np.diag([1.0, -1.0, 1.0]),
+    "y to the right of x, and headings that grow clockwise": np.diag([1.0, -1.0, -1.0]),
     **_ORDERS,
+}
+_TURNED = {
+    np.pi / 2: "headings that are 90° too small",
+    np.pi: "headings that are 180° off",
+    -np.pi / 2: "headings that are 90° too large",
 }
 #: Metres.
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
+#: Metres, of the roots of the variances of positions.
+_COVARIANCE_UNITS = {
+    what: np.diag([scale, scale, 1.0])
+    for unit, size in (("centimetres", 1e-2), ("millimetres", 1e-3))
+    for what, scale in ((unit, size), (f"metres, but poses in {unit}", 1 / size))
+}
 _ALIKE = 0.1  # logarithm of two scales that are the same
 _FINEST = 0.15  # part of a step by which a shift differs from whole steps
 
@@ -324,6 +352,9 @@ def _pose_readings(
     flipped = np.diag([1.0, 1.0, -1.0])
     for name, matrix in _LINEAR.items():
         yield name, poses @ matrix.T, covariances, matrix
+    for angle, name in _TURNED.items():
+        turned = np.concatenate([poses[..., :2], poses[..., 2:] + angle], axis=-1)
+        yield name, turned, covariances, np.eye(3)
     compass = poses @ flipped + [0, 0, np.pi / 2]
     yield "headings clockwise from the y axis", compass, covariances, flipped
     turn = _rotations(-poses[..., 2])
@@ -388,6 +419,12 @@ def _between_steps(
     poses, claims = estimates
     offsets = np.arange(-10 * reach + 1, 10 * reach) / 10
     moved = [_truth_at(truth, steps - offset) for offset in offsets]
+    if of.truth_at is not None:
+        known = [of.truth_at(-float(offset))[:, steps] for offset in offsets]
+        moved = [
+            np.where(np.isfinite(exact), exact, between)
+            for exact, between in zip(known, moved, strict=True)
+        ]
     gaps = [np.nanmean(np.square(each - poses)[..., :2]) for each in moved]
     best = int(np.argmin(gaps))
     offset = float(offsets[best])
@@ -478,13 +515,14 @@ def _readings(
     yield read("", claims)
     if name:
         yield read("", jacobian @ claims @ np.swapaxes(jacobian, -1, -2))
-    is_diagonal = not np.triu(claims, 1).any()  # as in no covariance of another error
-    for kind, title in FRAMES.items():
-        if kind != of.frame and not is_diagonal:
-            yield read(f"covariances of {title}", claims, kind)
-    for what, matrices, kind in () if is_diagonal else _transported(claims, poses):
-        yield read(what, matrices, kind)
+    if np.triu(claims, 1).any():  # not diagonal, as in no covariance of another error
+        others = [kind for kind in FRAMES if kind != of.frame]
+        found = [(f"covariances of {FRAMES[kind]}", claims, kind) for kind in others]
+        for what, matrices, kind in (*found, *_transported(claims, poses)):
+            yield read(what, matrices, kind)
     yield read("covariances with headings in degrees", _TURN @ claims @ _TURN)
+    for what, D in _COVARIANCE_UNITS.items():
+        yield read(f"covariances with positions in {what}", D @ claims @ D)
     for order, matrix in _ORDERS.items():
         yield read(f"covariances with {order}", matrix @ claims @ matrix.T)
     xx, xy, xt, yy, yt, tt = np.moveaxis(claims[..., *np.triu_indices(3)], -1, 0)

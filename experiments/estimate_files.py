@@ -359,6 +359,12 @@ def _of_tum(path: Path) -> Estimate:
     is_spatial = False
     if entries.shape[1] in (21, 36):  # of x, y, z, roll, pitch, yaw
         whole = square(entries, 6)
+        variances = np.einsum("tii->ti", whole)
+        if variances.any() and not variances[:, [0, 1, 5]].any():
+            raise lines[0].error(
+                "a covariance of x, y, z, roll, pitch, yaw",
+                "variances of 0 for x, y and yaw; write positions before rotations",
+            )
         is_spatial = bool((whole[:, [2, 3, 4], [2, 3, 4]] > 0).all(axis=1).any())
         is_spatial &= _leaves_its_plane(table[:, 1:8])
         entries = whole[:, [0, 1, 5]][:, :, [0, 1, 5]].reshape(-1, 9)

@@ -8,7 +8,8 @@ and the report are those of a Monte Carlo. `read_estimates` reads the files.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import groupby, islice
 from os import PathLike
 from pathlib import Path
@@ -78,6 +79,7 @@ _SYMMETRIC = 1e-6  # relative difference of two entries
 _INDEFINITE = -1e-9  # eigenvalue of correlations
 _NEAR = 1.5  # a mean NEES / 3 that an honest study may have
 _TIME_UNITS = {"nanoseconds": 1e9, "microseconds": 1e6, "milliseconds": 1e3}
+_COARSER = 1.5  # ratio of intervals
 _ROUNDED = 1e-6  # of a time stamp in nanoseconds since 1970 [s]
 _ASIDE, _ASIDE_GAIN = 0.01, 4.0  # of intervals of time, and of errors
 
@@ -158,8 +160,9 @@ def judge(
         for label, files in chunk.estimates.items():
             parts[label].append(_measured(chunk, files, frame, align))
     decides = "additive" if covariances == "additive" else "invariant"
+    notes: list[str] = []
     if covariances is None and not task.is_own:
-        decides = _deciding(parts)
+        decides, notes = _deciding(parts)
     mistakes = {
         label: _mistakes(each, task, frame, decides) for label, each in parts.items()
     }
@@ -172,7 +175,7 @@ def judge(
         "mistakes": json.dumps(mistakes),
         "alignment": "fitted" if align == "fit" else "given" if align else "",
         "frame": decides,
-        "notes": json.dumps(task.notes),
+        "notes": json.dumps([*task.notes, *notes]),
         **provenance(command or f"judge({estimates!r}, {drives!r}, truth={truth!r})"),
     }
     blocks = {k: [part.block for part in each] for k, each in parts.items()}
@@ -189,6 +192,8 @@ class _Chunk(NamedTuple):
     noise: Array
     #: Seconds of a step.
     dt: float = 1.0
+    #: True poses of all drives some steps later, nan where unknown.
+    truth_at: Callable[[float], Array] | None = None
 
 
 class _Task(NamedTuple):
@@ -213,6 +218,8 @@ class _Part(NamedTuple):
     block: Block
     #: Truth, poses and covariances as in the files, and starts.
     arrays: tuple[Array, Array, Array, Array]
+    #: See `_Chunk`.
+    truth_at: Callable[[float], Array] | None = None
 
 
 # --------------------------------------------------------------------------------------
@@ -347,13 +354,15 @@ def _paths(truth: Place | Sequence[Place], sources: dict[str, list[Path]]) -> _T
         for label in found:
             files: list[Estimate | str] = []
             poses = np.full((len(names), count, 3), np.nan)
+            clocks = []
             for row, name in enumerate(names):
                 if (label, name) not in inside:
                     files.append(NO_FILE)
                     continue
-                estimate, exact, *_ = inside[label, name]
+                estimate, exact, times, *_ = inside[label, name]
                 few = np.linspace(0, len(exact) - 1, count).round().astype(int)
                 poses[row] = exact[few]
+                clocks.append((row, times[few], true[name]))
                 files.append(estimate.at(few)._replace(times=None))
             empty = np.zeros((len(names), count, 0, 2))  # of a world without landmarks
             runs = SimulatedRuns(
@@ -365,10 +374,21 @@ def _paths(truth: Place | Sequence[Place], sources: dict[str, list[Path]]) -> _T
                 initial_poses=poses[:, 0],
             )
             noise = np.zeros((len(names), len(CHANNELS), len(MOMENTS)))
-            yield _Chunk(runs, {label: files}, _NO_BOUND, noise)
+            truth_at = partial(_truth_at, poses, clocks)
+            yield _Chunk(runs, {label: files}, _NO_BOUND, noise, truth_at=truth_at)
 
     notes = _notes(inside.values())
     return _Task(Path(places[0]).stem, "", 0, names, chunks(), notes)
+
+
+def _truth_at(
+    truth: Array, clocks: Sequence[tuple[int, Array, Array]], steps: float
+) -> Array:
+    """Return the true poses (B, K, 3) of drives some steps after their times."""
+    later = np.full_like(truth, np.nan)
+    for row, times, path in clocks:
+        later[row] = poses_at(times + steps * np.median(np.diff(times)), path)
+    return later
 
 
 class _Inside(NamedTuple):
@@ -376,10 +396,14 @@ class _Inside(NamedTuple):
 
     estimate: Estimate
     truth: Array
+    #: Shape (T,) [s].
+    times: Array
     #: Poses of the file that have none.
     left_out: int = 0
     #: Unit of the time stamps, if they were converted.
     unit: str = ""
+    #: Whether the truth has longer intervals.
+    is_coarse: bool = False
 
 
 def _within(estimate: Estimate, path: Array) -> _Inside:
@@ -393,7 +417,7 @@ def _within(estimate: Estimate, path: Array) -> _Inside:
                 f"{estimate.file} has no times and must have as many poses as its "
                 f"truth, {len(path)}, got {len(estimate.poses)}"
             )
-        return _Inside(estimate, path[:, 1:])
+        return _Inside(estimate, path[:, 1:], path[:, 0])
     places = [f"{estimate.file}, pose {k}" for k in range(len(estimate.poses))]
     rows = np.column_stack([estimate.times, estimate.poses])
     estimate = estimate.at(growing_rows(rows, places))
@@ -410,7 +434,10 @@ def _within(estimate: Estimate, path: Array) -> _Inside:
             f"{due[-1]:.10g} s; write both in seconds of one clock"
         )
     left_out = len(times) - len(inside)
-    return _Inside(estimate.at(inside), exact[inside], left_out, unit)
+    kept = estimate.at(inside)
+    spacings = [float(np.median(np.diff(each))) for each in (due, times[inside])]
+    is_coarse = spacings[0] > _COARSER * spacings[1]
+    return _Inside(kept, exact[inside], times[inside], left_out, unit, is_coarse)
 
 
 def _in_seconds(times: Array, poses: Array, path: Array) -> tuple[Array, str]:
@@ -461,6 +488,12 @@ def _notes(found: Iterable[_Inside]) -> tuple[str, ...]:
             f"near their times and are left out; the first file is "
             f"{short[0].estimate.file}, with {short[0].left_out}."
         )
+    coarse = [each for each in every if each.is_coarse]
+    if coarse:
+        notes.append(
+            f"the truth of {coarse[0].estimate.file} has fewer poses than the "
+            "estimate: between them it is interpolated, which adds to the errors."
+        )
     flat = [each for each in every if each.estimate.is_spatial]
     if flat:
         notes.append(
@@ -507,7 +540,8 @@ def _measured(
         if problem := _add_map(block, run, chunk.runs, each, moved[run, -1], unsure):
             failures[run] = Failure(steps - 1, problem)
     write_failures(block, failures)
-    return _Part(block, (truth, poses, claims, chunk.runs.initial_poses))
+    arrays = truth, poses, claims, chunk.runs.initial_poses
+    return _Part(block, arrays, chunk.truth_at)
 
 
 def _unmatched(estimate: Estimate, steps: int, dt: float) -> str:
@@ -541,6 +575,7 @@ def _invalid(
     """Find runs with something else than covariances."""
     gaps = abs(claims - np.swapaxes(claims, -1, -2)).max(axis=(2, 3))
     sizes = abs(claims).max(axis=(1, 2, 3))[:, None]
+    nothing = np.broadcast_to(sizes == 0, gaps.shape)
     variances = np.einsum("rsii->rsi", additive)
     negative = (variances < 0).any(axis=2)
     deviations = np.sqrt(np.where(variances > 0, variances, np.inf))
@@ -550,6 +585,7 @@ def _invalid(
     found: dict[int, Failure] = {}
     for reason, wrong in (
         ("an entry of the covariance is not finite", ~np.isfinite(gaps)),
+        ("all entries of its covariances are 0", nothing),
         ("the covariance is not symmetric", gaps > _SYMMETRIC * sizes),
         ("a variance is negative", negative),
         ("the covariance is indefinite: a correlation is too large", indefinite),
@@ -628,27 +664,38 @@ def _add_map(
     return ""
 
 
-def _deciding(parts: Mapping[str, Sequence[_Part]]) -> str:
-    """Return the error that decides where none is declared.
+def _deciding(parts: Mapping[str, Sequence[_Part]]) -> tuple[str, list[str]]:
+    """Return the error that decides where none is declared, and what that hides.
 
     It is the one that rejects fewer estimators. A choice by the mean NEES alone would
     reject an honest estimator in more than 5 % of cases, because it may choose the
     error in which the estimator is not honest.
     """
-    rejected, gaps = {}, {}
+    rejected: dict[str, dict[str, bool]] = {}
+    gaps = {}
     for frame in ("invariant", "additive"):
-        scores = [
-            np.concatenate([part.block[f"pose_nees_{frame}"] for part in each])[:, 1:]
-            for each in parts.values()
-        ]
-        rejected[frame] = sum(map(_is_rejected, scores))
-        known = np.concatenate([each[np.isfinite(each)] for each in scores])
+        scores = {
+            label: np.concatenate([p.block[f"pose_nees_{frame}"] for p in each])[:, 1:]
+            for label, each in parts.items()
+        }
+        rejected[frame] = {label: _is_rejected(nees) for label, nees in scores.items()}
+        known = np.concatenate([each[np.isfinite(each)] for each in scores.values()])
         mean = float(known.mean()) / POSE_FREEDOM if len(known) else 1.0
         gaps[frame] = abs(np.log(max(mean, 1e-300)))
-    if rejected["additive"] != rejected["invariant"]:
-        return min(rejected, key=lambda frame: rejected[frame])
+    counts = {frame: sum(each.values()) for frame, each in rejected.items()}
     is_additive = gaps["additive"] < min(gaps["invariant"], np.log(_NEAR))
-    return "additive" if is_additive else "invariant"
+    if counts["additive"] != counts["invariant"]:
+        is_additive = counts["additive"] < counts["invariant"]
+    chosen, other = "additive", "invariant"
+    if not is_additive:
+        chosen, other = other, chosen
+    return chosen, [
+        f"{label}: its covariances agree with the {other} error, but not with the "
+        f"{chosen} one, and one error decides for all estimators; judge {label} by "
+        "itself."
+        for label, is_bad in rejected[chosen].items()
+        if is_bad and not rejected[other][label]
+    ]
 
 
 def _is_rejected(nees: Array) -> bool:
@@ -677,11 +724,14 @@ def _mistakes(parts: Sequence[_Part], task: _Task, frame: str, decides: str) -> 
     counts = np.cumsum([len(part.arrays[0]) for part in parts])
     few = parts[: int(np.searchsorted(counts, conventions.MOST_DRIVES)) + 1]
     first = [np.concatenate([part.arrays[place] for part in few]) for place in range(4)]
+    (truth_at, *others) = [part.truth_at for part in few]
     ratios = np.concatenate([p.block["pose_nees_invariant"] for p in parts]) / 3
     return (
         conventions.swapped_drives(truth, poses, additive, task.names)
         or conventions.mistake_in(
-            first[0], first[1], first[2], first[3], frame, decides=decides
+            *(first[0], first[1], first[2], first[3], frame),
+            decides=decides,
+            truth_at=None if others else truth_at,
         )
         or conventions.stray_poses(ratios, task.names)
     )

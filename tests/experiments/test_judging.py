@@ -273,6 +273,27 @@ WRONG = {
         lambda x, P: (x * [0.4, 0.4, 1], P),
         "positions in a unit of 2.5 m: ",
     ),
+    "another axis": (lambda x, P: (x * [1, -1, 1], P), "y to the right of x: "),
+    "left-handed": (
+        lambda x, P: (x * [1, -1, -1], P * np.outer([1, -1, -1], [1, -1, -1])),
+        "y to the right of x, and headings that grow clockwise: ",
+    ),
+    "backward": (
+        lambda x, P: (x + np.array([0, 0, np.pi]), P),
+        "headings that are 180° off: ",
+    ),
+    "sideways": (
+        lambda x, P: (x + np.array([0, 0, np.pi / 2]), P),
+        "headings that are 90° too large: ",
+    ),
+    "covariance in centimetres": (
+        lambda x, P: (x, P * np.outer([100, 100, 1], [100, 100, 1])),
+        "covariances with positions in centimetres: ",
+    ),
+    "covariance in metres": (
+        lambda x, P: (x, P / np.outer([100, 100, 1], [100, 100, 1])),
+        "covariances with positions in metres, but poses in centimetres: ",
+    ),
     "transposed transport": (
         lambda x, P: (x, transposed(x, P)),
         "covariances of the additive error transported by Jᵀ P J instead of J P Jᵀ: ",
@@ -456,6 +477,10 @@ BROKEN = {
     ),
     "not symmetric": (changed(6, "0.5"), "the covariance is not symmetric"),
     "negative": (changed(5, "-1"), "a variance is negative"),
+    "none": (
+        lambda lines: [",".join([*line.split(",")[:5], *"000000"]) for line in lines],
+        "all entries of its covariances are 0",
+    ),
     "unknown landmark": (
         lambda lines: [*lines, "landmark,6,0,0,1,0,1"],
         "its map has landmark 6, the world has 6 from 0 on",
@@ -735,9 +760,9 @@ def test_an_indefinite_covariance_is_a_failed_run(elsewhere):
     assert failed["step"] == 7
 
 
-def additive_studies(rng, runs, steps=30):
+def additive_studies(rng, runs, steps=30, turn=0.1):
     """Return truth, estimates and covariances: errors are exactly additive."""
-    turns = rng.normal(0, 0.1, (runs, steps))
+    turns = rng.normal(0, turn, (runs, steps))
     heading = np.cumsum(turns, axis=1)
     place = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], -1), axis=1)
     truth = np.concatenate([place, heading[..., None]], axis=-1)
@@ -752,9 +777,9 @@ def additive_studies(rng, runs, steps=30):
 def additive(tmp_path):
     """Return a function that writes additive studies: estimates, and truth as TUM."""
 
-    def write(rng, late=0.0):
+    def write(rng, late=0.0, turn=0.1):
         for k, (path, poses, P) in enumerate(
-            zip(*additive_studies(rng, 60), strict=True)
+            zip(*additive_studies(rng, 60, turn=turn), strict=True)
         ):
             half, zero = path[:, 2] / 2, np.zeros(30)
             columns = [np.arange(30) - late, *path[:, :2].T, zero, zero, zero]
@@ -788,9 +813,9 @@ def test_the_error_that_rejects_decides_only_if_both_reject(honest):
     uneven = nees * np.where(np.arange(21) > 10, 1.7, 0.3)
     uneven *= 3 / uneven[:, 1:].mean()
     block = {f"pose_nees_{honest}": nees, f"pose_nees_{other}": uneven}
-    assert judging._deciding({"mine": [judging._Part(block, ())]}) == honest
+    assert judging._deciding({"mine": [judging._Part(block, ())]}) == (honest, [])
     block[f"pose_nees_{honest}"] = nees * np.where(np.arange(21) > 10, 1.8, 0.3)
-    assert judging._deciding({"mine": [judging._Part(block, ())]}) == other
+    assert judging._deciding({"mine": [judging._Part(block, ())]}) == (other, [])
 
 
 def test_an_estimator_that_diverges_does_not_choose_the_error_of_others():
@@ -798,13 +823,66 @@ def test_an_estimator_that_diverges_does_not_choose_the_error_of_others():
     mine = {"pose_nees_additive": nees, "pose_nees_invariant": 1.3 * nees}
     lost = {name: 1e4 * values for name, values in mine.items()}
     parts = {"mine": [judging._Part(mine, ())], "lost": [judging._Part(lost, ())]}
-    assert judging._deciding(parts) == "additive"
+    assert judging._deciding(parts) == ("additive", [])
 
 
-def test_a_clock_that_is_half_a_step_off_is_named(additive):
-    estimates, truth = additive(np.random.default_rng(9), late=0.5)
+def test_estimators_of_two_conventions_are_told_that_one_error_decides():
+    """An estimator that is honest in the other error is to be judged by itself."""
+    nees = np.random.default_rng(7).chisquare(3, (60, 21))
+    parts = {
+        label: [judging._Part({f"pose_nees_{one}": nees, f"pose_nees_{two}": far}, ())]
+        for label, one, two, far in (
+            ("a", "additive", "invariant", 2 * nees),
+            ("b", "invariant", "additive", 3 * nees),
+        )
+    }
+    frame, (note,) = judging._deciding(parts)
+    label, other = ("a", "additive") if frame == "invariant" else ("b", "invariant")
+    assert note == (
+        f"{label}: its covariances agree with the {other} error, but not with the "
+        f"{frame} one, and one error decides for all estimators; judge {label} by "
+        "itself."
+    )
+
+
+@pytest.mark.parametrize("turn", [0.1, 0.5])
+def test_a_clock_that_is_half_a_step_off_is_named(additive, turn):
+    """Also where the robot turns so much that no interpolated truth is the true one."""
+    estimates, truth = additive(np.random.default_rng(9), late=0.5, turn=turn)
     said = entry_of(judge(estimates, truth=truth))["diagnosis"]["sentence"]
     assert said.startswith("convention: time stamps that are 0.5 steps too late: ")
+
+
+def test_the_truth_given_as_the_estimate_is_named_despite_rounding(elsewhere):
+    mine, truth = elsewhere
+    for path in truth.iterdir():
+        rows = np.loadtxt(path)
+        rows[:, 1:8] = np.loadtxt(mine / path.name)[:, 1:8]
+        np.savetxt(path, rows, fmt="%.17g")
+    said = entry_of(judge(mine, truth=truth))["diagnosis"]["sentence"]
+    assert said.startswith("convention: the poses are the true ones to the last digit")
+
+
+def test_a_truth_with_fewer_poses_than_the_estimate_is_told(elsewhere):
+    mine, truth = elsewhere
+    assert not any("fewer poses" in note for note in notes_of(mine, truth))
+    for path in truth.iterdir():
+        np.savetxt(path, np.loadtxt(path)[::2], fmt="%.17g")
+    assert any("fewer poses than the estimate" in n for n in notes_of(mine, truth))
+
+
+def notes_of(estimates, truth):
+    return summarise_monte_carlo(judge(estimates, truth=truth))["notes"]
+
+
+def test_a_covariance_with_rotations_first_is_refused(elsewhere):
+    mine, truth = elsewhere
+    path = mine / f"drive_{SEED}.tum"
+    rows, whole = np.loadtxt(path), np.zeros((30, 6, 6))
+    whole[:, [2, 3, 4], [2, 3, 4]] = 0.01
+    np.savetxt(path, np.column_stack([rows[:, :8], whole.reshape(30, 36)]), fmt="%.17g")
+    with pytest.raises(ValueError, match=r"line 1: .* write positions before"):
+        judge(mine, truth=truth)
 
 
 def test_one_estimate_and_one_truth_need_no_common_name(elsewhere, tmp_path):
