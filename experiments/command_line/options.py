@@ -227,7 +227,7 @@ class Options:
     def read(self, path: Path, reporter: Reporter) -> "SlamLog":
         """Read a log of any known format, with its truth if that is in another file.
 
-        Notes what the importer omitted, and where the noise is from.
+        Notes what the importer omitted, and where truth and noise are from.
 
         Raises
         ------
@@ -251,6 +251,9 @@ class Options:
             raise BadInputError(f"the log {path} does not fit into memory") from error
         if "left_out" in log.header:
             reporter.note(f"left out of the log: {log.header['left_out']}")
+        found, start = log.header.get("truth", "none"), log.header.get("start_from")
+        if self.truth is None and start == "ground truth" and found != "none":
+            reporter.note(f"truth: {found}; the log starts at its pose")
         if "noise" in log.header and "motion_std" in log.header:
             reporter.note(f"noise {log.header['noise']}")
         return without_identities(log) if self.hide_identities else log

@@ -587,7 +587,7 @@ def test_noise_of_differing_information_is_the_median(file):
         ("ODOMETRY 3 5 1 0 0", "expected information at the end of the line, got none"),
         ("EDGE_SE2 3 5 1 0 0 1 2 0 1 0 1", "expected positive definite information"),
         ("ODOMETRY 3 5 1 0 0 1 0 0 1 0 0", "expected positive definite information"),
-        ("ODOMETRY 3 5 1 0 0 2e154 0 0 1 0 1", "expected smaller information"),
+        ("ODOMETRY 3 5 1 0 0 2e154 0 0 1 0 1", r"expected a number up to 1e\+100"),
         ("LANDMARK 3 7 0 0 1 0 1", "expected a landmark away from its pose"),
     ],
 )

@@ -227,7 +227,7 @@ def test_the_example_of_the_page_runs(folder, monkeypatch, tmp_path):
         ({"measurements": "t,tag,angle,far\n1,4,0,1\n"},
          "measurements.csv, line 1: expected a first row with the columns t, id, bea"),
         ({"measurements": "t,id,x,y\n1,4,0,1\n"},
-         "expected measurements, a table with the columns t, id, bearing, range, one"),
+         r"measurements.csv, line 1: expected a first row .* got 't,id,x,y'"),
         ({"odometry": "t,d,alpha\n1,1,0\n0.5,1,0\n"},
          r"odometry.csv, line 3: expected t >= 1, the time before, got 0.5"),
         ({"odometry": "t,d,alpha\n1,1,0\n2,1\n"},
@@ -246,11 +246,84 @@ def test_the_example_of_the_page_runs(folder, monkeypatch, tmp_path):
         ({"odometry": "1,1,0\n2,1,0\n"},
          "odometry.csv, line 1: expected a first row with the columns t, d, alpha or"),
         ({"odometry": "# motion: arc\n" + ODOMETRY}, "line 1: expected turn-last, mid"),
+        ({"odometry": "t,d,alpha\n50,1,0\n100,1,0\n150,1,0\n"},
+         r"odometry.csv, line 1: expected the unit of t in its name, as 't \[ms\]', 't "
+         r"\[us\]' or 't \[s\]', got steps of 50 without a unit"),
+        ({"odometry": "t,d,alpha\n1e-7,1,0\n2e-7,1,0\n3e-7,1,0\n"}, "steps of 1e-07"),
+        ({"groundtruth": "t,x,y\n0,1,1\n1e5,1,1\n2e5,1,1\n"},
+         r"groundtruth.csv, line 1: expected the unit of t in its name"),
+        ({"measurements": "t,id,bearing,range\n" + "".join(
+            f"{500 * k},4,0,1\n" for k in range(99))},
+         "measurements.csv, line 3: expected readings within .* and in one unit, got 98"
+         " of 99 outside it, the first at t = 500"),
+        ({"measurements": "t,id,bearing,range [ft]\n1,4,0,1\n"},
+         r"line 1: expected a unit of m, .*: convert the column, got 'range \[ft\]'"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_in_a_table_is_named(folder, changes, message):
     with pytest.raises(LogError, match=message):
         own(folder, **changes)
+
+
+@pytest.mark.parametrize("unit", ["ms", "us", "nanoseconds"])
+@pytest.mark.parametrize("form", ["t [{}]", "time_{}"])
+def test_the_unit_of_relative_stamps_is_that_of_the_header(folder, unit, form):
+    scale = {"ms": 1000, "us": 10**6, "nanoseconds": 10**9}[unit]
+
+    def stamped(text):
+        head, *rows = (line.split(",") for line in text.split())
+        rows = [[str(int(t) * scale), *others] for t, *others in rows]
+        return "\n".join(map(",".join, [[form.format(unit), *head[1:]], *rows])) + "\n"
+
+    tables = {"odometry": ODOMETRY, "measurements": MEASUREMENTS, "groundtruth": TRUTH}
+    log = own(folder, **{name: stamped(text) for name, text in tables.items()})
+    assert [event.t for event in log.events] == pytest.approx([0, 1, 1, 2, 3, 3])
+    assert log.ground_truth[:, 0] == pytest.approx([0, 1, 2, 3])
+
+
+POSES = TRUTH.replace("t,x,y,theta", "t,{0}x,{0}y,{0}theta")
+
+
+@pytest.mark.parametrize(
+    ("name", "columns", "is_truth"),
+    [
+        ("poses", "", True),
+        ("odom_poses", "", False),
+        ("ekf", "", False),
+        ("ekf", "true_", True),
+        ("odom_truth", "", True),
+    ],
+)
+def test_poses_in_a_file_named_as_an_estimate_are_no_truth(
+    folder, name, columns, is_truth
+):
+    log = own(folder, **{name: POSES.format(columns)})
+    assert log.start.tolist() == ([5, 6, 0.25] if is_truth else [0, 0, 0])
+    assert log.header["truth"] == (f"{name}.csv" if is_truth else "none")
+    told = f"the poses of {name}.csv, which no name calls the truth: name the columns"
+    assert log.header.get("left_out", "").startswith(told) != is_truth
+
+
+@pytest.mark.parametrize("prefix", ["", "gt_"])
+def test_poses_beside_odometry_are_the_truth_if_a_name_says_so(file, prefix):
+    head = f"t,v,omega,id,bearing,range,{prefix}x,{prefix}y,{prefix}yaw\n"
+    log = read_log(file(head + "0,1,0,4,0,9,5,6,0\n1,1,0,4,0,8,6,6,0\n"))
+    assert log.start.tolist() == ([5, 6, 0] if prefix else [0, 0, 0])
+    assert ("left_out" in log.header) == (not prefix)
+
+
+def test_poses_that_are_given_as_the_truth_are_the_truth(folder, file):
+    place = folder(odometry=ODOMETRY, measurements=MEASUREMENTS, ekf=TRUTH)
+    log = read_log(place, truth=place / "ekf.csv")
+    assert log.ground_truth.tolist() == [
+        [*map(float, row.split(","))] for row in TRUTH.split()[1:]
+    ]
+
+
+def test_commands_name_the_file_that_they_take_for_the_truth(folder, tmp_path):
+    place = folder(odometry=ODOMETRY, measurements=MEASUREMENTS, poses=TRUTH)
+    shown = " ".join(slamgym("replay", place, "--out", tmp_path / "r").output.split())
+    assert "truth: poses.csv; the log starts at its pose" in shown
 
 
 # True paths
@@ -381,6 +454,17 @@ def test_a_folder_without_a_true_path_is_no_truth(folder):
 # What is no log
 
 
+@pytest.mark.parametrize("name", ["Robot1_Odometry.dat", "Barcodes.dat"])
+def test_a_single_file_of_utias_asks_for_its_folder(file, name):
+    with pytest.raises(LogError, match=f"{name}: expected a log, .*: give its folder"):
+        read_log(file("1248272262.1 0.1 0\n1248272262.2 0.1 0\n", name))
+
+
+def test_a_folder_of_unknown_tables_names_them(folder):
+    with pytest.raises(LogError, match=r"got another folder with fahrt.csv: rename"):
+        read_log(folder(fahrt="zeit,weg,winkel\n0,1,2\n"))
+
+
 @pytest.mark.parametrize(
     ("text", "remedy"),
     [
@@ -389,11 +473,14 @@ def test_a_folder_without_a_true_path_is_no_truth(folder):
         (EUROC_HEAD + EUROC_ROWS, "got a path in the format of EuRoC, which --truth r"),
         (ROS, "expected odometry, a table with the columns t, d, alpha or t, v,"),
         ("t,d,alpha\n1,1,0\n", "or give the folder of several such files"),
-        ("odometry,1,1,0,1\n", "line 1: expected # format: slamlog 1, got 'odometry"),
+        ("odometry,1,1,0,1\n", "expected '# format: slamlog 1' above the rows"),
         ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n", "of a planar graph, got 'VERTEX_SE3:QU"),
         ("VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1 0 0\nEDGE_SE2 1 2 1 0 0\n"
          "EDGE_SE2 2 0 -2 0 0\n", "expected readings of landmarks, as a filter has no"),
-        ("1,2,3\n4,5,6\n", "nearest formats are .* csv with named columns"),
+        ("1,2,3\n4,5,6\n", "line 1: expected a first row that names the columns"),
+        ("1 2 3\n4 5 6\n", "folder of a UTIAS data set, got 3 numbers in each row"),
+        ("header: \n  seq: 1\n", r"csv with named col.*\('rostopic echo -p' writes"),
+        ("<log/>\n", "csv with named columns .*, got XML, '<log/>': convert it to"),
         ("EDG_SE2 0 1 1 0 0\n", "the nearest formats are iSAM or g2o text .* and "),
         ("ODOMETRIE 0.1 2 0\n", "the nearest formats are .*Freiburg sensor.dat"),
         ("# only\n% remarks\n", "line 1: expected rows, got comments only"),

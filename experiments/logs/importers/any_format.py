@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -37,6 +38,17 @@ FORMATS = (
     _Format("TUM", "'t x y z qx qy qz qw'", is_log=False),
     _Format("KITTI", "12 numbers of a matrix [R t]", is_log=False),
     _Format("EuRoC", "'#timestamp, p_RS_R_x, …'", ("timestamp",), True, is_log=False),
+)
+#: Files of UTIAS MR.CLAM, whose folder is a log.
+_OF_UTIAS = re.compile(
+    r"Robot\d+_\w+\.dat|Barcodes\.dat|Landmark_Groundtruth\.dat", re.IGNORECASE
+)
+_NUMBERS = "numbers without names"
+#: By which texts begin that are no tables.
+_MARKUP = (
+    (r"[{\[]", "JSON"),
+    (r"<", "XML"),
+    (r"---|[\w-]+:(\s|$)", "YAML ('rostopic echo -p' writes csv)"),
 )
 READERS = {
     "slamlog": slamlog.read_slamlog,
@@ -161,7 +173,7 @@ def read_true_path(path: str | PathLike[str]) -> TruePath:
     path = log_lines.ReadFile(path)
     lines = log_lines.read_lines(path)
     kind, table = _format_of(source, lines)
-    if table is not None and "truth" in table.kinds:
+    if table is not None and (table.has_path or "truth" in table.kinds):
         return _known(TruePath(named_columns.true_path_of(table)), source)
     if kind == "csv" and table is not None:
         raise named_columns.lacking("truth", [table], source)
@@ -169,9 +181,11 @@ def read_true_path(path: str | PathLike[str]) -> TruePath:
         return graph.true_path(log_lines.content_of(lines))
     content = log_lines.content_of(lines)
     numbers = numeric_rows(content)
-    if numbers is not None and (kind != "course" or numbers.shape[1] == 4):
-        if kind == "course":
-            return TruePath(numbers)  # rows t x y θ
+    if numbers is not None and kind == _NUMBERS:
+        if numbers.shape[1] != 4:
+            raise _unnamed(lines)
+        return TruePath(numbers)  # rows t x y θ
+    if numbers is not None and kind != "course":
         return path_of(numbers, kind, content)
     return _known(TruePath(read_log(path).ground_truth), source)
 
@@ -271,7 +285,14 @@ def _format_of_log(
     source: Path, lines: list[log_lines.LogLine]
 ) -> tuple[str, list[named_columns.Table]]:
     """Detect the format of a log; refuse a file that holds a path only."""
+    if _OF_UTIAS.fullmatch(source.name):
+        raise slamlog.LogError(
+            f"{source}: expected a log, got a file of UTIAS MR.CLAM: give its folder, "
+            "which holds odometry, measurements and Barcodes.dat of a drive"
+        )
     kind, table = _format_of(source, lines)
+    if kind == _NUMBERS:
+        raise _unnamed(lines)
     if kind in {known.name for known in FORMATS if not known.is_log}:
         raise lines[0].error(
             "a log of odometry and readings",
@@ -292,15 +313,39 @@ def _format_of(
         return kind, None
     table = named_columns.read_table(source, lines)
     if table is None or not table.kinds >= {"odometry", "measurements"}:
-        numbers = numeric_rows(content)
-        kind = "" if numbers is None else path_format_of(numbers)
+        kind = _format_of_numbers(content, has_names=table is not None)
     if kind or table is not None:
         return kind or "csv", table
     if content[0].text.split(",")[0].strip() in slamlog.ROW_FORMS:
-        raise lines[0].error(slamlog.FORMAT_LINE, log_lines.shown(lines[0].text))
+        wanted = f"{slamlog.FORMAT_LINE!r} above the rows of a slamlog"
+        raise lines[0].error(wanted, log_lines.shown(lines[0].text))
     if all(map(log_lines.is_number, content[0].text.split())):
         return "course", None
     raise _unknown(next(at for at in lines if log_lines.without_comment(at.text)))
+
+
+def _format_of_numbers(content: list[log_lines.LogLine], *, has_names: bool) -> str:
+    """Return the format of a table of numbers; empty if it has no known one."""
+    numbers = numeric_rows(content)
+    if numbers is None:
+        return ""
+    kind = path_format_of(numbers)
+    if kind == "TUM" and has_names and "," in content[0].text:
+        return "EuRoC"  # without velocities
+    if kind or has_names:
+        return kind
+    # In a course, every second row has two numbers.
+    return _NUMBERS if len(numbers) > 1 and numbers.shape[1] > 2 else ""
+
+
+def _unnamed(lines: list[log_lines.LogLine]) -> slamlog.LogError:
+    """Return the error of a table of numbers whose columns have no names."""
+    line = log_lines.content_of(lines)[0]
+    return line.error(
+        "a first row that names the columns, such as 't,d,alpha' or 't,x,y,theta', or "
+        "the folder of a UTIAS data set",
+        f"{len(log_lines.split_fields(line.text))} numbers in each row",
+    )
 
 
 def _kind_by_tag(line: log_lines.LogLine) -> str:
@@ -314,6 +359,13 @@ def _kind_by_tag(line: log_lines.LogLine) -> str:
 
 def _unknown(line: log_lines.LogLine) -> slamlog.LogError:
     """Return the error of an unknown format, with the two that come nearest."""
+    for pattern, name in _MARKUP:
+        if re.match(pattern, line.text):
+            raise line.error(
+                f"a log or a path; the nearest formats are csv with named columns "
+                f"({named_columns.EXPECTED}) and slamlog 1",
+                f"{name}, {log_lines.shown(line.text)}: convert it to such tables",
+            )
     first, *_ = log_lines.split_fields(line.text)
     is_numeric = log_lines.is_number(first)
 

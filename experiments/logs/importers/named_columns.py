@@ -11,8 +11,9 @@ several of four kinds, which its columns tell apart::
     landmarks      id, x, y
 
 Other columns are ignored. `SYNONYMS` lists further names of each column; a unit may
-follow in brackets or after an underscore. Comments ``# key: value`` with the keys of a
-slamlog set the same things.
+follow in brackets or after an underscore. Poses beside odometry, or in a file whose
+name suggests an estimate, are the truth only if a name says so. Comments
+``# key: value`` with the keys of a slamlog set the same things.
 """
 
 import math
@@ -55,11 +56,21 @@ SYNONYMS = {
 _NAMES = {column: names.split() for column, names in SYNONYMS.items()}
 #: Parts of names without a meaning, as in ``field.pose.pose.position.x`` of ROS.
 _IGNORED = {"field", "pose", "twist", "robot", "odom", "odometry", "measured"}
-UNITS = {
-    **dict.fromkeys(("m", "rad", "s", "sec", "m/s", "rad/s", "1", "-", ""), 1.0),
-    **dict.fromkeys(("deg", "degrees", "degree", "°", "deg/s", "°/s"), math.pi / 180),
-    **{"cm": 1e-2, "mm": 1e-3, "km": 1e3, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+#: Words for each unit by its size in SI units.
+_WORDS = {
+    1.0: "m metre metres meter meters m/s rad radian radians rad/s s sec secs second "
+    "seconds 1 -",
+    math.pi / 180: "deg degree degrees ° deg/s °/s",
+    1e-2: "cm",
+    1e-3: "mm ms msec millisecond milliseconds",
+    1e-6: "us µs μs usec microsecond microseconds",
+    1e-9: "ns nsec nanosec nanosecond nanoseconds",
+    1e3: "km",
 }
+UNITS = {word: size for size, words in _WORDS.items() for word in words.split()}
+UNITS[""] = 1.0
+#: Names of t that state its unit themselves.
+_TIMED = ("sec", "secs", "seconds", "step", "k")
 #: The columns of each kind, in the forms that it may have.
 FORMS = {
     "odometry": (("t", "d", "alpha"), ("t", "dx", "dy", "alpha"), ("t", "v", "omega")),
@@ -78,6 +89,9 @@ _STEMS = {
     "truth": "truth|gt",
     "landmarks": "landmark|map|world|beacon",
 }
+#: Names of columns or files that call poses the truth, and of files that do not.
+_TRUE = "truth|true|gt|mocap|vicon|optitrack"
+_ESTIMATED = "odom|estim|slam|ekf|filter|predict|dead|wheel|encoder|imu"
 #: Columns of the files that the documentation names.
 _EXAMPLES = {
     "odometry": "t, d, alpha or t, v, omega",
@@ -88,6 +102,9 @@ _EXAMPLES = {
 #: Stamps beyond these [s] are in other units: no drive is so long, and epoch times
 #: are near 1.7e9 s.
 _HUGE = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
+#: Steps of odometry that are no seconds, and of the truth: a stamp in ms, us or ns [s].
+_SHORTEST, _LONGEST, _LONGEST_OF_TRUTH = 5e-4, 5.0, 60.0
+_FEWEST_INSIDE = 0.1  # share of the readings within the time of the odometry
 #: A first stamp beyond this is an epoch time, which is subtracted [s].
 _EPOCH = 1e8
 TIME_DIGITS = 6
@@ -101,12 +118,21 @@ class Cells(NamedTuple):
     fields: list[str]
 
 
+class Column(NamedTuple):
+    """A column of a table."""
+
+    place: int
+    #: Of its unit in SI units.
+    scale: float
+    #: Whether its name states a unit.
+    has_unit: bool = False
+
+
 class Table(NamedTuple):
     """A file whose first row names its columns."""
 
     file: Path
-    #: Place and scale of each known column.
-    columns: Mapping[str, tuple[int, float]]
+    columns: Mapping[str, Column]
     rows: list[Cells]
     #: Keys of a slamlog in its comments.
     notes: Mapping[str, log_lines.LogLine]
@@ -126,19 +152,31 @@ class Table(NamedTuple):
             return named
         if "t" in there:  # of the robot, not of landmarks
             found.discard("landmarks")
-        has_heading = "theta" in there or "qw" in there
-        if found & {"odometry", "measurements"} and not has_heading:
-            found.discard("truth")
-        return found
+        return found if self.has_truth else found - {"truth"}
+
+    @property
+    def has_path(self) -> bool:
+        """Whether it has the columns of a path, not those of landmarks at times."""
+        there = self.columns.keys()
+        return there >= {"t", "x", "y"} and ("id" not in there or "bearing" in there)
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether it has a path that is the truth by its names."""
+        stem = self.file.stem.lower()
+        if re.search(_TRUE, f"{stem} {self.header.text.lower()}"):
+            return self.columns.keys() >= {"t", "x", "y"}
+        has_odometry = any(self.columns.keys() >= set(f) for f in FORMS["odometry"])
+        return self.has_path and not has_odometry and not re.search(_ESTIMATED, stem)
 
     def number(self, row: Cells, column: str) -> float:
         """Read a cell in SI units; raise LogError unless it is a finite number."""
-        place, scale = self.columns[column]
+        place, scale, _ = self.columns[column]
         return row.line.to_real(row.fields[place]) * scale
 
     def filled(self, columns: Iterable[str]) -> Iterator[Cells]:
         """Yield the rows in which not all of some columns are empty."""
-        places = [self.columns[column][0] for column in columns if column != "t"]
+        places = [self.columns[column].place for column in columns if column != "t"]
         for row in self.rows:
             if any(row.fields[place].lower() not in _EMPTY for place in places):
                 yield row
@@ -155,6 +193,16 @@ class Table(NamedTuple):
         scale = next((scale for limit, scale in _HUGE if size > limit), 1.0)
         return times * scale
 
+    def check_step(self, times: Array, longest: float) -> None:
+        """Raise LogError if stamps without a unit are hardly in seconds."""
+        gaps = np.diff(np.unique(times))
+        step = float(np.median(gaps)) if len(gaps) > 1 else longest
+        if not (self.columns["t"].has_unit or _SHORTEST <= step <= longest):
+            raise self.header.error(
+                "the unit of t in its name, as 't [ms]', 't [us]' or 't [s]'",
+                f"steps of {step:.3g} without a unit",
+            )
+
 
 def read_table(path: Path, lines: list[log_lines.LogLine]) -> Table | None:
     """Read a file whose first row, or the comment before it, names the columns.
@@ -167,7 +215,7 @@ def read_table(path: Path, lines: list[log_lines.LogLine]) -> Table | None:
     Raises
     ------
     LogError
-        If a row has another number of fields.
+        If a row has another number of fields, or a known column an unknown unit.
     """
     texts = [log_lines.without_comment(line.text) for line in lines]
     content = [k for k, text in enumerate(texts) if text]
@@ -175,6 +223,7 @@ def read_table(path: Path, lines: list[log_lines.LogLine]) -> Table | None:
         return None
     header = _header_of(lines, texts, content[0])
     names = log_lines.split_fields(header.text)
+    _check_units(header, names)
     columns = _columns(names)
     if len(columns) < 2 or not columns.keys() & {"t", "id"}:
         return None
@@ -204,21 +253,46 @@ def _header_of(
     return lines[first]._replace(text=texts[first])
 
 
-def _columns(names: Sequence[str]) -> dict[str, tuple[int, float]]:
-    """Return place and scale of the known columns."""
-    found: dict[str, tuple[int, int, float]] = {}
+def _check_units(header: log_lines.LogLine, names: Sequence[str]) -> None:
+    """Refuse an unknown unit in brackets behind the name of a known column."""
+    known = {name for spellings in _NAMES.values() for name in spellings}
+    for name in names:
+        match = _UNIT.fullmatch(name.lower())
+        if match and match[2].strip() not in UNITS and _plain(match[1]) in known:
+            wanted = "a unit of m, cm, mm, km, rad, deg, s, ms, us, ns"
+            raise header.error(f"{wanted}: convert the column", log_lines.shown(name))
+
+
+def _columns(names: Sequence[str]) -> dict[str, Column]:
+    """Return the known columns."""
+    found: dict[str, tuple[int, Column]] = {}
     for place, name in enumerate(names):
         for column, spellings in _NAMES.items():
             for spelling, unit in _readings_of(name):
                 if spelling in spellings:
                     rank = spellings.index(spelling)
                     if column not in found or rank < found[column][0]:
-                        found[column] = rank, place, UNITS[unit]
+                        has_unit = bool(unit) or spelling in _TIMED
+                        found[column] = rank, Column(place, UNITS[unit], has_unit)
                     break
-    taken = {column: place for column, (_, place, _) in found.items()}
+    taken = {column: each.place for column, (_, each) in found.items()}
     if "d" in taken and taken.get("range") == taken["d"]:
         del found["d" if "bearing" in found else "range"]
-    return {column: (place, scale) for column, (_, place, scale) in found.items()}
+    return {column: each for column, (_, each) in found.items()}
+
+
+_UNIT = re.compile(r"\s*(.*?)\s*[\[(](.*)[\])]\s*")
+
+
+def _parts(text: str) -> list[str]:
+    """Return the words of a column's name that have a meaning."""
+    parts = [part for part in re.split(r"[^\w°]+|_", text) if part]
+    return [part for part in parts if part not in _IGNORED] or parts
+
+
+def _plain(text: str) -> str:
+    """Return the name of a column without marks."""
+    return "".join(_parts(text))
 
 
 def _readings_of(name: str) -> Iterator[tuple[str, str]]:
@@ -229,10 +303,9 @@ def _readings_of(name: str) -> Iterator[tuple[str, str]]:
     >>> list(_readings_of("Bearing [deg]")), list(_readings_of("range_mm"))
     ([('bearing', 'deg')], [('rangemm', ''), ('range', 'mm')])
     """
-    match = re.fullmatch(r"\s*(.*?)\s*[\[(](.*)[\])]\s*", name.lower())
+    match = _UNIT.fullmatch(name.lower())
     text, unit = match.groups() if match else (name.lower(), "")
-    parts = [part for part in re.split(r"[^\w°]+|_", text) if part]
-    parts = [part for part in parts if part not in _IGNORED] or parts
+    parts = _parts(text)
     if unit.strip() in UNITS:
         yield "".join(parts), unit.strip()
     if not unit and len(parts) > 1 and parts[-1] in UNITS:
@@ -251,7 +324,7 @@ def tables_in(folder: Path) -> list[Table]:
             if any(re.search(stem, file.stem.lower()) for stem in _STEMS.values()):
                 raise
             continue
-        if table is not None and table.kinds:
+        if table is not None and (table.kinds or table.has_path):
             found.append(table)
         elif file.stem.lower() in _EXAMPLES:
             first = log_lines.read_lines(file)[0]
@@ -294,6 +367,7 @@ def read_named(tables: Sequence[Table], name: str, source: Path) -> slamlog.Slam
     if not rows:
         raise of["odometry"].header.error("rows of odometry below it", "empty ones")
     stamps = of["odometry"].times(rows)
+    of["odometry"].check_step(stamps, _LONGEST)
     epoch = float(stamps[0]) if abs(stamps[0]) > _EPOCH else 0.0
 
     def on_clock(times: Array) -> Array:
@@ -305,26 +379,32 @@ def read_named(tables: Sequence[Table], name: str, source: Path) -> slamlog.Slam
     # Before its first increment a robot stands; its velocity is not known then.
     begin = motions[0].start if "v" in form else -math.inf
     inside = [each for each in timed if begin <= each[1].t <= motions[-1].end]
-    if timed and not inside:
-        raise timed[0][0].error(
+    if len(inside) < _FEWEST_INSIDE * len(timed):
+        line, reading = next(each for each in timed if each not in inside)
+        raise line.error(
             f"readings within the time of the odometry, {motions[0].start:.15g} to "
-            f"{motions[-1].end:.15g}, on one clock",
-            f"all {len(timed)} outside it, the first at t = {timed[0][1].t:.15g}",
+            f"{motions[-1].end:.15g}, on one clock and in one unit",
+            f"{len(timed) - len(inside)} of {len(timed)} outside it, the first at t = "
+            f"{reading.t:.15g}",
         )
     truth = true_path_of(of["truth"]) if "truth" in of else np.empty((0, 4))
     truth[:, 0] = on_clock(truth[:, 0])
     places = _landmarks(of["landmarks"]) if "landmarks" in of else {}
     known = _true_start(motions[0], truth)
     is_known = bool(np.isfinite(known).all())
+    left_out = [f"{len(timed) - len(inside)} readings outside the time of the odometry"]
+    left_out = left_out * (len(inside) < len(timed)) + [
+        f"the poses of {table.file.name}, which no name calls the truth: name the "
+        "columns x_true, y_true, theta_true, or give the file as --truth"
+        for table in tables
+        if table.has_path and not table.has_truth
+    ]
     header = {
         "source": f"csv with named columns: {', '.join(t.file.name for t in tables)}",
         "start_from": "ground truth" if is_known else "origin (no truth then)",
         "truth": of["truth"].file.name if "truth" in of else "none",
         "epoch": repr(epoch),
-        "left_out": f"{len(timed) - len(inside)} readings outside the time of the "
-        "odometry"
-        if len(inside) < len(timed)
-        else "",
+        "left_out": "; ".join(left_out),
     }
     motion = "midpoint" if "v" in form else "turn-last"
     notes = {key: value for table in tables for key, value in table.notes.items()}
@@ -470,7 +550,7 @@ def _id_in(table: Table, row: Cells) -> int | None:
     """Read an id, which pandas may write as 3.0; None for -1 and empty cells."""
     if "id" not in table.columns:
         return None
-    text = row.fields[table.columns["id"][0]]
+    text = row.fields[table.columns["id"].place]
     text = re.sub(r"\.0+$", "", text)
     return None if text.lower() in (*_EMPTY, "-1") else row.line.to_id(text)
 
@@ -527,9 +607,10 @@ def true_path_of(table: Table) -> Array:
     """
     rows = list(table.filled(("x", "y")))
     times = table.times(rows)
+    table.check_step(times, _LONGEST_OF_TRUTH)
     headings = np.full(len(rows), np.nan)
     if "theta" in table.columns:
-        place = table.columns["theta"][0]
+        place = table.columns["theta"].place
         for k, row in enumerate(rows):
             if row.fields[place].lower() not in _EMPTY:
                 headings[k] = table.number(row, "theta")

@@ -101,7 +101,9 @@ def _choose_robot(folder: Path, robot: int | None) -> int:
     robots = robots_in(folder)
     if not robots:
         log = folder / "log.csv"
-        hint = f"; did you mean {log}?" if log.is_file() else ""
+        tables = sorted(file.name for file in folder.glob("*.csv"))
+        hint = f" with {', '.join(tables[:4])}: rename its columns" if tables else ""
+        hint = f"; did you mean {log}?" if log.is_file() else hint
         raise slamlog.LogError(
             f"{folder}: expected a log, or a folder with Robot<k>_Odometry.dat (UTIAS "
             "MR.CLAM), aa3_dr.mat (Victoria Park) or csv files with named columns "
