@@ -276,7 +276,8 @@ MOMENTS = (
     *("slope", "leverage", "pairs", "lagged"),
     *("distance", "distance²", "distance w²"),
 )
-_ROUNDING = 1e-9
+_ROUNDING = 1e-9  # and so many spacings of the largest coordinate:
+_SPACINGS = 4
 _LEAST_STD = 1e-6  # in place of 0, where the world has noise
 
 
@@ -367,7 +368,9 @@ def noise_sums(
         *_motion_noise(poses, moved, steps, motion, noise_in == "motion"),
         *_sensor_noise(poses, points, readings, seen, read, stds),
     ]
-    return np.stack([_summed(noise, len(poses)) for noise in channels], axis=1)
+    largest = np.abs(poses[..., :2]).max(initial=1.0)
+    exact = _ROUNDING + _SPACINGS * float(np.spacing(largest))
+    return np.stack([_summed(noise, len(poses), exact) for noise in channels], axis=1)
 
 
 def _motion_noise(
@@ -413,10 +416,10 @@ def _sensor_noise(
     ]
 
 
-def _summed(noise: _Noise, count: int) -> Array:
+def _summed(noise: _Noise, count: int, exact: float) -> Array:
     """Sum the moments of a channel by run, shape (count, 12)."""
     std = np.broadcast_to(noise.std, noise.values.shape)
-    if not std.any() and (np.abs(noise.values) < _ROUNDING).all():
+    if not std.any() and (np.abs(noise.values) < exact).all():
         return np.zeros((count, len(MOMENTS)))
     std = np.where(std > 0, std, _LEAST_STD)
     w, g = noise.values / std, noise.lever / std

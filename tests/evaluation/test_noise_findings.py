@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from far_origins import far_origins
 from scipy import stats
 
 from slamgym.evaluation.noise_findings import (
@@ -159,6 +160,30 @@ def test_noise_where_none_is_assumed_counts_in_units_of_a_millionth():
         measurement_std=(0.1, 0.1),
     )
     assert sums[0, 1, 1] == pytest.approx(3000.0)
+
+
+@far_origins
+def test_rounding_of_coordinates_is_no_noise(far):
+    """Where neither world nor filter has any, along and sideways."""
+    poses, rng = np.zeros((1, 50, 3)), np.random.default_rng(3)
+    poses[0, :, 2] = rng.uniform(-np.pi, np.pi, 50).cumsum()
+    odometry = np.column_stack([rng.uniform(0, 2, 50), poses[0, :, 2]])[None]
+    odometry[0, 1:, 1] -= poses[0, :-1, 2]
+    poses[0, 0, :2] = far
+    for step in range(49):
+        heading = poses[0, step, 2]
+        ahead = np.array([np.cos(heading), np.sin(heading)])
+        poses[0, step + 1, :2] = poses[0, step, :2] + odometry[0, step + 1, 0] * ahead
+    sums = noise_sums(
+        poses,
+        np.zeros((1, 1, 2)),
+        odometry,
+        np.ones((1, 50, 1, 2)),
+        np.zeros((1, 50, 1), dtype=bool),
+        motion_std=(0.0, 0.0, 0.1),
+        measurement_std=(0.1, 0.1),
+    )
+    assert not sums[0, :2].any()
 
 
 def far_noise(factor, law="normal", runs=40, seed=4):
