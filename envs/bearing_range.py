@@ -296,7 +296,7 @@ class LineOfSight:
         ends = np.array(walls, dtype=np.float64).reshape(-1, 4)
         a, b = ends.view(np.complex128).T
         margins = _MOUNTED * np.abs(b - a)
-        self._walls = np.column_stack([ends, (np.conj(a) * b).imag, margins])
+        self._walls = np.column_stack([ends, margins])
 
     def blocked(self, landmarks: ComplexArray, frame: Array) -> BoolArray:
         """Return which lines of sight cross a wall; its end points belong to it.
@@ -327,12 +327,12 @@ class LineOfSight:
 def _find_blocked(
     landmarks: ComplexArray, frame: Array, walls: Array, blocked: BoolArray
 ) -> None:
-    """Mark the blocked lines of sight; `walls` has rows (a, b, a × b, margin)."""
+    """Mark the blocked lines of sight; `walls` has rows (a, b, margin)."""
     for world in range(len(landmarks)):
         x, y = frame[0, world], frame[1, world]
         for w in range(len(walls)):
-            ax, ay, bx, by, origin_side, margin = walls[w]
-            robot_side = origin_side - fma(x, by - ay, -y * (bx - ax))
+            ax, ay, bx, by, margin = walls[w]
+            robot_side = fma(ax - x, by - y, (y - ay) * (bx - x))
             nearer, sign = abs(robot_side) + margin, np.sign(robot_side)
             for i in range(landmarks.shape[1]):
                 dx, dy = landmarks[world, i].real - x, landmarks[world, i].imag - y

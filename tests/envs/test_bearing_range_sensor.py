@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from far_origins import FAR
 from worlds import RANDOM_MAP
 
 from slamgym.envs.bearing_range import BearingRangeSensor, LineOfSight, hide_identities
@@ -264,12 +265,13 @@ def test_occlusion_is_the_exact_crossing_of_segments():
     assert hidden > 1000
 
 
+@pytest.mark.parametrize("origin", [(0.0, 0.0), *FAR.values()], ids=["0", *FAR])
 @pytest.mark.parametrize("height", [-1.0, 1.0])
-def test_a_landmark_mounted_on_a_wall_is_seen_from_both_sides(height):
-    wall = (0.1, 0.3, 3.7, 1.9)
+def test_a_landmark_mounted_on_a_wall_is_seen_from_both_sides(height, origin):
+    wall = np.array([0.1, 0.3, 3.7, 1.9]) + np.tile(origin, 2)
     a, b = complex(*wall[:2]), complex(*wall[2:])
     mounted = a + np.linspace(0.01, 0.99, 99) * (b - a)
-    robot = np.array([[2.0], [5.0 * height]])
+    robot = np.add(origin, (2.0, 5.0 * height))[:, None]
     assert not LineOfSight([wall]).blocked(mounted[None], robot).any()
 
 
