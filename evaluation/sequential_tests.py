@@ -53,15 +53,17 @@ class _Mixture:
         Parameters
         ----------
         gains : ndarray, shape (M, k, c)
-            Their logarithms, for k sums of evidence and c alternatives.
+            Their logarithms, for k sums of evidence and c alternatives; overwritten.
         """
-        if self._logs is None:
-            self._logs = np.zeros(gains.shape[1:])
-        logs = np.cumsum(np.concatenate([self._logs[None], gains]), axis=0)
-        self._logs = logs[-1].copy()  # a view would keep all of them
-        flat = logs[1:].reshape(len(gains), -1)
+        if self._logs is not None and len(gains):
+            gains[0] += self._logs
+        logs = np.cumsum(gains, axis=0, out=gains)
+        if len(gains):
+            self._logs = logs[-1].copy()  # a view would keep all of them
+        flat = logs.reshape(len(gains), -1)
         top = flat.max(axis=1, initial=-np.inf)
-        return np.asarray(top + np.log(np.exp(flat - top[:, None]).mean(axis=1)))
+        flat -= top[:, None]
+        return np.asarray(top + np.log(np.exp(flat, out=flat).mean(axis=1)))
 
 
 class EProcess(_Mixture):
@@ -124,8 +126,10 @@ class EProcess(_Mixture):
         freedom = np.asarray(degrees_of_freedom)
         if freedom.ndim < 2:
             freedom = np.broadcast_to(freedom, len(values))[:, None]
-        gains = freedom[:, :, None] * np.log(SCALES) + values[:, :, None] * self._slopes
-        return self._multiplied(-0.5 * np.where(freedom[:, :, None] > 0, gains, 0.0))
+        gains = np.where(freedom > 0, values, 0.0)[:, :, None] * self._slopes
+        gains += freedom[:, :, None] * np.log(SCALES)
+        gains *= -0.5
+        return self._multiplied(gains)
 
 
 class MeanEProcess(_Mixture):
