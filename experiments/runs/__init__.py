@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from .log_replay import Replay as Replay
     from .log_replay import replay as replay
     from .log_smoothing import SmoothedLog as SmoothedLog
+    from .log_smoothing import smooth as smooth
     from .log_smoothing import smooth_log as smooth_log
     from .log_smoothing import summarise_smoothing as summarise_smoothing
     from .simulated_runs import SimulatedRuns as SimulatedRuns

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import count
 from os import PathLike
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from ...estimator.smoother import (
     SmoothingSlam,
     reassociate,
 )
+from ...estimator.smoother import smooth as smooth_drive
 from ...estimator.smoother.batch_smoother import smooth_repaired, smoother_in
 from ...estimator.smoother.drive import Sightings
 from ...evaluation import nees
@@ -58,6 +59,71 @@ class SmoothedLog:
     def log(self) -> SlamLog:
         """The log."""
         return self.filtered.log
+
+
+@overload
+def smooth(
+    what: Drive,
+    settings: None = None,
+    *,
+    associate: bool = False,
+    **options: Any,  # of the drive alone
+) -> SmoothedDrive: ...
+
+
+@overload
+def smooth(
+    what: SlamLog | str | PathLike[str],
+    settings: FilterSettings | None = None,
+    *,
+    associate: bool = False,
+) -> SmoothedLog: ...
+
+
+def smooth(
+    what: Drive | SlamLog | str | PathLike[str],
+    settings: FilterSettings | None = None,
+    *,
+    associate: bool = False,
+    **options: Any,
+) -> SmoothedDrive | SmoothedLog:
+    """Smooth a drive, or a log or the file of one, as ``slamgym smooth`` does.
+
+    Parameters
+    ----------
+    what : Drive, SlamLog or path
+        A drive goes to :func:`slamgym.estimator.smooth`, a log to `smooth_log`.
+    settings : FilterSettings, optional
+        Of a log, see `smooth_log`.
+    associate : bool
+        Whether to repair the associations by the whole drive.
+    **options
+        Of a drive, see :func:`slamgym.estimator.smooth`.
+
+    Raises
+    ------
+    TypeError
+        If it is none of these, or has options of the other kind.
+
+    Examples
+    --------
+    >>> drive = Drive(motion_std=(0.1, 0.1, 0.05), measurement_std=(0.02, 0.1))
+    >>> drive.update([(0.0, 5.0)], [7])
+    >>> drive.predict((2.0, 0.0))
+    >>> drive.update([(0.0, 3.2)], [7])
+    >>> np.round(smooth(drive).poses[-1], 3)
+    array([1.933, 0.   , 0.   ])
+    """
+    if not isinstance(what, SlamLog | str | PathLike):
+        if settings is not None:
+            raise TypeError("settings are of a log; a drive has a noise of its own")
+        return smooth_drive(what, associate=associate, **options)
+    if options:
+        raise TypeError(
+            f"{', '.join(options)}: options of a drive; those of a log are in the "
+            "settings, as settings_for(log, estimator='smoother', options={...})"
+        )
+    return smooth_log(what, settings, associate=associate)
 
 
 def smooth_log(

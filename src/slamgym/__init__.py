@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from .estimator import list_estimators as list_estimators
     from .estimator import make_estimator as make_estimator
     from .estimator import register_estimator as register_estimator
-    from .estimator import smooth as smooth
     from .evaluation import assert_consistent as assert_consistent
     from .experiments.judging import judge as judge
     from .experiments.logs import read_log as read_log
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
     from .experiments.monte_carlo import monte_carlo as monte_carlo
     from .experiments.noise_fitting import fit_noise as fit_noise
     from .experiments.runs import replay as replay
+    from .experiments.runs import smooth as smooth
     from .experiments.trajectories import generate_trajectories as generate_trajectories
     from .experiments.trajectories import load_trajectories as load_trajectories
     from .sim_configs import Scenario as Scenario

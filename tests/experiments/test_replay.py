@@ -7,8 +7,9 @@ import pytest
 from far_origins import far_origins, rounding, shifted
 from rich.console import Console
 
+from slamgym import smooth
 from slamgym.envs.controllers import make_controller
-from slamgym.estimator import Belief, EkfSlam, UpdateReport, make_estimator
+from slamgym.estimator import Belief, Drive, EkfSlam, UpdateReport, make_estimator
 from slamgym.experiments.command_line.tables import key_figures, landmark_table
 from slamgym.experiments.logs.ground_truth import (
     path_accuracy,
@@ -664,7 +665,14 @@ def test_python_takes_the_path_of_a_log_and_the_name_of_a_filter(tmp_path):
     by_hand = replay(log, settings_for(log, estimator="ekf").make(log.start)).trace
     np.testing.assert_array_equal(by_name.poses, by_hand.poses)
     assert by_name.estimator == "ekf"
-    assert len(smooth_log(str(path)).poses) == len(by_hand.poses)
+    smoothed = smooth_log(str(path))
+    assert len(smoothed.poses) == len(by_hand.poses)
+    for what in (log, path, str(path)):
+        np.testing.assert_array_equal(smooth(what).poses, smoothed.poses)
+    with pytest.raises(TypeError, match="tolerance: options of a drive; those of a lo"):
+        smooth(path, tolerance=1e-6)
+    with pytest.raises(TypeError, match="settings are of a log; a drive has a noise"):
+        smooth(Drive(**NOISE), settings_for(log))
 
 
 def turned_away(log):
