@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import numpy_active_slam as twin
 import pytest
+from far_origins import far_origins, moved_world, rounding
 from gymnasium.envs.registration import EnvSpec
 from worlds import RANGED
 
@@ -686,6 +687,25 @@ def test_goals_are_the_ways_to_what_is_nearest_and_to_what_is_known_best():
 
 
 # the baselines
+
+
+@far_origins
+@pytest.mark.parametrize("name", ["coverage", "revisit", "greedy"])
+def test_an_agent_acts_far_from_the_origin_as_at_the_origin(name, far):
+    """Among inner walls, whose sides and detours are computed from coordinates."""
+    acted = []
+    for origin in ((0.0, 0.0), far):
+        scenario = moved_world(load_scenario("active_rooms"), origin)
+        env = ActiveSlamEnv(scenario)
+        baseline, steps = make_baseline(name, scenario, np.random.default_rng(0)), []
+        env.reset(seed=1)
+        for _ in range(8):
+            action = baseline.act(env.knowledge)
+            _, reward, *_ = env.step(action.astype(np.float32))
+            steps.append([*action, reward])
+        acted.append(steps)
+    # A rounding counts by the smallest standard deviation, of a millimetre.
+    np.testing.assert_allclose(*acted, rtol=0, atol=1e3 * rounding(far, 8))
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,16 @@ def rounding(far, steps=1):
     return steps * np.spacing(np.abs(far).max()) + 1e-11
 
 
+def moved_world(scenario, far):
+    """Return a scenario of random landmarks between walls at another place."""
+    twice, pose = np.tile(far, 2), np.add(scenario.start.pose, (*far, 0.0))
+    walls = [tuple(np.add(wall, twice)) for wall in scenario.walls]
+    bounds = tuple(np.add(scenario.landmarks.bounds, twice))
+    return scenario.with_changes(
+        start={"pose": tuple(pose)}, walls=walls, landmarks={"bounds": bounds}
+    )
+
+
 def shifted(state, far):
     """Return states (..., 3 + 2n) of the world at another place."""
     moved = np.array(state, dtype=float)
