@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from slamgym import Belief
 from slamgym.estimator import EkfSlam, InvariantEkfSlam, UpdateReport
-from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
 from slamgym.experiments.monte_carlo import monte_carlo, runner, summarise_monte_carlo
 from slamgym.sim_configs import Scenario, load_scenario
 
@@ -297,7 +297,8 @@ def turned(runs: Any) -> Any:
 def noise_of(runs: Any, column: int) -> Array:
     """Return the noise of the bearings (0) or ranges (1), shape (B, T, L)."""
     exact = with_noise(runs, column, 0.0).measurements
-    return np.asarray((runs.measurements - exact)[..., column])
+    noise = (runs.measurements - exact)[..., column]
+    return np.asarray(noise if column else wrap_angle(noise))
 
 
 def scaled_far(world: Scenario, runs: Any) -> Any:
@@ -576,7 +577,8 @@ def rating(fault: Fault, entry: dict[str, Any]) -> str:
         cause = COVARIANCE
     if cause in fault.right or (is_accepted and cause in ("honest", CANNOT_TELL)):
         return "right"
-    return "undecided" if cause == CANNOT_TELL else "wrong"
+    is_open = entry["diagnosis"]["sentence"].endswith(" explains this.")  # of a map
+    return "undecided" if cause == CANNOT_TELL or is_open else "wrong"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

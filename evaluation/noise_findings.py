@@ -118,14 +118,16 @@ def _tests(channel: str, total: Array, runs: int) -> Iterator[Finding]:
         yield _bias(channel, found, variance, runs)
     growth = _growth(channel, found, variance)
     is_growing = growth is not None and growth.matters and growth.p_value < 1e-4
-    tails = _tails(channel, found, mean, variance, is_growing)
+    kurtosis = _kurtosis(found, mean, variance, is_growing)
+    tails = None if kurtosis is None else _tails(channel, count, variance, kurtosis)
     if tails is not None:
         yield tails
     if growth is not None:
         yield growth
-    if not is_growing and (
-        tails is None or not (tails.matters and tails.p_value < 1e-4)
-    ):
+    has_tails = tails is not None and tails.matters and tails.p_value < 1e-4
+    if kurtosis is not None and has_tails and not is_growing:
+        yield _size_beside_tails(channel, count, variance, kurtosis)
+    elif not is_growing:
         yield _size(channel, count, variance)
     if found["pairs"] >= _FEWEST and variance > 0:
         yield _correlation(channel, found, mean, variance)
@@ -214,10 +216,34 @@ def _bias_text(channel: str, bias: float) -> str:
     return f"ranges are {abs(bias):.2g} m too {way}"
 
 
-def _tails(
-    channel: str, found: dict[str, float], mean: float, variance: float, grows: bool
-) -> Finding | None:
-    """Test the fourth moment about the mean; None where all numbers are equal.
+def _size_beside_tails(
+    channel: str, count: float, variance: float, kurtosis: float
+) -> Finding:
+    """Test whether tails leave a part of the variance unexplained.
+
+    Noise that is large at times only has some tails, too, but its size counts.  Student
+    noise of the filter's scale with the same kurtosis has a larger variance than one;
+    beyond it, or below one, s² has the standard error s² √((κ − 1) / n).
+    """
+    explained = min(max(variance, 1.0), _student_variance(kurtosis))
+    error = variance * np.sqrt((kurtosis - 1) / count)
+    return _size(channel, count, variance)._replace(
+        p_value=float(2 * ndtr(-abs(variance - explained) / error)),
+        impact=abs(float(np.log(variance / explained))),
+        matters=abs(variance / explained - 1) >= _LEAST_GROWTH,
+    )
+
+
+def _student_variance(kurtosis: float) -> float:
+    """Return the variance of Student's t of scale 1, by its kurtosis above 3."""
+    freedom = 4 + 6 / (kurtosis - 3)
+    return freedom / (freedom - 2)
+
+
+def _kurtosis(
+    found: dict[str, float], mean: float, variance: float, grows: bool
+) -> float | None:
+    """Return the fourth moment about the mean; None where all numbers are equal.
 
     If the variance grows with the distance, the part of the kurtosis of a linear growth
     is left out.
@@ -229,15 +255,19 @@ def _tails(
     fourth = (
         found["fourth"] - 4 * mean * found["third"] + 6 * mean**2 * found["second"]
     ) / count - 3 * mean**4
-    kurtosis = fourth / second**2
-    if grows:
-        kurtosis /= 1 + _spread_of_variance(found)
-    p_value = float(2 * ndtr(-abs(_kurtosis_score(kurtosis, count))))
+    share = 1 + _spread_of_variance(found) if grows else 1.0
+    return fourth / second**2 / share
+
+
+def _tails(channel: str, count: float, variance: float, kurtosis: float) -> Finding:
+    """Test the kurtosis; its effect is at most that of Student noise."""
+    excess = kurtosis - 3
+    most = _student_variance(kurtosis) if excess > 0 else 1.0
     return Finding(
         HEAVY_TAILS,
-        p_value,
-        max(abs(float(np.log(variance))), (kurtosis - 3) / 10),
-        kurtosis - 3 >= _LEAST_KURTOSIS,
+        float(2 * ndtr(-abs(_kurtosis_score(kurtosis, count)))),
+        max(float(np.log(min(max(variance, 1.0), most))), excess / 10),
+        excess >= _LEAST_KURTOSIS,
         f"the noise of {_SYMBOLS[channel]} has a kurtosis of {kurtosis:.3g}, a normal "
         "one 3",
         sign=0,

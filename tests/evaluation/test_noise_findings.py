@@ -116,10 +116,34 @@ def test_tails_have_the_p_value_of_anscombe_and_glynn(law, count, scale):
     kurtosis = stats.kurtosis(numbers, axis=None, fisher=False)
     expected = stats.kurtosistest(numbers.ravel()).pvalue
     assert found.p_value == pytest.approx(expected, rel=1e-6, abs=0)
-    by_size = abs(np.log(numbers.var(ddof=1)))
+    explained = 1.0
+    if kurtosis > 3:
+        student = stats.t(4 + 6 / (kurtosis - 3))
+        assert student.stats("k") == pytest.approx(kurtosis - 3)
+        explained = student.var()
+    by_size = np.log(np.clip(numbers.var(ddof=1), 1.0, explained))
     assert found.impact == pytest.approx(max(by_size, (kurtosis - 3) / 10))
     assert found.matters == (kurtosis >= 3.5)
     assert f"kurtosis of {kurtosis:.3g}" in found.text
+
+
+@pytest.mark.parametrize(
+    ("factor", "size"), [(1.8, "too small"), (0.5, "too large"), (2.5, "too small")]
+)
+def test_noise_of_another_size_in_half_of_the_time_is_not_tails_first(factor, size):
+    numbers = draw((40, 200), seed=6)
+    numbers[:, :100] *= factor
+    sums = sums_of("bearing", numbers)
+    assert np.mean(numbers**4) / np.mean(numbers**2) ** 2 > 3.5
+    causes = [f.cause for f in significant_findings(sums, 0.02)]
+    assert causes == [f"bearing noise {size}", HEAVY_TAILS]
+
+
+@pytest.mark.parametrize("degrees", [5, 8, 12])
+def test_the_variance_of_student_noise_is_explained_by_its_tails(degrees):
+    numbers = np.random.default_rng(7).standard_t(degrees, (40, 200))
+    first, *_ = significant_findings(sums_of("bearing", numbers), 0.02)
+    assert first.cause == HEAVY_TAILS
 
 
 def test_thirty_numbers_are_enough_and_fewer_are_not():
