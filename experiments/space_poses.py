@@ -57,6 +57,7 @@ _SMALL = 1e-4  # angle of a rotation below which series are exact [rad]
 _SYMMETRIC = 1e-6  # relative difference of two entries
 _NEAR, _FAR, _ERRORS = 1.5, 2.5, 3.0  # as for poses in the plane, see conventions
 _UNIT = 0.1  # largest difference of the length of a quaternion from 1
+_RESCALED = 0.1  # logarithm of a scale that is another unit
 _SMALLER = 4.0  # by which errors fall in the right convention of the poses
 _SHIFTS = (-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0)  # of time stamps, in steps
 _GAIN = 0.25  # of log-likelihood of a pose [nats]
@@ -227,6 +228,12 @@ def judge_in_space(
     readings = dict(_readings(exact, poses, claims, order))
     error, matrices = readings[_name(covariances, order)]
     nees = normalised_squared_error(error, matrices)
+    if not np.isfinite(nees).any():
+        raise ValueError(
+            f"{drives[0][1].file}: every covariance of six coordinates is singular, "
+            "and gives no NEES: write variances > 0 of all six, or judge poses in the "
+            "plane without --space"
+        )
     ratios = {"pose": nees / 6}
     for name, part in (("position", slice(0, 3)), ("rotation", slice(3, 6))):
         own = matrices[..., part, part]
@@ -387,7 +394,8 @@ def _pose_readings(truth: Pose, poses: Pose) -> Iterator[tuple[str, Pose, Pose]]
     ]
     if min(spreads) > 0:
         name, scale = unit_of(float(np.sqrt(spreads[0] / spreads[1])))
-        yield name, truth, poses._replace(positions=poses.positions * scale)
+        if abs(np.log(scale)) > _RESCALED:  # not the drift of a scale
+            yield name, truth, poses._replace(positions=poses.positions * scale)
     steps = np.arange(truth.positions.shape[1])
     for shift in _SHIFTS:
         side = "late" if shift > 0 else "early"

@@ -278,6 +278,25 @@ def test_the_command_judges_poses_in_space(tmp_path):
     assert "--space must be one of left, right, decoupled, got 'up'" in done.stderr
 
 
+def test_an_error_of_the_scale_is_no_other_unit(tmp_path):
+    places = write(tmp_path, 13, WRITTEN["left"], runs=3, noise=1e-3)
+    for path in (tmp_path / "e").iterdir():
+        rows = np.loadtxt(path)
+        rows[:, 1:4] *= 1.004
+        np.savetxt(path, rows, fmt="%.17g")
+    found = judge_in_space(*places)
+    assert found["verdict"] == "not consistent"
+    assert found["cause"] == ""
+
+
+@pytest.mark.parametrize("runs", [1, 3])
+def test_covariances_in_a_plane_are_refused_as_those_of_space(runs, tmp_path):
+    flat = np.diag([1.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+    places = write(tmp_path, 16, lambda X, P: flat @ P @ flat, runs=runs)
+    with pytest.raises(ValueError, match=r"seed_0\.tum: every covariance of six .* is "):
+        judge_in_space(*places)
+
+
 def test_the_figure_in_space_shows_steps_without_nees_as_gaps(tmp_path):
     """The covariance of a known start is 0."""
     places = write(tmp_path, 14, lambda X, P: P * (P[0, 0] > 1.5e-4), runs=3)
