@@ -161,9 +161,10 @@ class Watch:
     def shown_after(self) -> int | None:
         """Number of runs after which both ratios were shown to be near 1, if they are.
 
-        That of the pose counts alone if fewer than 2 runs have a map.
+        That of the pose counts alone if fewer than 2 runs have a NEES of the map.
         """
-        if self._on_map.undefined or not self._is_settled:
+        is_undefined = self._has_maps and self._on_map.undefined
+        if is_undefined or not self._is_settled:
             return None
         return max(self.pose.after or 0, self.map.after or 0)
 
@@ -175,9 +176,13 @@ class Watch:
         return self.rejected_after is not None or self._is_settled
 
     @property
+    def _has_maps(self) -> bool:
+        return self.map.runs > 1  # as a report of the maps needs
+
+    @property
     def _is_settled(self) -> bool:
-        has_map = self.map.runs > 1
-        return self.pose.after is not None and (not has_map or bool(self.map.after))
+        is_shown = self.map.after is not None or not self._has_maps
+        return self.pose.after is not None and is_shown
 
     def add_block(self, block: Block) -> None:
         """Add the runs of a block of results, by their NEES in the invariant frame."""

@@ -200,11 +200,14 @@ def test_a_map_without_a_nees_is_not_shown_to_be_consistent():
 
 def test_runs_that_have_no_nees_of_the_map_are_not_repeated_for_ever():
     rng = np.random.default_rng(25)
-    results = simulated(honest(rng, 200), landmarks=np.full((200, 6, 2), np.inf))
-    scores = scores_of(results, "mine", "invariant")
-    watch = watched(scores, "invariant")
-    assert watch.decided
-    assert watch.shown_after is None
+    nees, landmarks = honest(rng, 200), np.full((200, 6, 2), np.inf)
+    scores = scores_of(simulated(nees, landmarks=landmarks), "mine", "invariant")
+    assert watched(scores, "invariant").decided
+    chosen = verdict(nees, landmarks=landmarks)
+    found = verdict(nees, UNTIL, landmarks=landmarks)
+    assert found.word == chosen.word == "consistent"
+    for each in found, chosen:
+        assert each.reason.endswith("; this covers the pose only")
 
 
 def test_a_wrong_map_that_a_later_verdict_shows_is_rejected():

@@ -293,7 +293,9 @@ def test_an_error_of_the_scale_is_no_other_unit(tmp_path):
 def test_covariances_in_a_plane_are_refused_as_those_of_space(runs, tmp_path):
     flat = np.diag([1.0, 1.0, 0.0, 0.0, 0.0, 1.0])
     places = write(tmp_path, 16, lambda X, P: flat @ P @ flat, runs=runs)
-    with pytest.raises(ValueError, match=r"seed_0\.tum: every covariance of six .* is "):
+    with pytest.raises(
+        ValueError, match=r"seed_0\.tum: every covariance of six .* is "
+    ):
         judge_in_space(*places)
 
 

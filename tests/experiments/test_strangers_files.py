@@ -292,6 +292,8 @@ POSES = TRUTH.replace("t,x,y,theta", "t,{0}x,{0}y,{0}theta")
         ("ekf", "", False),
         ("ekf", "true_", True),
         ("odom_truth", "", True),
+        ("odom_length", "", False),
+        ("odom_xgt", "", True),
     ],
 )
 def test_poses_in_a_file_named_as_an_estimate_are_no_truth(

@@ -86,11 +86,11 @@ EXPECTED = (
 _STEMS = {
     "odometry": "odom|motion|control|veloc",
     "measurements": "meas|observation|reading|sensor|detect",
-    "truth": "truth|gt",
+    "truth": "truth|gt(?!h)",
     "landmarks": "landmark|map|world|beacon",
 }
 #: Names of columns or files that call poses the truth, and of files that do not.
-_TRUE = "truth|true|gt|mocap|vicon|optitrack"
+_TRUE = "truth|true|gt(?!h)|mocap|vicon|optitrack"  # not length
 _ESTIMATED = "odom|estim|slam|ekf|filter|predict|dead|wheel|encoder|imu"
 #: Columns of the files that the documentation names.
 _EXAMPLES = {
