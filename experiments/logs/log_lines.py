@@ -135,7 +135,11 @@ def content_of(lines: list[LogLine]) -> list[LogLine]:
     ['0 1 2']
     """
     texts = ((line, without_comment(line.text)) for line in lines)
-    found = [line._replace(text=text) for line, text in texts if text]
+    found = [
+        line if text is line.text else line._replace(text=text)
+        for line, text in texts
+        if text
+    ]
     if not found:
         raise lines[0].error("rows", "comments only")
     is_header = not any(map(is_number, split_fields(found[0].text)))
@@ -144,7 +148,8 @@ def content_of(lines: list[LogLine]) -> list[LogLine]:
 
 def without_comment(text: str) -> str:
     """Return a line up to its comment."""
-    return _COMMENT.split(text, maxsplit=1)[0].strip()
+    mark = _COMMENT.search(text)
+    return text[: mark.start()].strip() if mark else text
 
 
 def split_fields(text: str) -> list[str]:

@@ -131,7 +131,8 @@ def chain_of(graph: Graph) -> tuple[list[Increment], dict[int, int], int]:
         if i == j:
             raise line.error("odometry to a new pose", f"to pose {j} again")
         pair = (min(i, j), max(i, j))
-        between[pair] = min(line, between.get(pair, line), key=_rank)
+        other = between.get(pair)
+        between[pair] = line if other is None else min(line, other, key=_rank)
     poses = sorted({pose for pair in between for pose in pair})
     pairs = list(pairwise(poses))
     if not between.keys() >= set(pairs):
@@ -185,7 +186,7 @@ def unread_landmarks(graph: Graph) -> list[int]:
 
 def id_at(line: LogLine, place: int) -> int:
     """Read an id from a field of a line, the tag being field 0."""
-    return line.to_id(line.text.split()[place])
+    return line.to_id(line.text.split(maxsplit=place + 1)[place])
 
 
 def reals_at(line: LogLine, first: int, end: int | None = None) -> list[float]:
@@ -484,8 +485,7 @@ def read_isam(
         If a file cannot be opened.
     """
     graph = sort_lines(content_of(read_lines(path)))
-    poses = {id_at(line, place) for line in graph.edges for place in (1, 2)}
-    if len(graph.edges) >= max(len(poses), 1) and not graph.readings:
+    if not graph.readings and _has_closures(graph):
         raise graph.lines[-1].error(
             "readings of landmarks, as a filter has no use for loop closures between "
             f"poses: {', '.join(LANDMARK_TAGS)} lines",
@@ -506,6 +506,12 @@ def read_isam(
     return log if truth is None else with_truth(log, steps, truth)
 
 
+def _has_closures(graph: Graph) -> bool:
+    """Whether a graph has more edges between poses than a chain of them has."""
+    poses = {id_at(line, place) for line in graph.edges for place in (1, 2)}
+    return len(graph.edges) >= max(len(poses), 1)
+
+
 def _events(
     graph: Graph, chain: list[Increment], steps: dict[int, int]
 ) -> tuple[slamlog.Event, ...]:
@@ -516,7 +522,10 @@ def _events(
     for pose, step in steps.items():
         if step:
             _take_increment(recorder, chain[step - 1], step)
-        for line in sorted(graph.readings.get(pose, []), key=lambda at: id_at(at, 2)):
+        lines = graph.readings.get(pose, [])
+        if len(lines) > 1:
+            lines = sorted(lines, key=lambda at: id_at(at, 2))
+        for line in lines:
             reading = slamlog.Reading(float(step), id_at(line, 2), *polar_at(line))
             recorder.add_reading(line, reading)
     return recorder.finish()
