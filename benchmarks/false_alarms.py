@@ -13,9 +13,10 @@ six landmarks, whose errors contain the final error of the first two numbers. A 
 multiplies the squared errors of pose or map. "extended" is a study whose verdict is
 read after 50, 100, 200, 400 runs. A second table shows how many runs real filters need.
 
-With ``filters``, each study has 100 runs. Four worlds have a tenth or three tenths of
-their noise, so that every filter is nearly linear; in three others, the invariant
-filter has all of it. A number after ``looks`` or ``filters`` changes the seeds.
+With ``filters``, each study has 100 runs. All filters run in four worlds whose noise
+is reduced to 10 % or 30 %, so that every filter is nearly linear. The invariant filter
+also runs in three worlds with all their noise. A number after ``looks`` or ``filters``
+changes the seeds.
 """
 
 import sys
@@ -55,7 +56,7 @@ def scores(
 ) -> tuple[Array, Array, Array]:
     """NEES and NIS of three random walks, read in turn: (repetitions, runs, STEPS).
 
-    Also return their final errors in deviations, shape (repetitions, runs, 3).
+    Also return their final errors in standard deviations, shape (repetitions, runs, 3).
     """
     runs = shape[0] * shape[1]
     variance = np.ones(3)
@@ -264,7 +265,7 @@ FILTERS = (
 
 
 def honest_studies() -> Iterator[tuple[str, str, Scenario]]:
-    """Yield filters that are consistent by design, and names and worlds."""
+    """Yield filters that are consistent by design, with names and worlds."""
     worlds = {
         "six_landmarks, noise × .1": ("six_landmarks", 29, 0.1),
         "anchored, noise × .3": ("anchored", 29, 0.3),
@@ -296,7 +297,7 @@ def filters(seed: int) -> None:
             f"| `{label}` | {name} | {ratios} | {word} | {cause['cause']} |", flush=True
         )
     found = ", ".join(f"{word} {count}" for word, count in words.most_common())
-    print(f"\n{words.total()} studies: {found}; refused by the map: {by_map}")
+    print(f"\n{words.total()} studies: {found}; rejected because of the map: {by_map}")
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ BIAS_MARGIN = 0.25
 #: Rate at which all its tests together may reject a consistent map.
 ERROR_RATE = 0.005
 _POINT = 2  # degrees of freedom of a landmark
-_LARGEST = 1e100  # NEES that counts
+_LARGEST = 1e100  # larger NEES count as this value
 #: Tests that share it: of the whole map, of each landmark, seen from the robot and in
 #: the frame of the map, and of the mean error of each.
 TESTS = 4
@@ -213,10 +213,9 @@ def map_test(
 class MapEvidence:
     """Evidence against the final maps, after each of many runs.
 
-    It is the average of four e-processes, which ask what :func:`map_test` asks: about
-    the whole map, about each landmark seen from the robot and in the frame of the map,
-    and about the mean error of each. A map whose matrix has a negative eigenvalue is
-    certain evidence.
+    It is the average of four e-processes on the quantities that :func:`map_test` tests:
+    the whole map, each landmark seen from the robot and in the frame of the map, and
+    the mean error of each. A covariance with a negative eigenvalue is certain evidence.
     """
 
     def __init__(self) -> None:
@@ -225,7 +224,7 @@ class MapEvidence:
         )
         self._means = MeanEProcess(BIAS_MARGIN, EQUIVALENCE_MARGIN.high)
         self._is_indefinite = False
-        #: Number of maps so far without a NEES, as of a singular covariance.
+        #: Number of maps so far without a NEES, for instance by a singular covariance.
         self.undefined = 0
 
     def update(
@@ -246,7 +245,7 @@ class MapEvidence:
         -------
         ndarray, shape (runs,)
         ndarray, shape (runs,)
-            NEES of the whole map by its degrees of freedom; nan where it has none.
+            NEES of the whole map per degree of freedom; nan where it is undefined.
         """
         squares = (deviations**2).sum(axis=2)
         has_map = degrees_of_freedom > 0
@@ -275,7 +274,7 @@ class MapEvidence:
 
 
 def _kept(nees: Array, known: BoolArray) -> Array:
-    """Return known NEES, at most as large that no sum overflows, and 0 for others."""
+    """Return known NEES, limited so that no sum overflows, and 0 for others."""
     return np.where(known, np.minimum(nees, _LARGEST), 0.0)
 
 

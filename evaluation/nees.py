@@ -315,12 +315,12 @@ def _in_frame(
 
 
 def _without_rounding(covariances: Array) -> Array:
-    """Return covariances without the position's variances where they are rounding.
+    """Return covariances in which variances of the position that are rounding are 0.
 
-    A robot without noise to its side is certain of its y at first, but for the heading.
-    A filter that rotates covariances, or solves for them, makes about 1e-18 times the
-    variance of x of this zero, in any direction.  Therefore, the least variance of the
-    position given the heading decides.
+    At first, a robot without sideways noise is certain of its y, given its heading.  A
+    filter that rotates covariances, or solves for them, turns this zero into about
+    1e-18 times the variance of x, in any direction.  Therefore, the smallest variance
+    of the position given the heading decides.
     """
     P = covariances[..., :3, :3]
     heading = P[..., 2, 2]

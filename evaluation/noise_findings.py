@@ -221,9 +221,9 @@ def _size_beside_tails(
 ) -> Finding:
     """Test whether tails leave a part of the variance unexplained.
 
-    Noise that is large at times only has some tails, too, but its size counts.  Student
-    noise of the filter's scale with the same kurtosis has a larger variance than one;
-    beyond it, or below one, s² has the standard error s² √((κ − 1) / n).
+    Noise that is large only at times also has tails, but its size counts.  Student
+    noise of scale 1 with the same kurtosis has a variance above 1.  The tails explain
+    an s² up to this variance.  The standard error of s² is s² √((κ − 1) / n).
     """
     explained = min(max(variance, 1.0), _student_variance(kurtosis))
     error = variance * np.sqrt((kurtosis - 1) / count)
@@ -235,7 +235,7 @@ def _size_beside_tails(
 
 
 def _student_variance(kurtosis: float) -> float:
-    """Return the variance of Student's t of scale 1, by its kurtosis above 3."""
+    """Return the variance of Student's t of scale 1 with a kurtosis above 3."""
     freedom = 4 + 6 / (kurtosis - 3)
     return freedom / (freedom - 2)
 
@@ -306,8 +306,9 @@ MOMENTS = (
     *("slope", "leverage", "pairs", "lagged"),
     *("distance", "distance²", "distance w²"),
 )
-_ROUNDING = 1e-9  # and so many spacings of the largest coordinate:
-_SPACINGS = 4
+#: Values up to the sum of both are rounding: a constant, and spacings of floating-point
+#: numbers at the largest coordinate.
+_ROUNDING, _SPACINGS = 1e-9, 4
 _LEAST_STD = 1e-6  # in place of 0, where the world has noise
 
 

@@ -30,7 +30,7 @@ from ..arrays import Array
 
 #: Factors c by which squared errors may differ, each of equal weight.
 SCALES = np.delete(np.geomspace(0.3, 20.0, 43), 12)
-#: Lengths m of mean errors, in deviations, and number of their directions.
+#: Lengths m of mean errors, in standard deviations, and number of their directions.
 MEANS, _DIRECTIONS = np.array([0.5, 1.0, 2.0, 4.0]), 8
 #: Number of runs below which a confidence sequence shows nothing.
 FEWEST_SHOWN = 30
@@ -83,7 +83,7 @@ class EProcess(_Mixture):
     margin : (float, float)
         Ratios that are no reason to reject: r is the larger one for c > 1, the smaller
         one for c < 1. The average of each factor is then at most 1 for all NEES that
-        are a ratio inside the margin times χ².
+        are distributed as χ² times a ratio inside the margin.
     """
 
     def __init__(self, margin: tuple[float, float] = (1.0, 1.0)) -> None:
@@ -99,8 +99,8 @@ class EProcess(_Mixture):
         nees : array_like, shape (M, k)
             NEES of M runs at k steps that are chosen beforehand.
         degrees_of_freedom : array_like
-            One number, one per run, shape (M,), or all, shape (M, k). NEES with 0 add
-            no evidence.
+            One number, one per run, shape (M,), or one per NEES, shape (M, k). A NEES
+            with 0 degrees of freedom adds no evidence.
 
         Returns
         -------
@@ -133,7 +133,7 @@ class EProcess(_Mixture):
 
 
 class MeanEProcess(_Mixture):
-    """Evidence against mean errors of about 0, after each of many runs.
+    """Evidence that mean errors are not about 0, after each of many runs.
 
     ::
 
@@ -147,9 +147,10 @@ class MeanEProcess(_Mixture):
     Parameters
     ----------
     largest_mean : float
-        δ, length of a mean error that is no reason to reject, in deviations.
+        δ, largest length of a mean error that is no reason to reject, in standard
+        deviations.
     largest_variance : float
-        v, the same for the variance of a whitened error.
+        v, largest variance of a whitened error that is no reason to reject.
     """
 
     def __init__(self, largest_mean: float, largest_variance: float) -> None:

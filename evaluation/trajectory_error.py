@@ -21,7 +21,7 @@ _ROUNDING = 4 * np.finfo(np.float64).eps
 _LEAST_TO_EXCHANGE = 5  # positions, so that most of them are right
 _FAR = 10.0  # standard deviations between a position and an exchanged truth
 _NEARER = 5.0  # factor between the distances to the own truth and to the other one
-_APART = 2.5  # standard deviations between two truths that an estimate tells apart
+_APART = 2.5  # standard deviations between two truths that an estimate distinguishes
 _MOST_TRIED = 64  # positions whose pairs are tried as alignments
 
 
@@ -175,7 +175,8 @@ def exchanged_positions(estimate: ArrayLike, truth: ArrayLike) -> Exchange:
 
         (ẽᵢ − ẽₖ)ᵀ (g_π(i) − g_π(k)) > (2.5 s)²    for all k ≠ i,
 
-    half the increase of the sum of squares if i and k change places in π.
+    The left side is half the increase of the sum of squares if i and k change places in
+    π.
 
     Parameters
     ----------

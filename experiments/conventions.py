@@ -26,7 +26,7 @@ _STEPS, _SHIFT = 24, 3
 #: An honest square is within a factor _NEAR of 1 or _ERRORS standard errors, not beyond
 #: the factor _FAR.
 _NEAR, _FAR, _ERRORS = 1.5, 2.5, 3.0
-_ROUNDED = 1e-9  # of a pose [m, m, rad]
+_ROUNDED = 1e-9  # difference of poses that is rounding [m, m, rad]
 _GAIN = 1.0  # of log-likelihood of a pose [nats]
 #: NEES / 3 of a drive that another truth may fit, and how many of them are compared.
 _LOST, _MOST_LOST = 10.0, 50
@@ -87,8 +87,8 @@ def mistake_in(
     decides : {"invariant", "additive"}
         The error whose NEES counts where covariances are of the additive error.
     truth_at : callable, optional
-        ``truth_at(steps)`` returns the true poses some steps later (B, T, 3), nan where
-        unknown. By default they are interpolated.
+        ``truth_at(steps)`` returns the true poses (B, T, 3) that number of steps later,
+        nan where unknown. By default, they are interpolated.
 
     Examples
     --------
@@ -125,7 +125,7 @@ def mistake_in(
 
 
 def _are_same(truth: Array, poses: Array) -> bool:
-    """Whether poses are the true ones, but for the rounding of an interpolation."""
+    """Whether poses are the true ones, except for the rounding of an interpolation."""
     gaps = abs(rigid_motion.additive_error(truth, poses))
     known = np.isfinite(gaps)
     return bool(known.any() and (gaps[known] < _ROUNDED).all())
@@ -330,7 +330,7 @@ _TURNED = {
 }
 #: Metres.
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
-#: Metres, of the roots of the variances of positions.
+#: Units of the standard deviations of positions, as matrices that convert them.
 _COVARIANCE_UNITS = {
     what: np.diag([scale, scale, 1.0])
     for unit, size in (("centimetres", 1e-2), ("millimetres", 1e-3))
@@ -393,7 +393,7 @@ def _in_other_units(truth: Array, poses: Array, covariances: Array) -> Iterator[
 
 
 def unit_of(scale: float) -> tuple[str, float]:
-    """Return name and exact size of the known unit nearest to a scale of positions.
+    """Return the name and size of the known unit nearest to a scale of positions.
 
     Examples
     --------
@@ -515,7 +515,7 @@ def _readings(
     yield read("", claims)
     if name:
         yield read("", jacobian @ claims @ np.swapaxes(jacobian, -1, -2))
-    if np.triu(claims, 1).any():  # not diagonal, as in no covariance of another error
+    if np.triu(claims, 1).any():  # covariances of other errors are not diagonal
         others = [kind for kind in FRAMES if kind != of.frame]
         found = [(f"covariances of {FRAMES[kind]}", claims, kind) for kind in others]
         for what, matrices, kind in (*found, *_transported(claims, poses)):

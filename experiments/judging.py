@@ -79,7 +79,7 @@ _SYMMETRIC = 1e-6  # relative difference of two entries
 _INDEFINITE = -1e-9  # eigenvalue of correlations
 _NEAR = 1.5  # a mean NEES / 3 that an honest study may have
 _TIME_UNITS = {"nanoseconds": 1e9, "microseconds": 1e6, "milliseconds": 1e3}
-_COARSER = 1.5  # ratio of intervals
+_COARSER = 1.5  # interval of the truth by that of the estimates
 _ROUNDED = 1e-6  # of a time stamp in nanoseconds since 1970 [s]
 _ASIDE, _ASIDE_GAIN = 0.01, 4.0  # of intervals of time, and of errors
 
@@ -492,7 +492,7 @@ def _notes(found: Iterable[_Inside]) -> tuple[str, ...]:
     if coarse:
         notes.append(
             f"the truth of {coarse[0].estimate.file} has fewer poses than the "
-            "estimate: between them it is interpolated, which adds to the errors."
+            "estimate. Interpolation between these poses adds to the errors."
         )
     flat = [each for each in every if each.estimate.is_spatial]
     if flat:
@@ -572,7 +572,7 @@ def _unmatched(estimate: Estimate, steps: int, dt: float) -> str:
 def _invalid(
     claims: Array, additive: Array, failures: Mapping[int, Failure]
 ) -> dict[int, Failure]:
-    """Find runs with something else than covariances."""
+    """Find runs whose matrices are not covariances."""
     gaps = abs(claims - np.swapaxes(claims, -1, -2)).max(axis=(2, 3))
     sizes = abs(claims).max(axis=(1, 2, 3))[:, None]
     nothing = np.broadcast_to(sizes == 0, gaps.shape)
@@ -665,7 +665,7 @@ def _add_map(
 
 
 def _deciding(parts: Mapping[str, Sequence[_Part]]) -> tuple[str, list[str]]:
-    """Return the error that decides where none is declared, and what that hides.
+    """Return the error that decides where none is declared, and notes about it.
 
     It is the one that rejects fewer estimators. A choice by the mean NEES alone would
     reject an honest estimator in more than 5 % of cases, because it may choose the
@@ -691,8 +691,8 @@ def _deciding(parts: Mapping[str, Sequence[_Part]]) -> tuple[str, list[str]]:
         chosen, other = other, chosen
     return chosen, [
         f"{label}: its covariances agree with the {other} error, but not with the "
-        f"{chosen} one, and one error decides for all estimators; judge {label} by "
-        "itself."
+        f"{chosen} error, which decides for all estimators. Judge {label} in a "
+        "separate call."
         for label, is_bad in rejected[chosen].items()
         if is_bad and not rejected[other][label]
     ]

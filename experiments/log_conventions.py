@@ -2,10 +2,10 @@
 
 A log with clockwise bearings, degrees or shifted rows looks like a log with much noise.
 `mistake_in` reads a part of the log in each of the conventions that are often confused,
-and names the one in which its readings agree with its odometry. Where they agree as
-given, a longer part still shows whether the robot turns before it drives, or the scans
-stand a row too late. It names nothing if no convention explains the log. No truth is
-needed.
+and names the one in which its readings agree with its odometry. If they agree as given,
+a longer part of the log can still show that the robot turns before it drives, or that
+the scans stand one row too late. It names nothing if no convention explains the log. No
+truth is needed.
 
 Symbols
 -------
@@ -39,7 +39,7 @@ from .runs.summary import MOST_REJECTED
 #: Size of the part of a log that is read in other conventions: its first landmarks and
 #: rows of odometry, and blocks of scans spread over them.
 _LANDMARKS, _ROWS, _READINGS, _BLOCK = 40, 8000, 800, 12
-_UNREAD = -1  # id of the landmarks beyond these
+_UNREAD = -1  # id of all other landmarks
 _FEWEST = 30  # readings that are enough to recognise a convention
 #: Gain in log likelihood per reading [nats], and in all, that names a mistake; and by
 #: how much it leads over the next one.
@@ -57,12 +57,12 @@ _FACTORS = np.array(list(product(_SIZES, _SIZES)))
 _FEW = np.array([(1, 1), (4, 4), (0.25, 0.25), (1, 0.25), (4, 1), (0.25, 0.0625)])
 _FINALISTS = 3
 _LARGEST = 4.0  # factor of the noise with which a mistake explains a log
-#: Where the noise hides a mistake: readings of a longer part, its pieces, the rise of
-#: the log likelihood of a reading [nats], by how many standard errors of the pieces it
-#: differs from 0, and in which share of them it rises.
+#: For mistakes that the noise hides: number of readings of a longer part, number of its
+#: pieces, least rise of the log likelihood per reading [nats], least number of standard
+#: errors of this rise, and least share of the pieces in which the likelihood rises.
 _MANY, _PIECES, _RISE, _ERRORS, _MOST = 6000, 30, 0.08, 3.0, 0.95
 _NOTABLE = 2.0  # change of a piece that counts [nats]
-_APART = 2.0  # standard errors by which two hidden mistakes differ
+_APART = 2.0  # standard errors beyond which two hidden mistakes differ
 _FINE, _SEARCHES = np.array(list(product((0.5, 1.0, 2.0), repeat=2))), 3
 _DEGREE = np.pi / 180
 #: Durations of a step that turn velocities into increments where rows hold none [s].
@@ -183,8 +183,9 @@ def explaining(log: slamlog.SlamLog, settings: FilterSettings) -> Iterator[None]
 def part_of(log: slamlog.SlamLog) -> Reading | None:
     """Return the part of a log that is read in other conventions, as it is given.
 
-    It ends with the first scan that shows none of its landmarks; other landmarks count
-    as `_UNREAD`. None if it has no scan, as the first one comes late.
+    The part ends before the first scan that shows none of its landmarks. Landmarks
+    outside the part get the id `_UNREAD`. The result is None if the part has no scan,
+    because the first one comes late.
     """
     rows: list[tuple[float, float, float]] = []
     row_steps, scans, steps, sizes = [], [], [], []
@@ -280,7 +281,7 @@ class _Fit(NamedTuple):
     nis: Array
     #: Share of the readings.
     rejected: Array
-    #: Log likelihood of the scan of each step, (B, S), where it stands in the log.
+    #: Log likelihood of the scan of each step, at its place in the log, (B, S).
     by_step: Array
 
     @property
@@ -325,12 +326,12 @@ class _Comparison:
         return _named(near, before, _FACTORS[k])
 
     def hidden_mistake(self, factors: Array) -> Mistake | None:
-        """Return the mistake that the noise hides from NIS, but not from the log.
+        """Return a mistake that the noise hides from NIS, but the log likelihood shows.
 
-        Two conventions are compared piece by piece of a longer part, both with the best
-        noise of the log as given, near some factors; a larger one would hide anything.
-        The rise of the log likelihood must be significant by its scatter over the
-        pieces [1]_, which holds for a wrong noise, too.
+        Two conventions are compared on each piece of a longer part. Both use the noise
+        near some factors that fits the log as given best; a larger noise would hide any
+        mistake. The rise of the log likelihood must be significant compared with its
+        scatter over the pieces [1]_. This test is also valid for wrong noise.
 
         References
         ----------
@@ -436,7 +437,7 @@ class _Comparison:
 
 
 def _named(found: list[tuple[_Fit, Other]], before: _Fit, factors: Array) -> Mistake:
-    """Return mistakes that have the same effect as one."""
+    """Combine mistakes that have the same effect into one."""
     after = found[0][0]
     k = after.best
     return Mistake(
@@ -455,12 +456,12 @@ def _rise(after: _Fit, before: _Fit) -> tuple[float, float]:
     Returns
     -------
     errors : float
-        Their sum by its standard error.
+        Sum of the rises, divided by its standard error.
     share : float
         The share of pieces in which it rises, among those in which it changes notably.
     """
     scans = np.flatnonzero(before.by_step[0])
-    with np.errstate(invalid="ignore"):  # of passes that failed
+    with np.errstate(invalid="ignore"):  # where a pass failed
         rises = after.by_step[0, scans] - before.by_step[0, scans]
     if not np.isfinite(rises).all():
         return 0.0, 0.0
@@ -640,7 +641,7 @@ def _shifted(given: Reading) -> Iterator[Other]:
 
 
 def _moved(given: Reading) -> Iterator[Other]:
-    """Yield a part of a log with its scans a row of odometry earlier or later."""
+    """Yield a part of a log, with its scans one row of odometry earlier or later."""
     for word, back, by in (("late", "up", -1), ("early", "down", 1)):
         moved = given._replace(
             steps=given.steps + by, is_read=np.roll(given.is_read, by), moved=by

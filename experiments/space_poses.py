@@ -57,8 +57,8 @@ _SMALL = 1e-4  # angle of a rotation below which series are exact [rad]
 _SYMMETRIC = 1e-6  # relative difference of two entries
 _NEAR, _FAR, _ERRORS = 1.5, 2.5, 3.0  # as for poses in the plane, see conventions
 _UNIT = 0.1  # largest difference of the length of a quaternion from 1
-_RESCALED = 0.1  # logarithm of a scale that is another unit
-_SMALLER = 4.0  # by which errors fall in the right convention of the poses
+_RESCALED = 0.1  # logarithm of a scale above which the unit differs
+_SMALLER = 4.0  # factor by which the right convention reduces the errors
 _SHIFTS = (-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0)  # of time stamps, in steps
 _GAIN = 0.25  # of log-likelihood of a pose [nats]
 _DEGREES = np.diag([1.0] * 3 + [np.pi / 180] * 3)
@@ -74,7 +74,7 @@ class Pose(NamedTuple):
     rotations: Array
 
 
-#: Times of true poses (T,) [s], None if pose k is that of pose k of the estimate.
+#: Times (T,) [s] and true poses. Without times, pose k belongs to estimate k.
 _Path = tuple[Array | None, Pose]
 
 
@@ -188,8 +188,8 @@ def judge_in_space(
         ``verdict``, ``reason`` and ``sentence``; ``nees`` per degree of freedom of
         ``pose``, ``position`` and ``rotation``, and ``nees_over_time``, the same for
         each step, None where undefined; ``cause``, the convention that explains
-        the errors, or ""; ``runs``, ``steps``, ``tested_steps``, how many steps are
-        tested together, and ``left_out``, the number of poses without truth.
+        the errors, or ""; ``runs``, ``steps``, ``tested_steps``, the number of steps
+        that are tested together, and ``left_out``, that of poses without truth.
 
     Raises
     ------
@@ -231,8 +231,8 @@ def judge_in_space(
     if not np.isfinite(nees).any():
         raise ValueError(
             f"{drives[0][1].file}: every covariance of six coordinates is singular, "
-            "and gives no NEES: write variances > 0 of all six, or judge poses in the "
-            "plane without --space"
+            "so no NEES is defined: write variances > 0 for all six, or judge poses in "
+            "the plane without --space"
         )
     ratios = {"pose": nees / 6}
     for name, part in (("position", slice(0, 3)), ("rotation", slice(3, 6))):
@@ -269,14 +269,14 @@ def judge_in_space(
 
 
 def _means(ratios: Array) -> Array:
-    """Return averages over runs (M, K) of each step; nan where no run has any."""
+    """Return averages of ratios (M, K) over runs; nan where no run has one."""
     known = np.isfinite(ratios)
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(known, ratios, 0).sum(axis=0) / known.sum(axis=0))
 
 
 def nees_in_space_figure(found: Mapping[str, Any], width_mm: float = 85.0) -> Figure:
-    """Draw the NEES per degree of freedom over time, of what `judge_in_space` returns.
+    """Draw the NEES per degree of freedom over time, from the result of a judgement.
 
     Parameters
     ----------
@@ -380,7 +380,7 @@ def _median_errors(truth: Pose, poses: Pose) -> tuple[float, float]:
 
 
 def _pose_readings(truth: Pose, poses: Pose) -> Iterator[tuple[str, Pose, Pose]]:
-    """Yield truth and estimates as they are in other conventions of the poses."""
+    """Yield truth and estimates, read in other conventions of the poses."""
     origin = Pose(np.zeros_like(poses.positions), np.eye(3) + 0 * poses.rotations)
     inverse = "poses of the world as the robot sees it (inverse)"
     yield inverse, truth, between(poses, origin)
@@ -394,7 +394,7 @@ def _pose_readings(truth: Pose, poses: Pose) -> Iterator[tuple[str, Pose, Pose]]
     ]
     if min(spreads) > 0:
         name, scale = unit_of(float(np.sqrt(spreads[0] / spreads[1])))
-        if abs(np.log(scale)) > _RESCALED:  # not the drift of a scale
+        if abs(np.log(scale)) > _RESCALED:  # else an error of the scale
             yield name, truth, poses._replace(positions=poses.positions * scale)
     steps = np.arange(truth.positions.shape[1])
     for shift in _SHIFTS:
@@ -417,7 +417,7 @@ def _rolled(poses: Pose) -> Pose:
 
 
 def interpolated(start: Pose, end: Pose, share: Array) -> Pose:
-    """Return poses on the twists between two poses, at a share in [0, 1] of each."""
+    """Interpolate between poses along their twists, at shares in [0, 1]."""
     return composed(
         start, exponential(share[..., None] * logarithm(between(start, end)))
     )
@@ -451,7 +451,7 @@ def _poses_of(rows: Array) -> Pose:
 
 
 def _true_paths(path: Path) -> Iterator[tuple[Any, _Path]]:
-    """Yield names, and times and poses; an npz needs no times."""
+    """Yield name, times and poses of each drive; an npz may have no times."""
     if path.suffix == ".npz":
         for name, (rows,), times in _npz_drives(path, {"poses": (7,)}):
             yield name, (times, _poses_of(rows))
@@ -487,7 +487,7 @@ def _of_npz(path: Path) -> Iterator[tuple[Any, SpaceEstimate]]:
 def _npz_drives(
     path: Path, wanted: Mapping[str, tuple[int, ...]]
 ) -> Iterator[tuple[Any, list[Array], Array | None]]:
-    """Yield names, arrays (T, ...) of these shapes, poses first, and times, if any."""
+    """Yield name, arrays (T, ...) of given shapes, and times, if any, of each drive."""
     names, seeds, times = " and ".join(wanted), None, None
     try:
         with path.open("rb") as stream, np.load(stream) as archive:
@@ -514,7 +514,7 @@ def _check_npz(
     times: Array | None,
     drives: int,
 ) -> None:
-    """Refuse arrays (E, T, ...) of other shapes, or with other poses or times."""
+    """Refuse wrong shapes of arrays (E, T, ...), and invalid quaternions or times."""
     names, (count, steps) = " and ".join(wanted), (*arrays[0].shape, 0)[:2]
     due = [(drives, steps, *shape) for shape in wanted.values()]
     if [array.shape for array in arrays] != due:
@@ -530,7 +530,7 @@ def _check_npz(
     if times is None:
         return
     if times.shape != (count, steps) or not (np.diff(times) > 0).all():
-        raise ValueError(f"{path}: times must be (T,) for each drive, and grow")
+        raise ValueError(f"{path}: times must be (T,) for each drive, and increase")
 
 
 def _checked(file: str, matrices: Array) -> Array:
@@ -556,7 +556,7 @@ def _within(
             what = estimate.file if estimate.times is None else "the truth"
             raise ValueError(
                 f"{what} has no times, so {estimate.file} and its truth must have "
-                f"equally many poses, got {count} and {others}"
+                f"the same number of poses, got {count} and {others}"
             )
         return path, estimate, 0
     inside = np.flatnonzero(near_truth(estimate.times, due))

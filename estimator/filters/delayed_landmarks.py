@@ -53,10 +53,10 @@ from ..support.saved_states import NUMBERS, WHOLE, Table, with_prefix, without_p
 from .conditioning import moves_of, retracted
 from .gaussian_map import GaussianMap
 
-#: Past poses kept; beyond it, the one nearest to the pose before it goes, or the
-#: oldest of several such.
+#: Largest number of past poses. Beyond it, the pose nearest to its predecessor is
+#: removed, or the oldest of several equally near ones.
 MOST_POSES = 40
-ALIKE = 1e-3  # equal distances of poses, beyond their rounding far from the origin
+ALIKE = 1e-3  # relative difference of distances that count as equal
 CERTAIN = 10.0  # distance of a placed landmark, in its standard deviations
 BENT = 0.1  # second-order change of its readings, in theirs
 UNLIKELY = 23.0  # 2 log 10⁵: excess of the cost of other places
@@ -362,8 +362,8 @@ def _place(
 ) -> bool:
     """Add a landmark to the map if its readings determine it.
 
-    The fit is relative to the robot: far from the world's origin, points that turn
-    about it would lose their digits.
+    The fit is relative to the robot. Far from the world's origin, a rotation about the
+    origin would lose digits of the points.
     """
     world, P, reference = gaussian.used
     here = world[:2].copy()
@@ -474,7 +474,7 @@ def _guesses(seen: SeenLandmark, state: Array) -> list[Array]:
 def _conditioned(
     P: Array, fit: _Fit, columns: IntArray, turns: bool
 ) -> tuple[Array, Array]:
-    """Return the way of state and landmark by all readings, and their covariance."""
+    """Return the correction of state and landmark by all readings, and covariances."""
     cross, shift = fit.Hc @ P[columns], fit.shift(P[columns])
     to_landmark = -cross.T @ fit.G.T
     P = np.block(

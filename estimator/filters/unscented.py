@@ -58,7 +58,7 @@ def predict_through_points(
     for k in range(2 * points):
         sign, e = 1.0 if k < points else -1.0, deviations[:, k % points]
         poses[0, k], poses[1, k], poses[2, k], _, _ = composed_jit(
-            sign * e[0],  # from the mean: an average of large numbers loses digits
+            sign * e[0],  # relative to the mean: averages of large numbers lose digits
             sign * e[1],
             mean[2] + sign * e[2],
             forward + sign * e[3],

@@ -42,7 +42,7 @@ Noise = tuple[float, ...]  # the four numbers of a filter, see `Sensor`
 Slopes = tuple[Real, Real, Real, Real]
 
 
-#: Value of ``landmark_init`` with which readings of new landmarks wait.
+#: Value of ``landmark_init`` that lets readings of new landmarks wait.
 DELAYED = "delayed"
 
 
@@ -193,7 +193,7 @@ class Sensor:
         return replace(self, **numbers)
 
     def delayed(self) -> Sensor:
-        """Return the sensor as one whose single reading does not place a landmark."""
+        """Return a copy of the sensor whose single readings do not place landmarks."""
         return replace(self, name=f"{self.name} ({DELAYED})", inverse=None)
 
     def noise(self, measurement_std: ArrayLike) -> Noise:

@@ -119,7 +119,7 @@ def _judge_in_space(files: FilesOfEstimates, given: JudgeOptions, space: str) ->
         raise BadInputError(unknown_choice("--space", space, ERRORS))
     others = given.drives, given.covariances, given.frame, given.align
     if given.truths is None or any(each is not None for each in others):
-        raise BadInputError("--space needs --truth, and accepts only --out beside it")
+        raise BadInputError("--space needs --truth, and accepts no option but --out")
     found = judge_in_space(
         files, given.truths, covariances=kind, order=order or ORDERS[0]
     )

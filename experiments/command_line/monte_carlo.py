@@ -158,8 +158,8 @@ def _quote_checks(summary: dict[str, Any], world: Scenario) -> None:
     """Add findings of `check_estimator` about own filters that are not consistent.
 
     The check has a world of its own, with the sensor and the motion of the presets. If
-    only the map is wrong, a wrong belief about the pose alone is not quoted: the pose
-    is then wrong given the reported map, but not given the truth.
+    only the map is wrong, findings about the pose alone are not quoted: the pose then
+    disagrees with the reported map, but not with the truth.
     """
     from ...estimator.check_estimator import find_breaches
     from ...estimator.registry import find_estimator

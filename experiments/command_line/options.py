@@ -105,7 +105,7 @@ class Options:
         σx,σy,σθ of the first pose [m, m, rad].
     landmark_init
         How a landmark enters the map: full correlates it with the pose; independent, as
-        in the homework, does not; delayed waits until several poses have seen it.
+        in the homework, does not; delayed waits for readings from several poses.
     gate_probability
         Reject readings outside this probability region of their innovation.
     range_std_per_metre
@@ -227,7 +227,7 @@ class Options:
     def read(self, path: Path, reporter: Reporter) -> "SlamLog":
         """Read a log of any known format, with its truth if that is in another file.
 
-        Notes what the importer omitted, and where truth and noise are from.
+        Notes what the importer omitted, and where truth and noise come from.
 
         Raises
         ------
@@ -253,7 +253,7 @@ class Options:
             reporter.note(f"left out of the log: {log.header['left_out']}")
         found, start = log.header.get("truth", "none"), log.header.get("start_from")
         if self.truth is None and start == "ground truth" and found != "none":
-            reporter.note(f"truth: {found}; the log starts at its pose")
+            reporter.note(f"truth: {found}; the log starts at the true pose")
         if "noise" in log.header and "motion_std" in log.header:
             reporter.note(f"noise {log.header['noise']}")
         return without_identities(log) if self.hide_identities else log

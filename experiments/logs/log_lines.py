@@ -14,7 +14,7 @@ from typing import NamedTuple
 from ...sim_configs.scenario_files import replace_when_written
 
 MAX_ID_DIGITS = 18  # every such number fits int64
-LARGEST = 1e100  # number whose square, and a sum of such, is finite
+LARGEST = 1e100  # number whose square is finite, and sums of such squares are
 MAX_SHOWN = 60  # characters of a wrong text that an error repeats
 _COMMENT = re.compile(r"#|%|//")
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
@@ -58,7 +58,7 @@ number, got 'east'
         )
 
     def to_real(self, field: str) -> float:
-        """Read a number of size 1e100 at most; raise LogError for anything else."""
+        """Read a number of at most ±1e100; raise LogError for anything else."""
         try:
             value = float(field)
         except ValueError:

@@ -8,7 +8,8 @@ in 5 % of cases. Later verdicts therefore follow from the tests of
 together: :class:`Watch` applies them to the runs in their order. If a study is
 extended, its first verdict has 4 % of the 5 %, and all later ones have 1 % together.
 
-Both cover the pose and, where it is known, the map, whose evidence weighs a tenth.
+Both cover the pose and, where it is known, the map. The evidence against the map has
+the weight 0.1.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ _ERROR_RATE = 0.05
 #: Weight of the evidence against the map.
 MAP_SHARE = MAP_ERROR_RATE / _ERROR_RATE
 _STEPS = 10
-_MOST_NUMBERS = 2**14  # of NEES at once, which limits the memory
+_MOST_NUMBERS = 2**14  # NEES that are processed at once, to limit the memory
 _LARGEST_LOG = 700.0
 _MARGIN = f"[{EQUIVALENCE_MARGIN.low:g}, {EQUIVALENCE_MARGIN.high:g}]"
 _INTERVAL = f"{1 - SHOWN_ERROR_RATE:.0%} confidence sequence".replace("%", " %")
@@ -161,7 +162,7 @@ class Watch:
     def shown_after(self) -> int | None:
         """Number of runs after which both ratios were shown to be near 1, if they are.
 
-        That of the pose counts alone if fewer than 2 runs have a NEES of the map.
+        Only the ratio of the pose counts if fewer than 2 runs have a NEES of the map.
         """
         is_undefined = self._has_maps and self._on_map.undefined
         if is_undefined or not self._is_settled:
@@ -294,8 +295,8 @@ def looks_summary(scores: EstimatorScores, watch: Watch) -> dict[str, Any]:
     dict
         ``rejected_after`` and ``shown_after``, numbers of runs or None; ``e_value`` and
         ``map_e_value``, the largest ones; ``interval`` and ``map_interval``, see
-        :class:`Watch`; ``earlier_looks``, the numbers of runs of earlier verdicts. Of
-        the map, both are unknown if the pose alone is judged.
+        :class:`Watch`; ``earlier_looks``, the numbers of runs of earlier verdicts. The
+        entries of the map are None if only the pose is judged.
     """
     map_ends = watch.map.interval if watch.has_map else Band(np.nan, np.nan)
     return {
@@ -358,8 +359,8 @@ def _intervals(watch: Watch, maps: MapReport | None) -> str:
         return f"{interval}; {map_not_shown(maps)}"
     if watch.map.after is not None:
         return f"{interval}, as does that of the map, {watch.map.text()}"
-    of_map = f"that of the map, {watch.map.text()}, is not"
-    return f"{interval}, and {of_map}: more runs are needed"
+    of_map = f"that of the map, {watch.map.text()}, does not"
+    return f"{interval}, but {of_map}: more runs are needed"
 
 
 class _Refusal(NamedTuple):
@@ -390,7 +391,7 @@ def _refusal(
 def _first_refusal(
     scores: EstimatorScores, frame: ErrorFrame, report: ConsistencyReport
 ) -> _Refusal | None:
-    """Return whether a first verdict on a chosen number of runs rejected the filter."""
+    """Return the rejection by a first verdict on a chosen number of runs, if any."""
     looks = _looks(scores)
     if not looks or looks[0].until:
         return None

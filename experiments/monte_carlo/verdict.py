@@ -217,7 +217,7 @@ def map_not_shown(maps: MapReport) -> str:
 def map_refusal(maps: MapReport, evidence: str = "") -> str:
     """Write how wrong a rejected map is, by the test that shows it best.
 
-    The evidence is the p-value of this test by default.
+    By default, the evidence is the p-value of this test.
     """
     evidence, ratio = evidence or p_text(maps.p_value), maps.equivalence.statistic
     if maps.indefinite:
@@ -401,14 +401,14 @@ def coarse_bearings(scenario: str, entries: Mapping[str, Mapping[str, Any]]) -> 
     Returns
     -------
     str
-        See `coarse_suspicion`; empty if no filter is refused whose landmarks are placed
-        by one reading, or if the sensor is without a limit.
+        See `coarse_suspicion`. Empty if no filter that places landmarks by one reading
+        is rejected, or if the sensor has no maximum range.
 
     Examples
     --------
     >>> world = "sensor = {std = [0.3, 0.1], max_range = 5.0}"
     >>> coarse_bearings(world, {"ekf": {"verdict": "not consistent"}})
-    'A bearing that is wrong by σβ = 0.3 rad moves a reading at 5 m by 0.225 m off ...
+    'A bearing error of σβ = 0.3 rad moves a reading at 5 m by 0.225 m off its ...
     >>> coarse_bearings(world, {"ekf": {"verdict": "consistent"}})
     ''
     """
@@ -522,7 +522,7 @@ def _failed(label: str, entry: Mapping[str, Any], runs: int) -> str:
 CONVENTION = "convention"
 #: The cause where the map alone is rejected.
 MAP = "map"
-_WRONGLY = "; the filter computes or reports them wrongly"
+_WRONGLY = "; the filter computes or reports these covariances wrongly"
 _MOSTLY = 0.5  # share of the squared errors that an offset makes
 _NEARLY = 1.5  # ratio of a landmark that agrees, beside others that do not
 _ALIKE = 2.0  # largest by smallest ratio of landmarks with one scale
@@ -629,9 +629,9 @@ def _range(values: Array) -> str:
 
 
 def names_cause(entry: Mapping[str, Any]) -> bool:
-    """Whether the diagnosis in an entry of the summary says that something is wrong.
+    """Whether the diagnosis in an entry of the summary names a problem.
 
-    "cannot tell" does not where no test rejects the errors and no run has failed.
+    "cannot tell" names none if no test rejects the errors and no run has failed.
     """
     found = entry.get("diagnosis")
     if found is None or found["cause"] == HONEST:

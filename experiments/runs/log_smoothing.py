@@ -87,23 +87,23 @@ def smooth(
     associate: bool = False,
     **options: Any,
 ) -> SmoothedDrive | SmoothedLog:
-    """Smooth a drive, or a log or the file of one, as ``slamgym smooth`` does.
+    """Smooth a drive, a log, or the file of a log, as ``slamgym smooth`` does.
 
     Parameters
     ----------
     what : Drive, SlamLog or path
         A drive goes to :func:`slamgym.estimator.smooth`, a log to `smooth_log`.
     settings : FilterSettings, optional
-        Of a log, see `smooth_log`.
+        Settings for a log, see `smooth_log`.
     associate : bool
-        Whether to repair the associations by the whole drive.
+        Whether the whole drive repairs the associations.
     **options
-        Of a drive, see :func:`slamgym.estimator.smooth`.
+        Options for a drive, see :func:`slamgym.estimator.smooth`.
 
     Raises
     ------
     TypeError
-        If it is none of these, or has options of the other kind.
+        If `what` is none of these, or an option belongs to the other kind.
 
     Examples
     --------
@@ -116,12 +116,12 @@ def smooth(
     """
     if not isinstance(what, SlamLog | str | PathLike):
         if settings is not None:
-            raise TypeError("settings are of a log; a drive has a noise of its own")
+            raise TypeError("settings must be None for a drive, which has a noise")
         return smooth_drive(what, associate=associate, **options)
     if options:
         raise TypeError(
-            f"{', '.join(options)}: options of a drive; those of a log are in the "
-            "settings, as settings_for(log, estimator='smoother', options={...})"
+            f"a log takes no options of a drive, got {', '.join(options)}: give "
+            "settings=settings_for(log, estimator='smoother', options={...})"
         )
     return smooth_log(what, settings, associate=associate)
 

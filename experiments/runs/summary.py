@@ -514,7 +514,7 @@ def _coarse(log: SlamLog, settings: FilterSettings | None) -> str:
 def coarse_suspicion(bearing_std: float, range_std: float, distance: float) -> str:
     """Write whether bearings are too coarse beside fine ranges.
 
-    A reading of deviations (σβ, σr) at the range r lies on an arc, which is r σβ²/2
+    A reading with the noise (σβ, σr) at the range r lies on an arc, which is r σβ²/2
     away from its tangent at one σβ.  A filter that places a landmark by one reading
     takes the tangent for the arc, and is overconfident where this exceeds σr.
 
@@ -528,7 +528,7 @@ def coarse_suspicion(bearing_std: float, range_std: float, distance: float) -> s
     Examples
     --------
     >>> coarse_suspicion(0.3, 0.1, 5.0)
-    'A bearing that is wrong by σβ = 0.3 rad moves a reading at 5 m by 0.225 m off ...
+    'A bearing error of σβ = 0.3 rad moves a reading at 5 m by 0.225 m off its ...
     >>> coarse_suspicion(0.1, 0.1, 5.0)
     ''
     """
@@ -536,10 +536,10 @@ def coarse_suspicion(bearing_std: float, range_std: float, distance: float) -> s
     if off <= range_std:
         return ""
     return (
-        f"A bearing that is wrong by σβ = {bearing_std:g} rad moves a reading at "
-        f"{distance:.3g} m by {off:.3g} m off its tangent, and σr is {range_std:.3g} "
-        "m: filters that place a landmark by one reading are overconfident; those of "
-        "slamgym wait for several with landmark_init=delayed."
+        f"A bearing error of σβ = {bearing_std:g} rad moves a reading at "
+        f"{distance:.3g} m by {off:.3g} m off its tangent, but σr is {range_std:.3g} "
+        "m. Filters that place a landmark by one reading are overconfident. With "
+        "landmark_init=delayed, filters of slamgym wait for several readings."
     )
 
 

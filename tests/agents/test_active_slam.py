@@ -692,7 +692,7 @@ def test_goals_are_the_ways_to_what_is_nearest_and_to_what_is_known_best():
 @far_origins
 @pytest.mark.parametrize("name", ["coverage", "revisit", "greedy"])
 def test_an_agent_acts_far_from_the_origin_as_at_the_origin(name, far):
-    """Among inner walls, whose sides and detours are computed from coordinates."""
+    """Sides and detours of inner walls are computed from coordinates."""
     acted = []
     for origin in ((0.0, 0.0), far):
         scenario = moved_world(load_scenario("active_rooms"), origin)
@@ -704,7 +704,7 @@ def test_an_agent_acts_far_from_the_origin_as_at_the_origin(name, far):
             _, reward, *_ = env.step(action.astype(np.float32))
             steps.append([*action, reward])
         acted.append(steps)
-    # A rounding counts by the smallest standard deviation, of a millimetre.
+    # Rounding is divided by the smallest standard deviation, a millimetre.
     np.testing.assert_allclose(*acted, rtol=0, atol=1e3 * rounding(far, 8))
 
 

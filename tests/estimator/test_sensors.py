@@ -548,7 +548,7 @@ def test_landmarks_are_placed_from_several_poses(label, sensor):
     assert squared < 13 * 2.5
 
 
-def test_bearing_and_range_wait_for_several_poses_if_told_so():
+def test_delayed_readings_of_bearing_and_range_wait_for_several_poses():
     slam = waiting_filter("invariant", BEARING_RANGE, landmark_init="delayed")
     pose, _ = drive_past(slam, BEARING_RANGE, 1)
     assert (slam.landmark_ids, len(slam.waiting.ids)) == ((), 5)
@@ -562,7 +562,7 @@ def test_bearing_and_range_wait_for_several_poses_if_told_so():
     assert error @ np.linalg.solve(belief.error_covariance(), error) < 2.5 * len(error)
 
 
-def test_delayed_landmarks_of_fine_bearings_are_those_of_the_usual_filter():
+def test_delayed_landmarks_of_fine_bearings_equal_those_of_the_usual_filter():
     noise = {"motion_std": (0.01, 0.01, 0.003), "measurement_std": (0.003, 0.01)}
     slams = [
         make_estimator("invariant", **noise, landmark_init=how)
@@ -764,7 +764,7 @@ def test_landmarks_far_from_the_origin_are_placed_as_at_the_origin(label, sensor
 
 @far_origins
 def test_past_poses_at_equal_distances_are_forgotten_in_the_same_order(far):
-    """Rounding decided which of them is nearest to the one before it."""
+    """Rounding does not decide which of them is nearest to its predecessor."""
     left = []
     for origin in ((0, 0), far):
         slam = waiting_filter("ekf", BEARING, initial_pose=(*origin, 0))

@@ -82,7 +82,7 @@ def test_with_the_frame_anchored_every_filter_is_consistent(name):
 def test_a_filter_that_rotates_covariances_has_no_nees_before_its_robot_has_turned(
     name,
 ):
-    """Without noise to its side, the robot's y is certain until the heading errs."""
+    """Without sideways noise, y is certain until the heading has an error."""
     world = load_scenario("corridor").with_changes(steps=3)
     nees = monte_carlo(world, ["ekf", name], runs=10).pose_nees_invariant.values
     np.testing.assert_array_equal(np.isnan(nees[1]), np.isnan(nees[0]))
@@ -109,7 +109,7 @@ def test_large_heading_jumps_do_not_mislead_the_invariant_filter():
 
 
 @pytest.mark.slow
-def test_coarse_bearings_beside_fine_ranges_need_several_to_place_a_landmark():
+def test_coarse_bearings_beside_fine_ranges_need_several_readings_to_place_a_landmark():
     """What hurts is that one reading places a landmark, not the update.
 
     A reading lies on an arc, r σβ²/2 = 0.22 m off its tangent, for σr = 0.1 m.

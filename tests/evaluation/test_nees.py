@@ -123,9 +123,7 @@ def test_a_covariance_singular_within_rounding_has_no_nees(size):
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("frame", ["additive", "invariant"])
-def test_a_variance_of_rounding_beside_that_of_the_other_axis_gives_no_nees(
-    axis, frame
-):
+def test_a_variance_of_one_axis_that_is_rounding_gives_no_nees(axis, frame):
     covariances = np.tile(np.diag([1e-4, 1e-4, 1e-4]), (3, 1, 1))
     covariances[:, axis, axis] = 0.0, 1e-22, 1e-14
     poses = np.zeros((3, 3))
@@ -134,7 +132,7 @@ def test_a_variance_of_rounding_beside_that_of_the_other_axis_gives_no_nees(
 
 
 def test_a_position_certain_in_a_slanted_direction_has_no_nees():
-    """A certain y seen along a heading that is a little off, rounded by a solution."""
+    """A certain y in the frame of a slightly wrong heading, rounded by a solver."""
     rng = np.random.default_rng(4)
     basis = np.zeros((2000, 3, 2))
     basis[:, 0, 0] = basis[:, 2, 1] = 0.01

@@ -130,7 +130,7 @@ def test_tails_have_the_p_value_of_anscombe_and_glynn(law, count, scale):
 @pytest.mark.parametrize(
     ("factor", "size"), [(1.8, "too small"), (0.5, "too large"), (2.5, "too small")]
 )
-def test_noise_of_another_size_in_half_of_the_time_is_not_tails_first(factor, size):
+def test_the_size_of_noise_that_changes_at_half_time_comes_before_tails(factor, size):
     numbers = draw((40, 200), seed=6)
     numbers[:, :100] *= factor
     sums = sums_of("bearing", numbers)
@@ -188,7 +188,7 @@ def test_noise_where_none_is_assumed_counts_in_units_of_a_millionth():
 
 @far_origins
 def test_rounding_of_coordinates_is_no_noise(far):
-    """Where neither world nor filter has any, along and sideways."""
+    """Neither world nor filter has noise along or sideways."""
     poses, rng = np.zeros((1, 50, 3)), np.random.default_rng(3)
     poses[0, :, 2] = rng.uniform(-np.pi, np.pi, 50).cumsum()
     odometry = np.column_stack([rng.uniform(0, 2, 50), poses[0, :, 2]])[None]

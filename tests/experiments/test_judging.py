@@ -826,8 +826,8 @@ def test_an_estimator_that_diverges_does_not_choose_the_error_of_others():
     assert judging._deciding(parts) == ("additive", [])
 
 
-def test_estimators_of_two_conventions_are_told_that_one_error_decides():
-    """An estimator that is honest in the other error is to be judged by itself."""
+def test_an_estimator_that_agrees_only_with_the_other_error_is_named():
+    """One error decides for all estimators of a call."""
     nees = np.random.default_rng(7).chisquare(3, (60, 21))
     parts = {
         label: [judging._Part({f"pose_nees_{one}": nees, f"pose_nees_{two}": far}, ())]
@@ -840,14 +840,14 @@ def test_estimators_of_two_conventions_are_told_that_one_error_decides():
     label, other = ("a", "additive") if frame == "invariant" else ("b", "invariant")
     assert note == (
         f"{label}: its covariances agree with the {other} error, but not with the "
-        f"{frame} one, and one error decides for all estimators; judge {label} by "
-        "itself."
+        f"{frame} error, which decides for all estimators. Judge {label} in a "
+        "separate call."
     )
 
 
 @pytest.mark.parametrize("turn", [0.1, 0.5])
 def test_a_clock_that_is_half_a_step_off_is_named(additive, turn):
-    """Also where the robot turns so much that no interpolated truth is the true one."""
+    """The robot may turn so much that interpolation of the truth is inaccurate."""
     estimates, truth = additive(np.random.default_rng(9), late=0.5, turn=turn)
     said = entry_of(judge(estimates, truth=truth))["diagnosis"]["sentence"]
     assert said.startswith("convention: time stamps that are 0.5 steps too late: ")
@@ -863,7 +863,7 @@ def test_the_truth_given_as_the_estimate_is_named_despite_rounding(elsewhere):
     assert said.startswith("convention: the poses are the true ones to the last digit")
 
 
-def test_a_truth_with_fewer_poses_than_the_estimate_is_told(elsewhere):
+def test_a_truth_with_fewer_poses_than_the_estimate_is_reported(elsewhere):
     mine, truth = elsewhere
     assert not any("fewer poses" in note for note in notes_of(mine, truth))
     for path in truth.iterdir():

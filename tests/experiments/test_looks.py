@@ -185,7 +185,7 @@ def test_a_study_is_not_decided_before_the_map_is():
     landmarks[:80] = np.nan  # no map
     found = verdict(nees, UNTIL, landmarks=landmarks)
     assert found.word == "not shown"
-    assert "that of the map, [0.000, inf], is not: more runs are needed" in found.reason
+    assert "that of the map, [0.000, inf], does not: more runs are" in found.reason
     assert verdict(nees, UNTIL).word == "consistent"
 
 

@@ -208,7 +208,7 @@ class Sure(EkfSlam):
 """
 
 
-def test_of_a_filter_whose_map_alone_is_wrong_no_finding_about_the_pose_is_quoted(
+def test_no_finding_about_the_pose_is_quoted_if_only_the_map_is_wrong(
     here, monkeypatch
 ):
     (here / "sure.py").write_text(SURE_OF_ITS_MAP)

@@ -185,7 +185,7 @@ def test_a_map_of_wrong_scale_is_refused_by_name(factor, size):
     assert entry["diagnosis"]["cause"] == "map"
     cause = entry["diagnosis"]["sentence"]
     assert f"scale: the covariances are too {size}" in cause
-    assert cause.endswith("; the filter computes or reports them wrongly.")
+    assert cause.endswith("computes or reports these covariances wrongly.")
     assert entry["decisions"]["final_step"]["accepted"]
 
 

@@ -80,7 +80,7 @@ def test_innovations_of_a_filter_that_associates_may_be_of_wrong_landmarks():
     assert any("too much noise, or associates wrongly." in w for w in warnings)
 
 
-def test_bearings_that_are_coarse_beside_fine_ranges_are_told():
+def test_bearings_that_are_coarse_beside_fine_ranges_are_reported():
     """The median distance is 4.1 m: σβ = 0.3 moves a reading by 0.19 m."""
     done = run(standing([PLACES] * 30, ids=[1, 2, 3]))
 
@@ -90,9 +90,9 @@ def test_bearings_that_are_coarse_beside_fine_ranges_are_told():
         return run_warnings(done, settings)
 
     (warning,) = said(0.3)
-    assert "is wrong by σβ = 0.3 rad moves a reading at 4.1" in warning
+    assert "error of σβ = 0.3 rad moves a reading at 4.1" in warning
     assert "by 0.18" in warning
-    assert warning.endswith("wait for several with landmark_init=delayed.")
+    assert warning.endswith("filters of slamgym wait for several readings.")
     for silent in said(0.2), said(0.3, landmark_init="delayed"), run_warnings(done):
         assert silent == []
 

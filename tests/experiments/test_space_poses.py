@@ -278,7 +278,7 @@ def test_the_command_judges_poses_in_space(tmp_path):
     assert "--space must be one of left, right, decoupled, got 'up'" in done.stderr
 
 
-def test_an_error_of_the_scale_is_no_other_unit(tmp_path):
+def test_an_error_of_the_scale_is_not_named_as_a_unit(tmp_path):
     places = write(tmp_path, 13, WRITTEN["left"], runs=3, noise=1e-3)
     for path in (tmp_path / "e").iterdir():
         rows = np.loadtxt(path)

@@ -247,8 +247,8 @@ def test_the_example_of_the_page_runs(folder, monkeypatch, tmp_path):
          "odometry.csv, line 1: expected a first row with the columns t, d, alpha or"),
         ({"odometry": "# motion: arc\n" + ODOMETRY}, "line 1: expected turn-last, mid"),
         ({"odometry": "t,d,alpha\n50,1,0\n100,1,0\n150,1,0\n"},
-         r"odometry.csv, line 1: expected the unit of t in its name, as 't \[ms\]', 't "
-         r"\[us\]' or 't \[s\]', got steps of 50 without a unit"),
+         r"odometry.csv, line 1: expected the unit of t in its name, such as 't \[ms\]"
+         r"', 't \[us\]' or 't \[s\]', got steps of 50 without a unit"),
         ({"odometry": "t,d,alpha\n1e-7,1,0\n2e-7,1,0\n3e-7,1,0\n"}, "steps of 1e-07"),
         ({"groundtruth": "t,x,y\n0,1,1\n1e5,1,1\n2e5,1,1\n"},
          r"groundtruth.csv, line 1: expected the unit of t in its name"),
@@ -257,7 +257,7 @@ def test_the_example_of_the_page_runs(folder, monkeypatch, tmp_path):
          "measurements.csv, line 3: expected readings within .* and in one unit, got 98"
          " of 99 outside it, the first at t = 500"),
         ({"measurements": "t,id,bearing,range [ft]\n1,4,0,1\n"},
-         r"line 1: expected a unit of m, .*: convert the column, got 'range \[ft\]'"),
+         r"line 1: expected one of the units m, .* got 'range \[ft\]': convert the"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_in_a_table_is_named(folder, changes, message):
@@ -296,18 +296,18 @@ POSES = TRUTH.replace("t,x,y,theta", "t,{0}x,{0}y,{0}theta")
         ("odom_xgt", "", True),
     ],
 )
-def test_poses_in_a_file_named_as_an_estimate_are_no_truth(
+def test_poses_in_a_file_named_as_an_estimate_are_not_the_truth(
     folder, name, columns, is_truth
 ):
     log = own(folder, **{name: POSES.format(columns)})
     assert log.start.tolist() == ([5, 6, 0.25] if is_truth else [0, 0, 0])
     assert log.header["truth"] == (f"{name}.csv" if is_truth else "none")
-    told = f"the poses of {name}.csv, which no name calls the truth: name the columns"
-    assert log.header.get("left_out", "").startswith(told) != is_truth
+    note = f"the poses of {name}.csv, since no name marks them as the truth: name"
+    assert log.header.get("left_out", "").startswith(note) != is_truth
 
 
 @pytest.mark.parametrize("prefix", ["", "gt_"])
-def test_poses_beside_odometry_are_the_truth_if_a_name_says_so(file, prefix):
+def test_poses_beside_odometry_are_the_truth_if_a_name_marks_them(file, prefix):
     head = f"t,v,omega,id,bearing,range,{prefix}x,{prefix}y,{prefix}yaw\n"
     log = read_log(file(head + "0,1,0,4,0,9,5,6,0\n1,1,0,4,0,8,6,6,0\n"))
     assert log.start.tolist() == ([5, 6, 0] if prefix else [0, 0, 0])
@@ -325,7 +325,7 @@ def test_poses_that_are_given_as_the_truth_are_the_truth(folder, file):
 def test_commands_name_the_file_that_they_take_for_the_truth(folder, tmp_path):
     place = folder(odometry=ODOMETRY, measurements=MEASUREMENTS, poses=TRUTH)
     shown = " ".join(slamgym("replay", place, "--out", tmp_path / "r").output.split())
-    assert "truth: poses.csv; the log starts at its pose" in shown
+    assert "truth: poses.csv; the log starts at the true pose" in shown
 
 
 # True paths

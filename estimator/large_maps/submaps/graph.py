@@ -506,7 +506,7 @@ class Chain:
     The frame is the composition of the last poses of all submaps since the start of the
     run or the last join.  Its covariance is consistent, but does not account for loops
     closed since then.  All frames, and the joined map, are relative to the position of
-    the start: a map that turns about a far origin loses its digits.
+    the start: a rotation about a far origin would lose digits of the map.
 
     Parameters
     ----------

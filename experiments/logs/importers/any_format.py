@@ -44,7 +44,7 @@ _OF_UTIAS = re.compile(
     r"Robot\d+_\w+\.dat|Barcodes\.dat|Landmark_Groundtruth\.dat", re.IGNORECASE
 )
 _NUMBERS = "numbers without names"
-#: By which texts begin that are no tables.
+#: Beginnings of texts that are not tables, and names of their formats.
 _MARKUP = (
     (r"[{\[]", "JSON"),
     (r"<", "XML"),
@@ -288,7 +288,7 @@ def _format_of_log(
     if _OF_UTIAS.fullmatch(source.name):
         raise slamlog.LogError(
             f"{source}: expected a log, got a file of UTIAS MR.CLAM: give its folder, "
-            "which holds odometry, measurements and Barcodes.dat of a drive"
+            "which holds the odometry, the measurements and Barcodes.dat of a drive"
         )
     kind, table = _format_of(source, lines)
     if kind == _NUMBERS:
@@ -364,7 +364,7 @@ def _unknown(line: log_lines.LogLine) -> slamlog.LogError:
             raise line.error(
                 f"a log or a path; the nearest formats are csv with named columns "
                 f"({named_columns.EXPECTED}) and slamlog 1",
-                f"{name}, {log_lines.shown(line.text)}: convert it to such tables",
+                f"{name}, {log_lines.shown(line.text)}: convert it to one of them",
             )
     first, *_ = log_lines.split_fields(line.text)
     is_numeric = log_lines.is_number(first)

@@ -11,9 +11,10 @@ several of four kinds, which its columns tell apart::
     landmarks      id, x, y
 
 Other columns are ignored. `SYNONYMS` lists further names of each column; a unit may
-follow in brackets or after an underscore. Poses beside odometry, or in a file whose
-name suggests an estimate, are the truth only if a name says so. Comments
-``# key: value`` with the keys of a slamlog set the same things.
+follow in brackets or after an underscore. Poses in a table with odometry, or in a file
+whose name suggests an estimate, are the truth only if the name of a column or of the
+file marks them. Comments ``# key: value`` with the keys of a slamlog have the same
+effect as there.
 """
 
 import math
@@ -69,7 +70,7 @@ _WORDS = {
 }
 UNITS = {word: size for size, words in _WORDS.items() for word in words.split()}
 UNITS[""] = 1.0
-#: Names of t that state its unit themselves.
+#: Names of t that state its unit.
 _TIMED = ("sec", "secs", "seconds", "step", "k")
 #: The columns of each kind, in the forms that it may have.
 FORMS = {
@@ -89,7 +90,7 @@ _STEMS = {
     "truth": "truth|gt(?!h)",
     "landmarks": "landmark|map|world|beacon",
 }
-#: Names of columns or files that call poses the truth, and of files that do not.
+#: Parts of names that mark poses as the truth, and of file names that mark estimates.
 _TRUE = "truth|true|gt(?!h)|mocap|vicon|optitrack"  # not length
 _ESTIMATED = "odom|estim|slam|ekf|filter|predict|dead|wheel|encoder|imu"
 #: Columns of the files that the documentation names.
@@ -102,9 +103,9 @@ _EXAMPLES = {
 #: Stamps beyond these [s] are in other units: no drive is so long, and epoch times
 #: are near 1.7e9 s.
 _HUGE = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
-#: Steps of odometry that are no seconds, and of the truth: a stamp in ms, us or ns [s].
+#: Limits of steps of odometry, and of the truth, whose stamps can be in seconds [s].
 _SHORTEST, _LONGEST, _LONGEST_OF_TRUTH = 5e-4, 5.0, 60.0
-_FEWEST_INSIDE = 0.1  # share of the readings within the time of the odometry
+_FEWEST_INSIDE = 0.1  # least share of readings within the time of the odometry
 #: A first stamp beyond this is an epoch time, which is subtracted [s].
 _EPOCH = 1e8
 TIME_DIGITS = 6
@@ -122,7 +123,7 @@ class Column(NamedTuple):
     """A column of a table."""
 
     place: int
-    #: Of its unit in SI units.
+    #: Size of its unit in SI units.
     scale: float
     #: Whether its name states a unit.
     has_unit: bool = False
@@ -156,13 +157,13 @@ class Table(NamedTuple):
 
     @property
     def has_path(self) -> bool:
-        """Whether it has the columns of a path, not those of landmarks at times."""
+        """Whether it has the columns of a path, not of landmarks with time stamps."""
         there = self.columns.keys()
         return there >= {"t", "x", "y"} and ("id" not in there or "bearing" in there)
 
     @property
     def has_truth(self) -> bool:
-        """Whether it has a path that is the truth by its names."""
+        """Whether it has a path that is the truth, judging by names."""
         stem = self.file.stem.lower()
         if re.search(_TRUE, f"{stem} {self.header.text.lower()}"):
             return self.columns.keys() >= {"t", "x", "y"}
@@ -194,12 +195,12 @@ class Table(NamedTuple):
         return times * scale
 
     def check_step(self, times: Array, longest: float) -> None:
-        """Raise LogError if stamps without a unit are hardly in seconds."""
+        """Raise LogError if stamps without a unit are probably not in seconds."""
         gaps = np.diff(np.unique(times))
         step = float(np.median(gaps)) if len(gaps) > 1 else longest
         if not (self.columns["t"].has_unit or _SHORTEST <= step <= longest):
             raise self.header.error(
-                "the unit of t in its name, as 't [ms]', 't [us]' or 't [s]'",
+                "the unit of t in its name, such as 't [ms]', 't [us]' or 't [s]'",
                 f"steps of {step:.3g} without a unit",
             )
 
@@ -254,13 +255,13 @@ def _header_of(
 
 
 def _check_units(header: log_lines.LogLine, names: Sequence[str]) -> None:
-    """Refuse an unknown unit in brackets behind the name of a known column."""
+    """Refuse an unknown unit in brackets after the name of a known column."""
     known = {name for spellings in _NAMES.values() for name in spellings}
     for name in names:
         match = _UNIT.fullmatch(name.lower())
         if match and match[2].strip() not in UNITS and _plain(match[1]) in known:
-            wanted = "a unit of m, cm, mm, km, rad, deg, s, ms, us, ns"
-            raise header.error(f"{wanted}: convert the column", log_lines.shown(name))
+            wanted = "one of the units m, cm, mm, km, rad, deg, s, ms, us and ns"
+            raise header.error(wanted, f"{log_lines.shown(name)}: convert the column")
 
 
 def _columns(names: Sequence[str]) -> dict[str, Column]:
@@ -394,8 +395,8 @@ def read_named(tables: Sequence[Table], name: str, source: Path) -> slamlog.Slam
     is_known = bool(np.isfinite(known).all())
     left_out = [f"{len(timed) - len(inside)} readings outside the time of the odometry"]
     left_out = left_out * (len(inside) < len(timed)) + [
-        f"the poses of {table.file.name}, which no name calls the truth: name the "
-        "columns x_true, y_true, theta_true, or give the file as --truth"
+        f"the poses of {table.file.name}, since no name marks them as the truth: name "
+        "the columns x_true, y_true, theta_true, or give the file as --truth"
         for table in tables
         if table.has_path and not table.has_truth
     ]

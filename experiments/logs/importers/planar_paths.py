@@ -33,9 +33,9 @@ class TruePath(NamedTuple):
 
 
 def numeric_rows(lines: list[log_lines.LogLine]) -> Array | None:
-    """Return the numbers of a file, all rows of equal length; None for another file.
+    """Return the numbers of a file whose rows have equal length; None for other files.
 
-    That is also one with numbers beyond `log_lines.LARGEST`.
+    The result is also None for numbers beyond `log_lines.LARGEST`.
     """
     rows = [log_lines.split_fields(line.text) for line in lines]
     if len({len(row) for row in rows}) > 1:
@@ -85,9 +85,9 @@ def heading_of(quaternions: Array, lines: Sequence[log_lines.LogLine]) -> Array:
     Parameters
     ----------
     quaternions : ndarray, shape (n, 4)
-        Unit quaternions but for rounding.
+        Unit quaternions, except for rounding.
     lines : sequence of LogLine
-        The line of each one.
+        The line of each quaternion.
 
     Raises
     ------

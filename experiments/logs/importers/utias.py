@@ -102,7 +102,7 @@ def _choose_robot(folder: Path, robot: int | None) -> int:
     if not robots:
         log = folder / "log.csv"
         tables = sorted(file.name for file in folder.glob("*.csv"))
-        hint = f" with {', '.join(tables[:4])}: rename its columns" if tables else ""
+        hint = f" with {', '.join(tables[:4])}: rename their columns" if tables else ""
         hint = f"; did you mean {log}?" if log.is_file() else hint
         raise slamlog.LogError(
             f"{folder}: expected a log, or a folder with Robot<k>_Odometry.dat (UTIAS "
