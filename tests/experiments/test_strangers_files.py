@@ -314,6 +314,16 @@ def test_poses_beside_odometry_are_the_truth_if_a_name_marks_them(file, prefix):
     assert ("left_out" in log.header) == (not prefix)
 
 
+@pytest.mark.parametrize("name", ["odometry", "wheels"])
+def test_true_poses_beside_odometry_count_whatever_the_file_is_named(folder, name):
+    rows = "t,d,alpha,x_true,y_true\n1,0,0,5,6\n2,1,0,6,6\n"
+    place = folder(measurements=MEASUREMENTS, **{name: rows})
+    assert read_log(place).ground_truth[:, 1:3].tolist() == [[5, 6], [6, 6]]
+    (place / "groundtruth.csv").write_text(TRUTH)
+    if name == "odometry":  # the file of the truth comes first
+        assert read_log(place).header["truth"] == "groundtruth.csv"
+
+
 def test_poses_that_are_given_as_the_truth_are_the_truth(folder, file):
     place = folder(odometry=ODOMETRY, measurements=MEASUREMENTS, ekf=TRUTH)
     log = read_log(place, truth=place / "ekf.csv")
