@@ -148,8 +148,9 @@ def content_of(lines: list[LogLine]) -> list[LogLine]:
 
 def without_comment(text: str) -> str:
     """Return a line up to its comment."""
-    mark = _COMMENT.search(text)
-    return text[: mark.start()].strip() if mark else text
+    if not ("#" in text or "%" in text or "//" in text):  # faster than the pattern
+        return text
+    return _COMMENT.split(text, maxsplit=1)[0].strip()
 
 
 def split_fields(text: str) -> list[str]:
