@@ -63,7 +63,7 @@ class SmoothedLog:
 
 @overload
 def smooth(
-    what: Drive,
+    drive: Drive,
     settings: None = None,
     *,
     associate: bool = False,
@@ -73,7 +73,7 @@ def smooth(
 
 @overload
 def smooth(
-    what: SlamLog | str | PathLike[str],
+    drive: SlamLog | str | PathLike[str],
     settings: FilterSettings | None = None,
     *,
     associate: bool = False,
@@ -81,7 +81,7 @@ def smooth(
 
 
 def smooth(
-    what: Drive | SlamLog | str | PathLike[str],
+    drive: Drive | SlamLog | str | PathLike[str],
     settings: FilterSettings | None = None,
     *,
     associate: bool = False,
@@ -91,7 +91,7 @@ def smooth(
 
     Parameters
     ----------
-    what : Drive, SlamLog or path
+    drive : Drive, SlamLog or path
         A drive goes to :func:`slamgym.estimator.smooth`, a log to `smooth_log`.
     settings : FilterSettings, optional
         Settings for a log, see `smooth_log`.
@@ -103,7 +103,7 @@ def smooth(
     Raises
     ------
     TypeError
-        If `what` is none of these, or an option belongs to the other kind.
+        If `drive` is none of these, or an option belongs to the other kind.
 
     Examples
     --------
@@ -114,16 +114,16 @@ def smooth(
     >>> np.round(smooth(drive).poses[-1], 3)
     array([1.933, 0.   , 0.   ])
     """
-    if not isinstance(what, SlamLog | str | PathLike):
+    if not isinstance(drive, SlamLog | str | PathLike):
         if settings is not None:
             raise TypeError("settings must be None for a drive, which has a noise")
-        return smooth_drive(what, associate=associate, **options)
+        return smooth_drive(drive, associate=associate, **options)
     if options:
         raise TypeError(
             f"a log takes no options of a drive, got {', '.join(options)}: give "
             "settings=settings_for(log, estimator='smoother', options={...})"
         )
-    return smooth_log(what, settings, associate=associate)
+    return smooth_log(drive, settings, associate=associate)
 
 
 def smooth_log(

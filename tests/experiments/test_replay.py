@@ -668,7 +668,9 @@ def test_python_takes_the_path_of_a_log_and_the_name_of_a_filter(tmp_path):
     smoothed = smooth_log(str(path))
     assert len(smoothed.poses) == len(by_hand.poses)
     for what in (log, path, str(path)):
-        np.testing.assert_array_equal(smooth(what).poses, smoothed.poses)
+        np.testing.assert_array_equal(smooth(drive=what).poses, smoothed.poses)
+    with pytest.raises(TypeError, match="drive must be a Drive, got int"):
+        smooth(3)
     with pytest.raises(TypeError, match="takes no options of a drive, got tolerance: "):
         smooth(path, tolerance=1e-6)
     with pytest.raises(TypeError, match="settings must be None for a drive, which"):
