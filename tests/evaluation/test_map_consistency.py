@@ -119,8 +119,17 @@ def test_runs_without_a_map_or_its_nees_add_no_evidence_and_the_latter_are_count
     assert watched.undefined == 1
 
 
+def test_a_map_with_a_singular_landmark_is_undefined():
+    parts = scores_of(HONEST[:4].copy())
+    parts[0][2, 7], parts[3][2, 7] = np.inf, np.nan
+    watched = MapEvidence()
+    assert np.isnan(watched.update(*parts)[1]).tolist() == [False, False, True, False]
+    assert watched.undefined == 1
+
+
 def test_huge_errors_of_a_map_are_evidence_without_an_overflow():
-    errors = np.concatenate([np.full((3, 20, 2), 1e150), HONEST])
-    found = evidence(errors)
+    parts = scores_of(HONEST.copy())
+    parts[1][:3] = 1.7e308
+    found = MapEvidence().update(*parts)[0]
     assert np.isfinite(found).all()
     assert found[0] > np.log(200)

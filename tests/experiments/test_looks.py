@@ -187,6 +187,10 @@ def test_a_study_is_not_decided_before_the_map_is():
     assert found.word == "not shown"
     assert "that of the map, [0.000, inf], does not: more runs are" in found.reason
     assert verdict(nees, UNTIL).word == "consistent"
+    more = np.concatenate([landmarks, some_landmarks(rng, 200)])
+    longer = np.concatenate([nees, honest(rng, 200, memory=0.0)])
+    scores = scores_of(simulated(longer, landmarks=more), "mine", "invariant")
+    assert watched(scores, "invariant").shown_after >= 80 + 30
 
 
 def test_a_map_without_a_nees_is_not_shown_to_be_consistent():
@@ -236,6 +240,9 @@ def test_a_small_error_of_the_pose_is_no_excuse_for_a_wrong_map():
     found = verdict(nees, UNTIL, landmarks=landmarks)
     assert found.word == "nearly consistent"
     assert "as does that of the map, [" in found.reason
+    few = landmarks.copy()
+    few[10:] = np.nan
+    assert verdict(nees, UNTIL, landmarks=few).word == "not consistent"
     found = verdict(nees, UNTIL, landmarks=1.3 * landmarks)
     assert found.word == "not consistent"
     assert not found.by_map
