@@ -315,7 +315,7 @@ def test_poses_beside_odometry_are_the_truth_if_a_name_marks_them(file, prefix):
 
 
 @pytest.mark.parametrize("name", ["odometry", "wheels"])
-def test_true_poses_beside_odometry_count_whatever_the_file_is_named(folder, name):
+def test_true_poses_beside_odometry_count_in_a_file_of_any_name(folder, name):
     rows = "t,d,alpha,x_true,y_true\n1,0,0,5,6\n2,1,0,6,6\n"
     place = folder(measurements=MEASUREMENTS, **{name: rows})
     assert read_log(place).ground_truth[:, 1:3].tolist() == [[5, 6], [6, 6]]

@@ -440,7 +440,7 @@ def _by_kind(tables: Sequence[Table], source: Path) -> dict[str, Table]:
     for kind in ("odometry", "measurements"):
         if kind not in of:
             raise lacking(kind, tables, source)
-    if of["odometry"].has_truth:  # whatever its file is named
+    if of["odometry"].has_truth:  # regardless of the file's name
         of.setdefault("truth", of["odometry"])
     return of
 
