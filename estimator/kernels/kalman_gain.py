@@ -452,7 +452,7 @@ NUMBERS_READ = Rules._fields.index("numbers")
 # --------------------------------------------------------------------------------------
 # Room for the intermediate results of one update, and the layout of its rows.
 #
-# ``CONTRIBUTING.md`` has a picture of them.
+# ``docs/kernels.md`` has a picture of them.
 
 # The first rows are vectors over the whole state.
 CORRECTION = 0  # δ

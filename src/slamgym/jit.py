@@ -8,24 +8,22 @@ import contextlib
 import ctypes
 import hashlib
 import os
-import pickle
+import re
+import shutil
 import sys
 import tempfile
-import time
-import uuid
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache, cached_property
 from pathlib import Path
-from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
 from numba import config, njit, types
-from numba.core import compiler, serialize
+from numba.core import caching, event
 from numba.core.cpu import CPUTargetOptions
-from numba.core.runtime.nrt import rtsys
 from numba.extending import intrinsic
 
 _PLAIN = bool(getattr(config, "DISABLE_JIT", 0))
@@ -130,58 +128,6 @@ def _kept(kernel: Any) -> Any:
     return kernel
 
 
-def specialised(
-    kernel: Kernel, changes: Mapping[Callable[..., Any], Callable[..., Any]], name: str
-) -> Kernel:
-    """Return a kernel that calls other functions in place of some, however deep.
-
-    It is compiled and cached like the kernel itself.  What does not depend on the
-    functions is shared with it.
-
-    Parameters
-    ----------
-    kernel : callable
-        The kernel.
-    changes : mapping
-        Compiled functions that it calls, directly or not, and what replaces them.
-    name : str
-        Distinguishes the new kernel from others made from this one.
-    """
-    parts = [code_fingerprint(part) for part in changes.values() if not _PLAIN]
-    digest = hashlib.sha256("".join(parts).encode()).hexdigest()[:16]
-    known: dict[int, Any] = {id(old): new for old, new in changes.items()}
-
-    def remade(value: Any) -> Any:
-        function = getattr(value, "py_func", value)
-        if id(value) in known or not isinstance(function, FunctionType):
-            return known.get(id(value), value)
-        known[id(value)] = value  # inside itself, should it be recursive
-        own = function.__globals__
-        used = {each: own[each] for each in function.__code__.co_names if each in own}
-        if _library(function) in LIBRARIES:
-            return value
-        new = {each: remade(part) for each, part in used.items()}
-        if all(new[each] is part for each, part in used.items()):
-            return value
-        copy = FunctionType(
-            *(function.__code__, own | new, f"{function.__name__}_{name}_{digest}"),
-            *(function.__defaults__, function.__closure__),
-        )
-        copy.__qualname__, copy.__module__ = copy.__name__, function.__module__
-        copy.__kwdefaults__ = function.__kwdefaults__
-        known[id(value)] = copy if value is function else _recompiled(copy, value)
-        return known[id(value)]
-
-    return cast("Kernel", remade(kernel))
-
-
-def _recompiled(function: Any, like: Any) -> Any:
-    """Compile a function as another one was."""
-    options = {k: v for k, v in like.targetoptions.items() if k != "nopython"}
-    kernel = njit(**options)(function)
-    return _kept(kernel) if isinstance(like._cache, KernelCache) else kernel
-
-
 @cache
 def _fma_in_c() -> Any:
     """Find the function in the C library; compiled kernels do without it."""
@@ -255,22 +201,16 @@ add_words = cast(
 
 
 # --------------------------------------------------------------------------------------
-# Keep compiled kernels on disk, each under the fingerprint of its code.
-#
-# Nothing here can be stale, so nothing is compared or deleted at import.  Each compiled
-# signature is one file, which is written under another name and then renamed: processes
-# and users may share the folder.
+# Keep compiled kernels on disk, in numba's own cache.  It does not notice an edit in
+# another file.  Therefore, each state of the sources has its own folder.
 
-_NUMBA: Any = numba
-_RESULT: Any = compiler.CompileResult
-_dumps: Any = serialize.dumps  # what numba's own cache uses, too
-
-#: Size of the folder above which the kernels go that nobody has used for longest.
-MAX_BYTES = 256 * 2**20
+#: Parts of the package that contain kernels, or values that kernels read.
+SOURCES = ("jit.py", "arrays.py", "agents", "envs", "estimator", "evaluation")
+#: Number of states of the sources whose kernels are kept; about 50 MB each.
+KEPT_STATES = 8
+_STATE = re.compile("[0-9a-f]{16}")  # the name of its folder
+_UNRELATED = ("NUMBA_CACHE_", "NUMBA_DEBUG_", "NUMBA_NUM_THREADS")
 _USER_CACHES = {"win32": "~/AppData/Local", "darwin": "~/Library/Caches"}
-_DAY = 86400.0
-_DIGEST = hashlib.sha256().digest_size
-_listeners: list[Callable[[], object]] = []
 
 
 @contextlib.contextmanager
@@ -279,26 +219,136 @@ def on_compilation(notify: Callable[[], object]) -> Iterator[None]:
 
     It is called before the compilation, and not for kernels that are loaded.
     """
-    _listeners.append(notify)
-    try:
+
+    class Listener(event.Listener):
+        def on_start(self, _event: Any) -> None:
+            notify()
+
+        def on_end(self, _event: Any) -> None:
+            pass
+
+    with event.install_listener("numba:compile", Listener()):
         yield
-    finally:
-        _listeners.remove(notify)
 
 
-def cache_folder() -> Path:
-    """Return the folder of compiled kernels.
+def digest_of_sources() -> str:
+    """Return a digest of everything that determines the machine code of the kernels.
 
-    It is ``slamgym`` in ``NUMBA_CACHE_DIR``, if that is set, else in the user's cache
-    folder: ``XDG_CACHE_HOME``, or ``~/.cache`` and its like.  The path begins with
-    ``~`` for a user without a home.
+    It covers the source code, the versions of Python, numba and numpy, and numba's
+    environment variables.
     """
-    chosen = _NUMBA.config.CACHE_DIR
-    if chosen:
-        return Path(chosen).absolute() / "slamgym"
-    usual = _USER_CACHES.get(sys.platform, "~/.cache")
-    base = os.environ.get("XDG_CACHE_HOME") or usual
-    return Path(os.path.expanduser(base)) / "slamgym"
+    digest = hashlib.sha256(
+        f"{sys.version} {numba.__version__} {np.__version__}".encode()
+    )
+    for name, value in sorted(os.environ.items()):
+        if name.startswith("NUMBA_") and not name.startswith(_UNRELATED):
+            digest.update(f"{name}={value}".encode())
+    for place in (Path(__file__).parent / part for part in SOURCES):
+        files = [place] if place.is_file() else sorted(place.rglob("*.py"))
+        for file in filter(Path.is_file, files):  # not a link of an editor
+            digest.update(f"{file.relative_to(place.parent)}".encode())
+            digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+_DIGEST = digest_of_sources()  # at import: later edits are not in this process
+
+
+@cache
+def cache_folder() -> Path | None:
+    """Return the folder of compiled kernels, or None if they cannot be kept.
+
+    The folder is in ``slamgym`` in ``NUMBA_CACHE_DIR``, if that is set, else in the
+    user's cache folder: ``XDG_CACHE_HOME``, or the default of the system, such as
+    ``~/.cache``.  If it cannot be written, a temporary folder of the user replaces it.
+    Machine code that another user could have written is never loaded.
+    """
+    usual = os.environ.get("XDG_CACHE_HOME") or _USER_CACHES.get(
+        sys.platform, "~/.cache"
+    )
+    chosen = getattr(config, "CACHE_DIR", "")
+    root = Path(chosen or os.path.expanduser(usual)) / "slamgym"
+    root = root if root.parts[0].startswith("~") else root.absolute()
+    user = os.getuid() if hasattr(os, "getuid") else "kernels"
+    temporary = Path(tempfile.gettempdir()) / f"slamgym-{user}"
+    is_known = temporary.exists()
+    problem = _problem_with(root / _DIGEST)
+    if not problem:
+        _forget_old_states(root)
+        return root / _DIGEST
+    _forget_old_states(temporary)
+    if _problem_with(temporary) or _problem_with(temporary / _DIGEST):
+        _warn(f"{problem}: every process compiles again; set NUMBA_CACHE_DIR")
+        return None
+    if not is_known:
+        _warn(f"{problem}: {temporary} replaces it; NUMBA_CACHE_DIR sets another one")
+    return temporary / _DIGEST
+
+
+def _problem_with(folder: Path) -> str:
+    """Make a folder that only this user can enter; return why it cannot be used."""
+    try:
+        if str(folder).startswith("~"):
+            raise OSError("the home folder is unknown")
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        state = folder.lstat()
+    except OSError as error:
+        return f"{folder} cannot be written ({error.strerror or error})"
+    is_private = state.st_mode & 0o170077 == 0o040000
+    if hasattr(os, "getuid") and not (is_private and state.st_uid == os.getuid()):
+        return f"{folder} can be written by others"
+    with contextlib.suppress(OSError):  # it may be read only
+        os.utime(folder)
+    return ""
+
+
+def _warn(problem: str) -> None:
+    text = f"the folder of compiled kernels {problem}"
+    warnings.warn(text, RuntimeWarning, stacklevel=2)
+
+
+def _forget_old_states(root: Path) -> None:
+    """Delete the kernels of all states of the sources, except those used last.
+
+    A process that has loaded a kernel no longer needs its file.  A process that does
+    not find a file compiles the kernel again.
+    """
+    with contextlib.suppress(OSError):  # another process deletes them, too
+        states = [each for each in root.iterdir() if _STATE.fullmatch(each.name)]
+        states.sort(key=lambda state: state.stat().st_mtime)
+        for state in states[:-KEPT_STATES]:
+            shutil.rmtree(state, ignore_errors=True)
+
+
+class _Locator(caching._CacheLocator):
+    """Give numba the folder of a kernel's files, and what distinguishes their names."""
+
+    def __init__(self, function: FunctionType) -> None:
+        self._module = function.__module__
+
+    @classmethod
+    def from_function(cls, function: Any, _file: str) -> "_Locator":
+        return cls(function)
+
+    def get_cache_path(self) -> str:
+        return str(cache_folder())
+
+    def ensure_cache_path(self) -> None:
+        cache_folder()
+
+    def get_source_stamp(self) -> str:
+        return _DIGEST
+
+    def get_disambiguator(self) -> str:
+        return self._module.rpartition("slamgym.")[2]
+
+
+class _Results(caching.CompileResultCacheImpl):
+    _locator_classes: Any = (_Locator,)
+
+
+class _Files(caching.FunctionCache):
+    _impl_class = _Results
 
 
 class KernelCache:
@@ -313,6 +363,16 @@ class KernelCache:
     def __init__(self, kernel: Any) -> None:
         self._kernel = kernel
 
+    @cached_property
+    def _files(self) -> Any:
+        """Numba's own cache; None for a kernel that is not kept."""
+        function = self._kernel.py_func
+        is_ours = function.__module__.startswith("slamgym.")
+        is_elsewhere = getattr(config, "CACHE_LOCATOR_CLASSES", "")
+        if not is_ours or is_elsewhere or function.__closure__ or not cache_folder():
+            return None
+        return cast("Any", _Files)(function)
+
     @property
     def cache_path(self) -> str:
         """The folder, for numba's statistics."""
@@ -321,35 +381,18 @@ class KernelCache:
     def flush(self) -> None:
         """Do nothing: no file can be out of date."""
 
-    @cached_property
-    def _fingerprint(self) -> str | None:
-        """Computed at the first call, when all that the kernel calls is defined."""
-        try:
-            return code_fingerprint(self._kernel)
-        except UnknownValueError:
-            return None
-
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Return the compiled code for the types of a call, or None."""
-        found = self._loaded(signature, target_context)
-        if found is None:
-            for notify in tuple(_listeners):
-                notify()
-        return found
-
-    def _loaded(self, signature: Any, target_context: Any) -> Any:
-        if self._fingerprint is None:
+        if self._files is None:
             return None
-        rtsys.initialize(target_context)
-        name = self._file_name(signature, target_context.codegen())
-        for folder in (cache_folder(), _private_folder()):
-            content = _read(folder / name) if folder else None
-            if content:
-                with contextlib.suppress(ImportError, AttributeError):  # a type moved
-                    known, result = pickle.loads(content)
-                    if known == signature:
-                        return _RESULT._rebuild(target_context, *result)
-        return None
+        try:
+            found = self._files.load_overload(signature, target_context)
+        except Exception:  # a damaged file can raise any error
+            found = None
+            with contextlib.suppress(OSError):
+                self._files.flush()
+        # Two processes that compile for different types may write the same file.
+        return found if found and found.signature.args == signature else None
 
     def save_overload(self, signature: Any, result: Any) -> None:
         """Keep the compiled code for the types of a call.
@@ -358,26 +401,19 @@ class KernelCache:
         ------
         TypeError
             If the kernel does not count references, but returns an array, whose memory
-            a caller would free, or gets one from a kernel that counts them, which
-            nobody would free.
+            a caller would free, or receives one from a kernel that counts them, whose
+            memory would never be freed.
         """
         uncounted = not self._kernel.targetoptions["_nrt"]
         if uncounted and any("array" in str(each) for each in _handed_on(result)):
             self._kernel._reset_overloads()  # another call is refused, too
             raise TypeError(f"{self._kernel} hands on arrays: use njit_allocating")
-        if self._fingerprint is None:
-            return
-        if result.library.has_dynamic_globals or result.lifted:
-            return  # it holds addresses in the memory of this process
-        name = self._file_name(signature, result.codegen)
-        _save(name, _dumps((signature, result._reduce())))
-
-    def _file_name(self, signature: Any, codegen: Any) -> str:
-        machine = codegen.magic_tuple()  # the processor and what it can do
-        key = f"{self._fingerprint} {signature} {machine}".encode()
-        function = self._kernel.py_func
-        readable = f"{function.__module__}.{function.__name__}".rpartition("slamgym.")
-        return f"{readable[2]}-{hashlib.sha256(key).hexdigest()[:32]}.nbc"
+        if self._files is None or result.library.has_dynamic_globals or result.lifted:
+            return  # these hold addresses in the memory of this process
+        # The folder may be read only, and its files damaged.
+        with contextlib.suppress(Exception):
+            if digest_of_sources() == _DIGEST:  # else edited since the import
+                self._files.save_overload(signature, result)
 
 
 def _handed_on(result: Any) -> Iterator[Any]:
@@ -391,238 +427,115 @@ def _handed_on(result: Any) -> Iterator[Any]:
             yield signature.return_type
 
 
-def _read(file: Path) -> bytes | None:
-    """Return a file's content if it is there and whole, and note that it is in use."""
-    try:
-        content = file.read_bytes()
-        if time.time() - file.stat().st_mtime > _DAY:
-            with contextlib.suppress(OSError):  # of another user
-                os.utime(file)
-    except OSError:
-        return None
-    digest, content = content[:_DIGEST], content[_DIGEST:]
-    return content if hashlib.sha256(content).digest() == digest else None
-
-
-def _save(name: str, content: bytes) -> None:
-    content = hashlib.sha256(content).digest() + content
-    folder = cache_folder()
-    try:
-        if not folder.is_absolute():
-            raise OSError("there is no such home")
-        folder.mkdir(parents=True, exist_ok=True)
-        _write(folder / name, content)
-    except OSError as error:
-        reason = f"{folder} cannot be written ({error.strerror or error})"
-        with contextlib.suppress(OSError):
-            _save_privately(name, content, reason)
-    else:
-        _sweep_once(folder)
-
-
-def _save_privately(name: str, content: bytes, reason: str) -> None:
-    private = _private_folder() or _make_private_folder()
-    if private is None:
-        _warn_once(f"{reason}: every process compiles anew; set NUMBA_CACHE_DIR")
-        return
-    _warn_once(f"{reason}: they go to {private}; NUMBA_CACHE_DIR names another folder")
-    _write(private / name, content)
-
-
-@cache
-def _warn_once(reason: str) -> None:
-    text = f"the folder of compiled kernels {reason}"
-    warnings.warn(text, RuntimeWarning, stacklevel=2)
-
-
-def _write(file: Path, content: bytes) -> None:
-    temporary = file.with_name(f"{uuid.uuid4().hex}.tmp")
-    try:
-        temporary.write_bytes(content)
-        temporary.replace(file)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise
-
-
-def _private_path() -> Path:
-    user = os.getuid() if hasattr(os, "getuid") else "kernels"
-    return Path(tempfile.gettempdir()) / f"slamgym-{user}"
-
-
-def _private_folder() -> Path | None:
-    """Return this user's temporary folder, if it exists and no one else owns it."""
-    path = _private_path()
-    try:
-        state = path.lstat()
-    except OSError:
-        return None
-    if not hasattr(os, "getuid"):  # Windows: a user's own temporary folder
-        return path
-    ours = state.st_uid == os.getuid() and state.st_mode & 0o170077 == 0o040000
-    return path if ours else None
-
-
-def _make_private_folder() -> Path | None:
-    with contextlib.suppress(OSError):
-        _private_path().mkdir(mode=0o700)
-    return _private_folder()
-
-
-@cache
-def _sweep_once(folder: Path) -> None:
-    """Delete what was unused for longest, once per process, if it is too much.
-
-    A process that has loaded a kernel does not need its file any more, and one that
-    misses a file compiles the kernel again.
-    """
-    files = sorted(_states(folder), reverse=True)
-    total = 0
-    for used, size, file in files:
-        total += size
-        abandoned = file.suffix == ".tmp" and time.time() - used > _DAY
-        if total > MAX_BYTES or abandoned:
-            with contextlib.suppress(OSError):
-                file.unlink()
-
-
-def _states(folder: Path) -> Iterator[tuple[float, int, Path]]:
-    for file in folder.glob("*.*"):
-        with contextlib.suppress(OSError):  # deleted by another process meanwhile
-            state = file.stat()
-            yield state.st_mtime, state.st_size, file
-
-
 # --------------------------------------------------------------------------------------
-# Identify what a kernel computes by all code and constants that go into it.
-#
-# The loaded code counts, not files: dates, folders and edits after the import play no
-# part.  Two checkouts with equal kernels have equal fingerprints.
+# Kernels of another sensor or model.
 
-#: Named, with the versions of numba and numpy; not followed into their sources.
-LIBRARIES = {"builtins", "math", "numba", "numpy"}
-
-_VALUES = (bool, int, float, complex, str, bytes, type(None), type(...), np.generic)
-_UNRELATED = ("NUMBA_CACHE", "NUMBA_DEBUG", "NUMBA_NUM_THREADS")
+#: Libraries whose versions count in the digest, not their sources.
+LIBRARIES = ("builtins", "math", "numba", "numpy")
 
 
-class UnknownValueError(TypeError):
-    """A kernel uses a global value of a kind that has no fingerprint."""
+def specialised(
+    kernel: Kernel, changes: Mapping[Callable[..., Any], Callable[..., Any]], name: str
+) -> Kernel:
+    """Return a kernel in which other functions replace some, at any depth of calls.
 
-
-def code_fingerprint(kernel: Any) -> str:
-    """Return a hash of all that decides which machine code a kernel becomes.
-
-    It covers the byte code of the kernel, of every function that it calls, however
-    deep, the names of their modules and the constants they read, with the versions of
-    Python, numba and numpy, the options of the compiler and numba's environment
-    variables.
+    It is compiled and cached like the kernel itself, under a name with a digest of the
+    other functions.  Parts that do not depend on them are shared with the kernel.
 
     Parameters
     ----------
-    kernel : dispatcher
-        A function decorated by numba.
-
-    Raises
-    ------
-    UnknownValueError
-        If it uses a global value other than functions, classes, modules, numbers,
-        strings, tuples, dicts and arrays.
+    kernel : callable
+        The kernel.
+    changes : mapping
+        Compiled functions that it calls, directly or not, and their replacements.
+    name : str
+        Distinguishes the new kernel from others made from this one.
     """
     digest = hashlib.sha256()
-    for part in (*_compiler(), *_Description().of(kernel)):
-        digest.update(f"{len(part)}:{part}".encode())
-    return digest.hexdigest()
+    for part in _parts_of(list(changes.values()), set()):
+        digest.update(part)
+    known: dict[int, Any] = {id(old): new for old, new in changes.items()}
+
+    def remade(value: Any) -> Any:
+        function = getattr(value, "py_func", value)
+        if id(value) in known or not isinstance(function, FunctionType):
+            return known.get(id(value), value)
+        known[id(value)] = value  # inside itself, if it is recursive
+        own = function.__globals__
+        used = {each: own[each] for each in function.__code__.co_names if each in own}
+        if function.__module__.partition(".")[0] in LIBRARIES:
+            return value
+        new = {each: remade(part) for each, part in used.items()}
+        if all(new[each] is part for each, part in used.items()):
+            return value
+        copy = FunctionType(
+            *(function.__code__, own | new),
+            *(f"{function.__name__}_{name}_{digest.hexdigest()[:16]}",),
+            *(function.__defaults__, function.__closure__),
+        )
+        copy.__qualname__, copy.__module__ = copy.__name__, function.__module__
+        copy.__kwdefaults__ = function.__kwdefaults__
+        known[id(value)] = copy if value is function else _recompiled(copy, value)
+        return known[id(value)]
+
+    return cast("Kernel", remade(kernel))
 
 
-def _compiler() -> Iterator[str]:
-    yield f"{sys.version} numba {numba.__version__} numpy {np.__version__}"
-    for name, value in sorted(os.environ.items()):
-        if name.startswith("NUMBA_") and not name.startswith(_UNRELATED):
-            yield f"{name}={value}"
+def _recompiled(function: Any, like: Any) -> Any:
+    """Compile a function with the options of another one."""
+    options = {k: v for k, v in like.targetoptions.items() if k != "nopython"}
+    kernel = njit(**options)(function)
+    return _kept(kernel) if isinstance(like._cache, KernelCache) else kernel
 
 
-class _Description:
-    """Describe values by text; what was described before, by its number."""
+def _parts_of(value: Any, seen: set[int]) -> Iterator[bytes]:
+    """Yield what determines the machine code of functions: code, and values it reads.
 
-    def __init__(self) -> None:
-        self._seen: dict[int, int] = {}
+    Functions of a user may call functions in other files, and read values that change
+    without an edit of a file.
+    """
+    function = getattr(value, "py_func", getattr(value, "__wrapped__", value))
+    if isinstance(value, list | tuple):
+        yield repr((type(value), getattr(value, "_fields", None))).encode()
+        for each in value:
+            yield from _parts_of(each, seen)
+    elif isinstance(value, np.ndarray):
+        yield f"{value.dtype} {value.shape}".encode() + value.tobytes()
+    elif not isinstance(function, FunctionType):
+        kind = getattr(value, "__qualname__", value)
+        parts = [getattr(value, name, None) for name in ("_fields", "__members__")]
+        yield repr((kind, parts)).encode()
+    elif id(function) not in seen:
+        seen.add(id(function))
+        options = sorted(getattr(value, "targetoptions", {}).items())
+        yield f"{function.__module__}.{function.__qualname__} {options}".encode()
+        if function.__module__.partition(".")[0] not in LIBRARIES:
+            cells = [cell.cell_contents for cell in function.__closure__ or ()]
+            named = sorted((function.__kwdefaults__ or {}).items())
+            yield from _parts_of((cells, function.__defaults__, named), seen)
+            names: set[str] = set()
+            for code in _with_inner(function.__code__):
+                constants = [each for each in code.co_consts if not _is_code(each)]
+                yield code.co_code
+                yield repr((code.co_names, code.co_varnames, constants)).encode()
+                names.update(code.co_names)
+            yield from _values_of(names, function.__globals__, seen)
 
-    def of(self, value: Any) -> Iterator[str]:
-        """Yield the parts of a value's description."""
-        if isinstance(value, _VALUES):
-            yield f"{type(value).__name__} {value!r}"
-        elif isinstance(value, tuple | list | frozenset):
-            yield from self._collection(value)
-        elif isinstance(value, dict):
-            yield from self._collection(list(value.items()))
-        elif isinstance(value, np.ndarray):
-            yield f"array {value.dtype} {value.shape} {value.tobytes().hex()}"
-        else:
-            yield from self._named(value)
 
-    def _collection(self, values: Any) -> Iterator[str]:
-        yield f"{type(values).__name__} of {len(values)}"
-        if isinstance(values, frozenset):  # its order differs between processes
-            values = sorted(values, key=repr)
-        for value in values:
-            yield from self.of(value)
-
-    def _named(self, value: Any) -> Iterator[str]:
-        known = self._seen.get(id(value))
-        self._seen.setdefault(id(value), len(self._seen))
-        if known is not None:  # above, or around this: a function may call itself
-            yield f"as number {known}"
-        elif hasattr(value, "py_func"):  # a numba dispatcher
-            yield f"kernel {_options(value)}"
-            yield from self.of(value.py_func)
-        elif _library(value) in LIBRARIES:
-            yield f"{type(value).__name__} {_name(value)}"
-        elif isinstance(value, FunctionType):
-            yield from self._function(value)
-        elif isinstance(value, type):
-            yield from self._class(value)
-        elif hasattr(value, "__wrapped__"):  # a numba intrinsic
-            yield from self.of(value.__wrapped__)
-        else:
-            raise UnknownValueError(f"{value!r} has no fingerprint")
-
-    def _class(self, value: type) -> Iterator[str]:
-        yield f"class {_name(value)}"  # of a NamedTuple, kernels see the fields only
-        yield from self.of(getattr(value, "_fields", ()))
-        yield from self.of(getattr(value, "_field_defaults", {}))
-
-    def _function(self, function: FunctionType) -> Iterator[str]:
-        yield f"function {_name(function)}"  # compiled code imports the module again
-        yield from self.of(function.__defaults__)
-        yield from self.of(function.__kwdefaults__)
-        for cell in function.__closure__ or ():
-            yield from self.of(cell.cell_contents)
-        codes = list(_with_inner(function.__code__))
-        for code in codes:
-            yield from self._code(code)
-        names = sorted({name for code in codes for name in code.co_names})
-        for name in names:
-            if name in function.__globals__:
-                yield name
-                yield from self._global(function.__globals__[name], names)
-
-    def _code(self, code: CodeType) -> Iterator[str]:
-        yield f"{code.co_code.hex()} {code.co_exceptiontable.hex()} {code.co_flags}"
-        yield f"{code.co_argcount} {code.co_posonlyargcount} {code.co_kwonlyargcount}"
-        yield from self.of((code.co_varnames, code.co_names, code.co_freevars))
-        yield from self.of(tuple(c for c in code.co_consts if not _is_code(c)))
-
-    def _global(self, value: Any, names: list[str]) -> Iterator[str]:
+def _values_of(
+    names: set[str], known: dict[str, Any], seen: set[int]
+) -> Iterator[bytes]:
+    for name in sorted(names & known.keys()):
+        value = known[name]
+        yield name.encode()
+        asked = hash((id(value), frozenset(names)))  # others may ask for other names
         if not isinstance(value, ModuleType):
-            yield from self.of(value)
-            return
-        yield f"module {value.__name__}"
-        if value.__name__.partition(".")[0] not in LIBRARIES:
-            for name in names:
-                if hasattr(value, name):
-                    yield from self._global(getattr(value, name), names)
+            yield from _parts_of(value, seen)
+        elif value.__name__.partition(".")[0] in LIBRARIES or asked in seen:
+            yield value.__name__.encode()
+        else:
+            seen.add(asked)
+            yield from _values_of(names, vars(value), seen)
 
 
 def _with_inner(code: CodeType) -> Iterator[CodeType]:
@@ -634,23 +547,3 @@ def _with_inner(code: CodeType) -> Iterator[CodeType]:
 
 def _is_code(constant: object) -> bool:
     return isinstance(constant, CodeType)
-
-
-def _options(kernel: Any) -> str:
-    """Return the options of the compiler in one order; ``fastmath`` may be a set."""
-    options = sorted(kernel.targetoptions.items())
-    return repr([(k, sorted(v) if isinstance(v, set) else v) for k, v in options])
-
-
-def _library(value: Any) -> str:
-    """Return the library that a function, a class or a type of numba comes from."""
-    if isinstance(value, BuiltinFunctionType | np.ufunc | np.dtype):
-        return "builtins"
-    if not hasattr(value, "__qualname__"):
-        value = type(value) if isinstance(value, types.Type) else None
-    return str(getattr(value, "__module__", None)).partition(".")[0]
-
-
-def _name(value: Any) -> str:
-    name = getattr(value, "__qualname__", None)
-    return f"{value.__module__}.{name}" if name else repr(value)

@@ -116,8 +116,8 @@ main(["estimators", "--json"])
 
 @pytest.mark.slow
 def test_the_tests_of_the_filter_pass_in_plain_python():
-    """By the command of CONTRIBUTING, but for what takes many thousand steps."""
-    text = (ROOT / "CONTRIBUTING.md").read_text()
+    """By the command of the page on kernels, but for what takes many thousand steps."""
+    text = (ROOT / "docs" / "kernels.md").read_text()
     (path,) = re.findall(r"`NUMBA_DISABLE_JIT=1 pytest (\S+)`", text)
     long = "nees_and_nis or over_1000_steps or keeps_its_share"
     options = ["-p", "no:cacheprovider", "-k", f"not ({long})"]

@@ -17,7 +17,6 @@ from rich.console import Console
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from slamgym import jit as kernel_cache
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.experiments import figures
 from slamgym.experiments.command_line import program, run_files, tables
@@ -824,12 +823,11 @@ def test_the_program_loads_no_numba_for_its_lists_and_answers_errors_with_one_li
     assert "did you mean 'loop'" in result.stderr
 
 
-def test_a_compilation_is_noted_once_and_nothing_else_is(capsys, monkeypatch):
+def test_a_compilation_is_noted_once_and_nothing_else_is(capsys):
     @jit
     def double(x):
         return 2 * x
 
-    monkeypatch.setattr(kernel_cache, "_save", lambda name, content: None)
     report = program.Reporter(as_json=True)
     for kinds, note in (((1.0, 1), "compiling the kernel, once"), ((1.0, 1), "")):
         with report.note_if_compiling("the kernel"):
