@@ -15,6 +15,7 @@ from slamgym.experiments.logs import (
     OdometryRow,
     Scan,
     SlamLog,
+    read_log,
     read_slamlog,
     record_episode,
     write_slamlog,
@@ -25,6 +26,7 @@ from slamgym.sim_configs import action_sequence, load_scenario
 DATA = os.environ.get("SLAMGYM_DATA")
 PUBLIC = ("cmu16833", "utias_d6_r3")
 HALF = np.pi / 2
+NOISE = {"motion_std": (0.05, 0.02, 0.03), "measurement_std": (0.02, 0.1)}
 
 
 def simulated(name, seed, steps=200, **changes):
@@ -263,6 +265,34 @@ def test_mirror_images_are_both_named_where_no_truth_tells_them_apart(corridor):
     found = mistake_of(blind)
     assert FAR["clockwise"][1] in found.name
     assert FAR["clockwise turns"][1] in found.name
+
+
+def csv_of(log, folder):
+    """Write a log as csv files with named columns, without its header."""
+    folder.mkdir()
+    rows = [event for event in log.events if isinstance(event, OdometryRow)]
+    lines = [f"{row.t},{row.d},{row.alpha}" for row in rows]
+    (folder / "odometry.csv").write_text("\n".join(["t,d,alpha", *lines, ""]))
+    lines = [
+        f"{scan.t},{name},{bearing},{distance}"
+        for scan in log.events
+        if isinstance(scan, Scan)
+        for name, (bearing, distance) in zip(
+            scan.landmark_ids.tolist(), scan.measurements.tolist(), strict=True
+        )
+    ]
+    (folder / "measurements.csv").write_text(
+        "\n".join(["t,id,bearing,range", *lines, ""])
+    )
+    return folder
+
+
+@pytest.mark.parametrize("name", ["degrees", "exchanged", "clockwise"])
+def test_a_mistake_in_csv_files_of_ones_own_is_named(corridor, name, tmp_path):
+    change, words = FAR[name]
+    log = read_log(csv_of(change(corridor), tmp_path / "own"))
+    settings = settings_for(log, **NOISE)
+    assert words in mistake_in(log, settings).name
 
 
 def test_commands_name_the_mistake_and_suggest_no_noise(corridor, tmp_path):

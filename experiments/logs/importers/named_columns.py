@@ -529,7 +529,8 @@ def _readings(table: Table, on_clock: Callable[[Array], Array]) -> _TimedReading
     timed = []
     for k in np.argsort(times, kind="stable").tolist():
         t, row = float(times[k]), rows[k]
-        bearing = slamlog.wrap_bearing(table.number(row, "bearing"))
+        # Not wrapped, which would hide degrees and ranges.
+        bearing = table.number(row, "bearing")
         distance = table.number(row, "range")
         reading = slamlog.Reading(t, _id_in(table, row), bearing, distance)
         timed.append((row.line, reading))
