@@ -295,14 +295,14 @@ def kill_workers(job: Any, target: Path, every: float) -> int:
 
 
 def is_worker(process: psutil.Process) -> bool:
-    """Whether a process computes runs: of loky, Dask or Ray."""
+    """Whether a process computes runs: of loky or Dask."""
     try:
         line = " ".join(process.cmdline())
     except psutil.Error:
         return False
     if "resource_tracker" in line:  # it serves them
         return False
-    return any(word in line for word in ("LokyProcess", "spawn_main", "ray::"))
+    return any(word in line for word in ("LokyProcess", "spawn_main"))
 
 
 def main() -> None:

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 from ..arrays import AnyArray, Array
 from ..estimator.interface import ScanDecisions
 from ..estimator.models.rigid_motion import rotation
-from ..estimator.models.sensors import Sensor, find_sensor, former_noise
+from ..estimator.models.sensors import Sensor, find_sensor
 from ..estimator.support.argument_checks import as_floats
 
 CLUTTER = -1  # the true landmark of a reading that has none
@@ -129,7 +129,6 @@ def score_association(
     return AssociationScores(**counts)
 
 
-@former_noise
 def oracle_errors(
     poses: Array,
     scans: Sequence[Array],

@@ -27,13 +27,7 @@ from scipy.special import stdtrit
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.models.bearing_range import reading_slopes_jit
 from ..estimator.models.rigid_motion import seen_from
-from ..estimator.models.sensors import (
-    BEARING_RANGE,
-    POSITION,
-    Sensor,
-    find_sensor,
-    former_noise,
-)
+from ..estimator.models.sensors import BEARING_RANGE, POSITION, Sensor, find_sensor
 from ..estimator.support import argument_checks
 from ..jit import jit, njit_allocating, njit_internal
 
@@ -64,7 +58,6 @@ class Efficiency(NamedTuple):
     interval: tuple[float, float]
 
 
-@former_noise
 def posterior_bound(
     true_poses: ArrayLike,
     landmarks: ArrayLike,

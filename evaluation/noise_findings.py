@@ -19,7 +19,7 @@ from scipy.special import chdtr, chdtrc, ndtr, stdtr
 
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.models.bearing_range import wrap_angle
-from ..estimator.models.sensors import Sensor, former_noise, only_bearing_range
+from ..estimator.models.sensors import Sensor, only_bearing_range
 from ..estimator.support import argument_checks
 
 #: The five noises: εx, εy, εα of the motion, εβ, εr of the readings.
@@ -324,7 +324,6 @@ class _Noise(NamedTuple):
     distance: Array | float = 0.0
 
 
-@former_noise
 def noise_sums(
     true_poses: ArrayLike,
     landmarks: ArrayLike,

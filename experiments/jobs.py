@@ -30,7 +30,6 @@ from typing import Any, NamedTuple, TypeVar
 import psutil
 from filelock import FileLock, Timeout
 
-from ..estimator.support.argument_checks import usable_cores
 from ..sim_configs.field_types import unknown_choice
 from ..sim_configs.scenario_files import replace_when_written
 from .runs.filter_settings import integer, one_blas_thread
@@ -43,7 +42,7 @@ Workers = Callable[[Iterable[Call]], Iterable[Any]]
 #: a worker gets None.
 Work = Callable[[range, Callable[[int], object] | None], Result]
 
-BACKENDS = ("loky", "threading", "dask", "ray")
+BACKENDS = ("loky", "threading", "dask")
 #: How long a worker lives on without the process that engaged it [s].
 _PATIENCE = 0.5
 
@@ -151,14 +150,12 @@ def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
     Raises
     ------
     ValueError
-        If an argument does not fit, or Ray is not installed.
+        If an argument does not fit.
     """
     if backend not in (None, *BACKENDS):
         raise ValueError(unknown_choice("backend", backend, BACKENDS))
     if jobs not in (None, -1):
         integer("jobs", jobs or 0, 1)
-    if backend == "ray":
-        return _ray_workers(None if jobs == -1 else jobs)
     from joblib import effective_n_jobs, parallel, parallel_config  # noqa: PLC0415
 
     if backend is None and effective_n_jobs(jobs) == 1:
@@ -178,8 +175,6 @@ def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
 
 def blocks_at_once(jobs: int | None, backend: str | None) -> int:
     """Return how many blocks the workers of these arguments compute at a time."""
-    if backend == "ray":
-        return usable_cores() if jobs in (None, -1) else int(jobs or 1)
     from joblib import effective_n_jobs, parallel_config  # noqa: PLC0415
 
     if backend is None:
@@ -202,33 +197,6 @@ def _watch(engaging: int) -> None:
     while os.getppid() == engaging and psutil.pid_exists(engaging):
         time.sleep(_PATIENCE)
     os._exit(1)
-
-
-def _ray_workers(jobs: int | None) -> Workers:
-    """Engage a cluster's workers by Ray's own pool.
-
-    Ray's backend for joblib returns results only when the last one is complete, so that
-    no block could be written before.
-    """
-    try:
-        from ray.util.multiprocessing import Pool  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise ValueError("backend 'ray' needs ray: pip install ray") from None
-
-    def compute(calls: Iterable[Call]) -> Iterator[Any]:
-        handler = signal.getsignal(signal.SIGTERM)
-        with Pool(jobs) as pool:
-            in_main_thread = threading.current_thread() is threading.main_thread()
-            if callable(handler) and in_main_thread:
-                signal.signal(signal.SIGTERM, handler)  # Ray's own one aborts
-            yield from pool.imap_unordered(_call, calls)
-
-    return compute
-
-
-def _call(call: Call) -> Any:
-    function, arguments, options = call
-    return function(*arguments, **options)
 
 
 # --------------------------------------------------------------------------------------

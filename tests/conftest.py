@@ -28,7 +28,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
 
 # No tests: with --doctest-modules, each worker would load them, and compile what
 # `forked_preload` compiles for the processes that are forked.
-collect_ignore = ["support", "mutate.py", "on_ray.py"]
+collect_ignore = ["support", "mutate.py", "on_rllib.py"]
 
 # The many objects of modules and tests live to the end: the search for garbage need not
 # go through them again and again.

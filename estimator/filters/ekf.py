@@ -28,7 +28,6 @@ from ..models.sensors import (
     Sensor,
     find_sensor,
     for_sensor,
-    former_noise,
     two_stds,
 )
 from ..support import argument_checks, saved_states
@@ -299,7 +298,6 @@ class EkfSlam(MapFilter):
     _update_map: ClassVar[UpdateKernel] = staticmethod(update_map)
     _move_pose: ClassVar[Callable[..., None]] = staticmethod(move_pose)
 
-    @former_noise
     def __init__(
         self,
         motion_std: ArrayLike,

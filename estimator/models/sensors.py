@@ -19,11 +19,10 @@ Since the robot's frame moves with the pose::
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, wraps
-from typing import Any, TypeVar, cast
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -392,30 +391,6 @@ def sensor_in(options: Mapping[str, Any]) -> Sensor:
     sensor = find_sensor(options.get("sensor", BEARING_RANGE))
     numbers = {name: options[name] for name in NUMBERS if name in options}
     return sensor.with_noise(**numbers) if numbers else sensor
-
-
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-
-def former_noise(function: Function) -> Function:
-    """Accept the numbers of a sensor's noise as keywords too, with a warning."""
-
-    @wraps(function)
-    def door(*args: Any, **keywords: Any) -> Any:
-        if former := keywords.keys() & set(NUMBERS):
-            given = ", ".join(f"{name}={keywords[name]!r}" for name in sorted(former))
-            warnings.warn(
-                f"the noise is part of the sensor: give sensor=find_sensor("
-                f"'bearing_range').with_noise({given})",
-                DeprecationWarning,
-                stacklevel=2,
-            )
-            keywords["sensor"] = sensor_in(keywords)
-            for name in former:
-                del keywords[name]
-        return function(*args, **keywords)
-
-    return cast("Function", door)
 
 
 def only_bearing_range(sensor: str | Sensor, part: str) -> Sensor:

@@ -16,7 +16,7 @@ from ...arrays import Array, IntArray
 from ..interface import Belief, UpdateReport
 from ..models.bearing_range import locate_landmark, predict_measurement, wrap_angle
 from ..models.motions import UNICYCLE, Motion, MotionNoise, predict_pose
-from ..models.sensors import Sensor, former_noise, only_bearing_range
+from ..models.sensors import Sensor, only_bearing_range
 from ..support import argument_checks, saved_states
 from ..support.argument_checks import LandmarkIds
 
@@ -57,7 +57,6 @@ class PeerSlam(ABC):
         If an argument has the wrong shape or is not finite or negative.
     """
 
-    @former_noise
     def __init__(
         self,
         motion_std: ArrayLike,

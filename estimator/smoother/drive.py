@@ -21,7 +21,7 @@ from ..models.bearing_range import wrap_angle
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.motions import Motion as DriveMotion
 from ..models.rigid_motion import pose_rotation, predict
-from ..models.sensors import Sensor, find_sensor, former_noise
+from ..models.sensors import Sensor, find_sensor
 from ..support import argument_checks
 
 
@@ -93,7 +93,6 @@ class Drive:
     (2, (7,))
     """
 
-    @former_noise
     def __init__(
         self,
         motion_std: ArrayLike,

@@ -14,7 +14,7 @@ from ..filters.conditioning import PoseReading
 from ..interface import bookmark
 from ..map_management.map_editor import MapEditor
 from ..models.motions import UNICYCLE, Motion
-from ..models.sensors import Sensor, former_noise
+from ..models.sensors import Sensor
 from ..registry import accepted_options, find_estimator, make_estimator, read_label
 from ..support import argument_checks, saved_states
 from ..support.undo import Undo, attributes, undo_all, undone_on_error
@@ -261,7 +261,6 @@ class SmoothingSlam(RecordedSlam):
         If the filter does not take an option.
     """
 
-    @former_noise
     def __init__(
         self,
         motion_std: ArrayLike,

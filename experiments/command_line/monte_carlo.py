@@ -105,12 +105,13 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
         raise BadInputError(unknown_choice("--figures", given.figures, FORMATS))
     place = given.out or default_folder("monte-carlo", world.name)
     told = world.with_changes(**assumed) if assumed else world
+    cluster = connected(given.backend, given.scheduler, given.jobs)
     with reporter.note_if_compiling("the filters"):
         _compile(given.estimators, identities=world.sensor.identities)
     if given.merge:
         monte_carlo.merge_blocks(given.merge, place)
     with (
-        connected(given.backend, given.scheduler, given.jobs),
+        cluster,
         reporter.warnings(),
         reporter.progress("running", unit="runs") as tick,
         interruptible(
@@ -219,7 +220,7 @@ def _compile(estimators: str, *, identities: bool) -> None:
 
 
 # --------------------------------------------------------------------------------------
-# The clusters that may do the work of a command: Dask and Ray.
+# The cluster that can compute the runs of a command.
 
 #: What starts here listens to this machine only.
 _HERE = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
@@ -232,21 +233,21 @@ def connected(backend: str | None, scheduler: str | None, jobs: int | None) -> A
     Parameters
     ----------
     backend : str or None
-        "dask" or "ray"; no other needs a cluster.
+        "dask"; no other needs a cluster.
     scheduler : str or None
-        Address of the cluster; None starts one for Dask, while Ray does so by itself.
+        Address of the cluster; None starts one on this machine.
     jobs : int or None
         Workers of a cluster that is started.
 
     Raises
     ------
     BadInputError
-        If the backend is not installed, or none that has a scheduler.
+        If the backend is not installed, or has no scheduler.
     """
     if backend == "dask":
         return _dask_client(scheduler, jobs)
     if scheduler is not None:
-        _join_ray(backend, scheduler)
+        raise BadInputError("--scheduler requires --backend dask")
     return contextlib.nullcontext()
 
 
@@ -285,13 +286,3 @@ def _with_new_workers(client: Any) -> Iterator[None]:
         finally:
             over.set()
             watch.join()
-
-
-def _join_ray(backend: str | None, scheduler: str) -> None:
-    if backend != "ray":
-        raise BadInputError("--scheduler is for --backend dask or ray")
-    try:
-        import ray  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise BadInputError("--backend ray needs ray: pip install ray") from None
-    ray.init(address=scheduler)

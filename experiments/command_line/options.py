@@ -135,9 +135,9 @@ class Options:
     jobs
         Worker processes, -1 for one on each core.
     backend
-        Where the workers run: loky, on this machine; dask or ray, on a cluster.
+        Where the workers run: loky, on this machine; dask, on a cluster.
     scheduler
-        The Dask or Ray cluster.
+        The Dask cluster.
     out
         The folder to write: new, empty, or with earlier output of slamgym, which is
         replaced unless you changed it.
@@ -172,7 +172,7 @@ class Options:
     set_: list[str] | None = declared(None, "--set KEY=VALUE")
     resolution: float = declared(0.0, "R", "all are distinct")
     jobs: int | None = declared(None, "--jobs -j N", "none, this process only")
-    backend: str | None = declared(None, "loky|dask|ray")
+    backend: str | None = declared(None, "loky|dask")
     scheduler: str | None = declared(None, "ADDRESS", "a cluster on this machine")
     out: Path | None = declared(None, "DIR", "results/<name>-<estimator>")
     every_step: bool | None = declared(

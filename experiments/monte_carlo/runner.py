@@ -121,7 +121,7 @@ def monte_carlo(
         aside with a warning.
     jobs : int, optional
         Number of workers; by default one process with all its cores.
-    backend : {"loky", "threading", "dask", "ray"}, optional
+    backend : {"loky", "threading", "dask"}, optional
         Provider of the workers; `joblib.parallel_config` can also set it from outside.
     block_size : int
         Number of runs in a block.

@@ -93,7 +93,7 @@ def generate_trajectories(
     jobs : int, optional
         Number of workers, which make one shard at a time each; -1 for one on each
         core. By default this process does all. The bytes are the same.
-    backend : {"loky", "dask", "ray"}, optional
+    backend : {"loky", "dask"}, optional
         Provider of the workers.
     progress : callable, optional
         Called with (steps done, steps of all episodes), which includes steps of

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 import slamgym
-from slamgym.public_names import MOVED
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = ("agents", "envs", "estimator", "evaluation", "experiments", "sim_configs")
@@ -84,29 +83,6 @@ def test_public_names_need_no_import_deeper_than_two_levels(name):
     for public in set(module.__all__) - {"monte_carlo"}:
         assert getattr(short, public, None) is getattr(module, public), public
     assert slamgym.monte_carlo is slamgym.experiments.monte_carlo.monte_carlo
-
-
-@pytest.mark.parametrize("old", MOVED)
-def test_a_module_that_moved_can_be_imported_with_a_warning(old):
-    with pytest.deprecated_call(match=f"{old} no longer exists.*slamgym.{MOVED[old]}$"):
-        module = importlib.import_module(f"slamgym.{old}")
-    place = importlib.import_module(f"slamgym.{MOVED[old]}")
-    public = [name for name in dir(place) if not name.startswith("_")]
-    assert all(getattr(module, name) is getattr(place, name) for name in public)
-    with pytest.raises(ModuleNotFoundError):
-        importlib.import_module(f"slamgym.{old}.anything")
-    del sys.modules[f"slamgym.{old}"]
-
-
-@pytest.mark.filterwarnings("ignore:slamgym.envs.sensors:DeprecationWarning")
-def test_names_of_a_module_that_moved_are_those_of_its_new_place():
-    from slamgym.envs.sensors import BearingRangeSensor, OdometrySensor
-
-    assert BearingRangeSensor is slamgym.envs.BearingRangeSensor
-    assert OdometrySensor is slamgym.envs.OdometrySensor
-    with pytest.raises(ImportError, match="no_such_name"):
-        from slamgym.envs.sensors import no_such_name  # noqa: F401
-    del sys.modules["slamgym.envs.sensors"]  # another test expects its warning
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ from numeric_jacobian import numeric_jacobian
 from scipy.optimize import least_squares
 
 from slamgym.estimator import (
-    EkfSlam,
     InvariantEkfSlam,
     make_batch,
     make_estimator,
@@ -36,7 +35,6 @@ from slamgym.estimator.models.sensors import (
     kernel_parts,
     read_bearing_range,
 )
-from slamgym.estimator.smoother import Drive
 from slamgym.experiments.runs.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
@@ -384,24 +382,6 @@ def test_names_of_a_sensor_may_be_lists():
     lists = replace(COPY, **names)
     assert lists == COPY
     assert hash(lists) == hash(COPY)
-
-
-@pytest.mark.parametrize(
-    "door",
-    [
-        lambda **noise: EkfSlam(MOTION, (0.1, 0.1), **noise).sensor,
-        lambda **noise: InvariantEkfSlam(MOTION, (0.1, 0.1), **noise).sensor,
-        lambda **noise: Drive(MOTION, (0.1, 0.1), **noise).sensor,
-    ],
-)
-def test_the_former_keywords_of_the_noise_give_a_sensor_and_a_warning(door):
-    former = {"range_std_per_metre": 0.2, "range_noise_at": "reading"}
-    with pytest.warns(DeprecationWarning, match="part of the sensor: give sensor="):
-        sensor = door(**former)
-    assert sensor.noise((0.1, 0.2)) == (0.1, 0.2, 0.2, 0.0)
-    assert sensor.range_noise_at == "reading"
-    with pytest.raises(TypeError, match="colour"):
-        door(colour="red")
 
 
 def test_a_users_filter_that_names_the_numbers_of_the_noise_gets_them(own_registry):

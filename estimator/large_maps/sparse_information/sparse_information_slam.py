@@ -17,7 +17,6 @@ from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
 from ...interface import Belief, MapView, UpdateReport, describe_filter
 from ...models.bearing_range import wrap_angle
-from ...models.sensors import former_noise
 from ...support import argument_checks, saved_states
 from ...support.argument_checks import LandmarkIds
 from ...support.saved_states import with_prefix, without_prefix
@@ -92,7 +91,6 @@ gate_probability, noise_at_rest, min_range
 
     __repr__ = describe_filter
 
-    @former_noise
     def __init__(
         self,
         motion_std: ArrayLike,

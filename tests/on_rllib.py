@@ -1,32 +1,23 @@
 # pyright: reportMissingImports=false
-"""What runs on Ray: PPO of RLlib on every environment, Monte Carlos, trajectories.
+"""PPO of RLlib learns in every environment.
 
 Not part of the suite, as Ray asks for an older Gymnasium and for two gigabytes; in an
 environment of its own::
 
     python3 -m venv .rllib && . .rllib/bin/activate
     pip install torch==2.13.0 "ray[rllib]==2.60.0" pytest -e .
-    pytest tests/on_ray.py
+    pytest tests/on_rllib.py
 
 RLlib takes our environments in three ways, all of them tried here: a function that
 makes one world, already flat, which RLlib puts side by side; the id alone, flattened by
 a connector of RLlib's; and a function that makes the native vector of worlds.
 """
 
-import os
-import signal
-import subprocess
-import sys
-import time
-
 import gymnasium as gym
 import numpy as np
-import psutil
 import pytest
 
 import slamgym  # noqa: F401 (registers the environments)
-from slamgym.experiments.monte_carlo import monte_carlo
-from slamgym.experiments.trajectories import generate_trajectories
 
 IDS = sorted(each for each in gym.registry if each.startswith("slamgym/"))
 STEPS = 20
@@ -114,56 +105,3 @@ def test_ppo_learns(cluster, each, set_up):
     algorithm.stop()
     assert np.isfinite(after).all()
     assert (after != before).any()
-
-
-def test_a_monte_carlo_has_the_bits_of_one_on_this_core(cluster, tmp_path):
-    for name, workers in {"here": {}, "ray": {"backend": "ray", "jobs": 2}}.items():
-        out = tmp_path / name
-        monte_carlo("six_landmarks", "ekf", 8, block_size=2, out=out, **workers)
-    blocks = sorted((tmp_path / "here" / "blocks").glob("*.npz"))
-    assert len(blocks) == 4
-    for block in blocks:
-        other = tmp_path / "ray" / "blocks" / block.name
-        assert block.read_bytes() == other.read_bytes()
-
-
-def test_trajectories_have_the_bytes_of_one_process(cluster, tmp_path):
-    job = {"episodes": 8, "episodes_per_shard": 2, "format": "slamlog"}
-    for name, workers in {"here": {}, "ray": {"backend": "ray", "jobs": 2}}.items():
-        generate_trajectories("six_landmarks", tmp_path / name, **job, **workers)
-    files = sorted(f for f in (tmp_path / "here").rglob("*") if f.is_file())
-    assert len(files) == 8 + 4 + 1
-    for file in files:
-        other = tmp_path / "ray" / file.relative_to(tmp_path / "here")
-        assert file.read_bytes() == other.read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
-)
-def test_an_ended_job_says_how_to_go_on_and_leaves_no_process(tmp_path, number, code):
-    job = "monte-carlo six_landmarks -e ekf --runs 90000 --block-size 8 --jobs 2"
-    main = "from slamgym.experiments.command_line.app import main; main()"
-    command = [sys.executable, "-c", main, *job.split(), "--backend", "ray"]
-    environment = {**os.environ, "RAY_USAGE_STATS_ENABLED": "0"}
-    with subprocess.Popen(
-        [*command, "--out", "out"],
-        cwd=tmp_path,
-        env=environment,
-        stderr=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        text=True,
-    ) as child:
-        deadline = time.monotonic() + 240
-        while len(list(tmp_path.glob("out/blocks/runs-*.npz"))) < 2:
-            assert child.poll() is None, child.communicate()[1]
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
-        processes = psutil.Process(child.pid).children(recursive=True)
-        child.send_signal(number)
-        message = child.communicate(timeout=60)[1]
-    assert child.returncode == code, message
-    assert "the finished runs are in out, and the same command continues" in message
-    assert "Traceback" not in message
-    _, alive = psutil.wait_procs(processes, timeout=30)
-    assert alive == []
