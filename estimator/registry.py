@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
+from ..leaves import is_here, leaf
 from ..suggestions import closest, imported
 from .filters import ekf
 from .filters.batch import BatchSlam
 from .filters.ideal import IdealEkfSlam
-from .filters.robocentric import RobocentricEkfSlam
 from .interface import SlamEstimator
 from .models.sensors import NUMBERS, sensor_in
-from .peers.catalogue import PEERS
 
 if TYPE_CHECKING:
     from .map_management.policy import LandmarkPolicy
@@ -31,6 +30,10 @@ _NOISE = ("motion_std", "measurement_std", "initial_pose", "initial_pose_std")
 _REFUSED = re.compile(r"(?:unexpected keyword argument|no option) '(\w+)'")
 
 _factories: dict[str, EstimatorFactory | str] = {}  # or where to import it from
+
+_catalogue = leaf("estimator.peers.catalogue")
+#: The estimators of other libraries, by name.
+PEERS: Mapping[str, Any] = _catalogue.PEERS if _catalogue else {}
 
 
 class UnknownOptionError(ValueError, TypeError):
@@ -299,22 +302,32 @@ def accepted_options(
     return {key: value for key, value in options.items() if key in known}
 
 
+def _inside(path: str) -> str:
+    """Return the module of an import path, by its name in the package."""
+    return path.partition(":")[0].partition(".")[2]
+
+
 _LARGE = f"{__package__}.large_maps"
 
-_factories |= {
+_shipped: dict[str, EstimatorFactory | str] = {
     "ekf": ekf.EkfSlam,
     "invariant": ekf.InvariantEkfSlam,
     "first_estimates": ekf.FirstEstimatesEkfSlam,
     "observability_constrained": ekf.ObservabilityConstrainedEkfSlam,
     "iterated": ekf.IteratedEkfSlam,
     "unscented": f"{__package__}.filters.unscented:UnscentedSlam",
-    "robocentric": RobocentricEkfSlam,
+    "robocentric": f"{__package__}.filters.robocentric:RobocentricEkfSlam",
     "ideal": IdealEkfSlam,
     "compressed": f"{_LARGE}.compressed.compressed_slam:CompressedEkfSlam",
     "sparse_information": (
         f"{_LARGE}.sparse_information.sparse_information_slam:SparseInformationSlam"
     ),
     "submaps": f"{_LARGE}.submaps.submap_slam:SubmapSlam",
+}
+_factories |= {
+    name: factory
+    for name, factory in _shipped.items()
+    if not isinstance(factory, str) or is_here(_inside(factory))
 }
 _factories |= {name: peer.path for name, peer in PEERS.items()}
 

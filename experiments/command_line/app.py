@@ -3,20 +3,26 @@
 Each command is a function in a module of its own, which takes options by name, and
 it imports what is heavy when it runs, so that help answers at once.
 """
-# ruff: noqa: I001 (the order of the imports is the order of the commands in the help)
 
 import inspect
 from collections.abc import Sequence
 from typing import Any
 
-from . import run, replay, fit_noise, monte_carlo, generate  # noqa: F401
-from . import judge, noise_study, render_video  # noqa: F401 (each adds its command)
+from ...leaves import leaf
 from .options import Options, takes
-from .program import command, main
-from .program import Reporter
+from .program import Reporter, command, main
 
 __all__ = ["main"]
 __dir__ = __all__.copy
+
+#: The modules of commands, in the order of the help. Each adds its command to the
+#: program.
+COMMANDS = (
+    *("run", "replay", "smooth", "fit_noise", "monte_carlo", "generate", "judge"),
+    *("noise_study", "render_video"),
+)
+for _name in COMMANDS:
+    leaf(f"experiments.command_line.{_name}")
 
 
 @command
@@ -51,14 +57,13 @@ def estimators(*, given: Options) -> None:
     slamgym estimators
     slamgym estimators --json
     """
-    from ...estimator.peers.catalogue import list_peers
-    from ...estimator.registry import find_estimator, list_estimators
+    from ...estimator.registry import PEERS, find_estimator, list_estimators
 
     each = [
         (name, "slamgym", True, inspect.getdoc(find_estimator(name)) or "")
         for name in list_estimators()
     ]
-    each += [(p.name, p.library, p.installed, p.description) for p in list_peers()]
+    each += [(p.name, p.library, p.installed, p.description) for p in PEERS.values()]
     rows = [(*facts, text.partition("\n")[0]) for *facts, text in each]
     _show("estimators", "name library installed description", rows, given.reporter())
 

@@ -1,16 +1,13 @@
 """``slamgym fit-noise``: the noise of a log, by maximum likelihood."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.text import Text
 
 from .. import figures, noise_fitting
 from .options import LogFile, Options, declared, takes
 from .program import Reporter, command
-
-if TYPE_CHECKING:
-    from ..log_conventions import Mistake
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,10 +46,10 @@ def fit_noise(log: LogFile, *, given: FitNoiseOptions) -> None:
     slamgym fit-noise log.csv --write
     slamgym fit-noise MRCLAM_Dataset6 --robot 3 --estimator ekf
     """
-    from ..log_conventions import explaining, mistake_in
     from ..noise_fitting.fit import refuse_other_formats, write_noise
     from ..runs.filter_settings import noise_or_assumed, settings_for
     from .output_folder import default_folder, output_folder, write_summary
+    from .run_files import explaining, mistake_in
     from .tables import written
 
     reporter = given.reporter()
@@ -91,19 +88,22 @@ def fit_noise(log: LogFile, *, given: FitNoiseOptions) -> None:
     reporter.finish({**summary, "out": str(place), "written": is_written})
 
 
-def _show_fit(
-    summary: dict[str, Any], mistake: "Mistake | None", reporter: Reporter
-) -> None:
+def _show_fit(summary: dict[str, Any], mistake: object, reporter: Reporter) -> None:
     """Print a fit; for a log with a mistake, print the mistake first, and no noise."""
+    from ..noise_fitting.search import ENTRIES, noise_of
+    from ..runs.filter_settings import FilterSettings
     from .tables import advice, heading, noise_comparison_table, noise_table
 
+    settings = FilterSettings("", **summary["runs"]["suggested"]["settings"])
+    noise = noise_of(settings).tolist()
+    suggested = {name: std for (name, _), std in zip(ENTRIES, noise, strict=True)}
     title = heading("Noise of ", summary["log"], ", by ", summary["estimator"])
     if mistake is not None:
         no_noise = "No noise is suggested, because it would hide the mistake."
         reporter.show(title, Text(f"Warning: {mistake} {no_noise}", "yellow"), "")
         title = Text("The fit to the log as it is:", "dim")
     compared = noise_comparison_table(summary)
-    reporter.show(title, noise_table(summary), "", compared, "")
+    reporter.show(title, noise_table(summary, suggested), "", compared, "")
     if mistake is None:
         reporter.show(advice(summary), "")
         reporter.show_verbatim(summary["options"])

@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,17 +11,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.text import Text
 
+from ...leaves import leaf
 from .. import figures
 from ..figures.style import sign
-from ..log_conventions import explaining, mistake_in
 from ..logs.recording import steps_of
 from ..logs.slamlog import SlamLog, write_slamlog
 from ..runs.filter_settings import FilterSettings
 from ..runs.log_replay import Replay, replay
 from ..runs.summary import association_failure, summarise
 from ..runs.trace import RunTrace
-from ..viewers import RunFrames, ViewedRun, write_rerun, write_run_page
-from ..viewers.rerun_recording import import_rerun
 from . import options, program, tables
 from .output_folder import write_summary
 from .program import Reporter
@@ -50,7 +49,10 @@ def check_rerun(path: Path | None) -> None:
         raise program.BadInputError(f"--rerun must end in .rrd, got {path}")
     if not path.absolute().parent.is_dir():
         raise program.BadInputError(f"--rerun: the folder of {path} does not exist")
-    import_rerun()
+    viewers = leaf("experiments.viewers.rerun_recording")
+    if viewers is None:
+        raise program.BadInputError("--rerun: this installation has no viewers")
+    viewers.import_rerun()
 
 
 def filter_and_write(
@@ -89,21 +91,7 @@ def filter_and_write(
     every_step = given.every_step
     if every_step is None:
         every_step = sum(1 for _ in steps_of(log)) <= _FEW_STEPS + 1
-    runs, viewed = [], []
-    for label, settings in filters.items():
-        frames = RunFrames(log)
-        warm_up(settings, reporter)
-        with reporter.progress("filtering") as tick, explaining(log, settings):
-            run = replay(
-                log,
-                settings.make(log.start),
-                name=label,
-                keep_history=every_step,
-                progress=tick,
-                watch=frames.watch,
-            )
-        runs.append(run)
-        viewed.append(ViewedRun(run.trace, frames))
+    runs, frames = _filtered(log, filters, bool(every_step), reporter)
     traces = [run.trace for run in runs]
     with reporter.progress("drawing") as tick:
         write_figures(
@@ -118,9 +106,11 @@ def filter_and_write(
             compared = figures.comparison_figure(traces, walls)
             sign(compared, log.name)
             figures.save_figure(compared, folder / "comparison.png", dpi=150)
-    write_run_page(folder / "run.html", log, viewed, walls=walls)
-    if given.rerun is not None:
-        write_rerun(given.rerun, log, viewed, walls=walls)
+    if viewers := leaf("experiments.viewers"):
+        viewed = [*map(viewers.ViewedRun, traces, frames)]
+        viewers.write_run_page(folder / "run.html", log, viewed, walls=walls)
+        if given.rerun is not None:
+            viewers.write_rerun(given.rerun, log, viewed, walls=walls)
     write_slamlog(runs[0].log, folder / "log.csv")
     write_belief(folder / "belief.npz", runs[0])
     summaries = [
@@ -133,6 +123,44 @@ def filter_and_write(
             summary["warnings"] = [str(mistake)]
     named = {"mistake": None if mistake is None else mistake.as_dict()}
     return write_summary(folder, {**summaries[0], **named, "others": summaries[1:]})
+
+
+def _filtered(
+    log: SlamLog,
+    filters: Mapping[str, FilterSettings],
+    every_step: bool,
+    reporter: Reporter,
+) -> tuple[list[Replay], list[Any]]:
+    """Run filters over a log; also return the frames for the viewers, or None."""
+    viewers = leaf("experiments.viewers")
+    runs, kept = [], []
+    for label, settings in filters.items():
+        frames = viewers and viewers.RunFrames(log)
+        warm_up(settings, reporter)
+        with reporter.progress("filtering") as tick, explaining(log, settings):
+            run = replay(
+                log,
+                settings.make(log.start),
+                name=label,
+                keep_history=every_step,
+                progress=tick,
+                watch=frames and frames.watch,
+            )
+        runs.append(run)
+        kept.append(frames)
+    return runs, kept
+
+
+def mistake_in(log: SlamLog, settings: FilterSettings) -> Any:
+    """Return the convention that a log breaks; None if it is unknown."""
+    conventions = leaf("experiments.log_conventions")
+    return conventions and conventions.mistake_in(log, settings)
+
+
+def explaining(log: SlamLog, settings: FilterSettings) -> AbstractContextManager[None]:
+    """Name the mistake of a log beside the numerical failure that it causes."""
+    conventions = leaf("experiments.log_conventions")
+    return conventions.explaining(log, settings) if conventions else nullcontext()
 
 
 def write_belief(path: Path, run: Replay) -> None:

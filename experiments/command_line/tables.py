@@ -389,13 +389,12 @@ _VERDICTS = {
 }
 
 
-def noise_table(summary: dict[str, Any]) -> Table:
-    """Lay out the standard deviations with their intervals."""
+def noise_table(summary: dict[str, Any], suggested: Mapping[str, float]) -> Table:
+    """Lay out the standard deviations with their intervals, and those suggested."""
     table = _table(
         ("noise", "before", "most likely", "95 % interval", "suggested", ""),
         texts=("noise", ""),
     )
-    suggested = _noise_by_name(summary["runs"]["suggested"]["settings"])
     for row in summary["noise"]:
         table.add_row(
             f"{row['name']} [{row['unit']}]".replace("[", "\\["),
@@ -488,14 +487,6 @@ def _interval(row: dict[str, Any]) -> str:
     if row["verdict"] == "unknown" or row["high"] is None:
         return "-"
     return f"{significant(row['low'])} … {significant(row['high'])}"
-
-
-def _noise_by_name(settings: dict[str, Any]) -> dict[str, float]:
-    from ..noise_fitting.search import ENTRIES, noise_of
-    from ..runs.filter_settings import FilterSettings
-
-    noise = noise_of(FilterSettings("", **settings)).tolist()
-    return {name: std for (name, _), std in zip(ENTRIES, noise, strict=True)}
 
 
 def _at(run: dict[str, Any], path: tuple[str, ...]) -> Any:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .maps import map_figure as map_figure
     from .maps import map_sequence as map_sequence
     from .maps import noise_study_figure as noise_study_figure
-    from .maps import smoothed_figure as smoothed_figure
+    from .smoothed import smoothed_figure as smoothed_figure
     from .style import save_figure as save_figure
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

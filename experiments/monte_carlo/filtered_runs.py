@@ -20,7 +20,6 @@ from ...estimator.filters.ekf import EkfSlam
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.motions import find_motion
 from ...estimator.models.sensors import Sensor, find_sensor
-from ...estimator.smoother.batch_smoother import smoother_in
 from ...estimator.support.saved_states import is_semidefinite
 from ...evaluation.error_bound import PosteriorBound, posterior_bound
 from ...evaluation.nees import SINGULAR
@@ -178,8 +177,9 @@ def _one_by_one(
             belief = _step(slam, runs, run, step, trace, recorder)
             if not _finite(trace, (run, step)):
                 return Failure(step, _NOT_FINITE)
-        if (smoother := smoother_in(slam)) is not None:
-            path = smoother.smoothed()  # without innovations, and so without NIS
+        smoothed = getattr(getattr(slam, "best", slam), "smoothed", None)
+        if callable(smoothed):  # without innovations, and so without NIS
+            path = smoothed()
             belief, covariances = path.belief(), path.pose_covariances
             trace.poses[run], trace.pose_covariances[run] = path.poses, covariances
             trace.nis[run], trace.degrees_of_freedom[run] = 0.0, 0

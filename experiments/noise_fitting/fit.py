@@ -28,10 +28,10 @@ from ...evaluation.hypothesis_tests import (
 from ...evaluation.nees import pose_nees
 from ..logs import slamlog
 from ..logs.ground_truth import hides_identities, true_poses_of
-from ..logs.importers.any_format import as_log
 from ..logs.log_lines import read_lines, write_whole
 from ..runs.filter_settings import (
     FilterSettings,
+    given_log,
     noise_or_assumed,
     one_blas_thread,
     settings_for,
@@ -132,7 +132,7 @@ def fit_noise(
     >>> [(noise.name, noise.verdict) for noise in fit.noise][:2]
     [('σx', 'fitted'), ('σy', 'fitted')]
     """
-    log = as_log(log)
+    log = given_log(log)
     if settings is None:
         stds: dict[str, Any] = {**noise_or_assumed(log, {})}
         settings = settings_for(log, **stds)

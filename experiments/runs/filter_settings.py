@@ -24,10 +24,10 @@ from threadpoolctl import threadpool_limits
 from ...estimator import interface, registry
 from ...estimator.models.sensors import Sensor, sensor_in
 from ...estimator.support import argument_checks
+from ...leaves import is_here
 from ...sim_configs import Scenario
 from ...suggestions import closest
 from ..logs.ground_truth import hides_identities
-from ..logs.importers.any_format import as_log
 from ..logs.recording import log_header
 from ..logs.slamlog import UNICYCLES, LogError, SlamLog
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 #: and whose options it takes too.
 SMOOTHER = "slamgym.estimator.smoother.recorded_slam:SmoothingSlam"
 #: Estimators of whole drives, which no step-by-step experiment knows by name.
-OFFLINE = {"smoother": SMOOTHER}
+OFFLINE = {"smoother": SMOOTHER} if is_here("estimator.smoother") else {}
 #: The five noises: three of the motion in the robot's frame, two of the sensor.
 SIGMAS = ("σx", "σy", "σα", "σβ", "σr")
 
@@ -130,6 +130,23 @@ class FilterSettings:
         return replace(self, options=options)
 
 
+def given_log(log: SlamLog | str | PathLike[str]) -> SlamLog:
+    """Return a log, or read the log at a path, in any known format.
+
+    Raises
+    ------
+    TypeError
+        If it is neither.
+    """
+    if isinstance(log, SlamLog):
+        return log
+    from ..logs.importers.any_format import read_log  # noqa: PLC0415 (all formats)
+
+    if isinstance(log, str | PathLike):
+        return read_log(log)
+    raise TypeError(f"log must be a SlamLog or the path of one, got {log!r}")
+
+
 def settings_for(
     log: SlamLog | str | PathLike[str],
     *,
@@ -169,7 +186,7 @@ def settings_for(
     LogError
         If a value in the header is malformed.
     """
-    log = as_log(log)
+    log = given_log(log)
     name, own = registry.read_label(estimator)
     estimator = OFFLINE.get(name, name)
     factory = registry.find_estimator(estimator)

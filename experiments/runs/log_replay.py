@@ -16,10 +16,8 @@ import numpy as np
 from ...arrays import Array
 from ...estimator import interface
 from ...estimator.interface import Belief, MapView, SlamEstimator, UpdateReport
-from ...estimator.map_management.managed_slam import ManagedFilter
 from ..logs import ground_truth, recording, slamlog
-from ..logs.importers.any_format import as_log
-from .filter_settings import one_blas_thread, refuse_large_map, settings_for
+from .filter_settings import given_log, one_blas_thread, refuse_large_map, settings_for
 from .trace import (
     DecisionRecorder,
     MapEstimate,
@@ -135,7 +133,7 @@ def replay(
     >>> replay(log, slam).readings
     ReadingCounts(associated=1, added=1, rejected=0, skipped=0, near=1, ...
     """
-    log = as_log(log)
+    log = given_log(log)
     if isinstance(estimator, str):
         name = name or estimator
         estimator = settings_for(log, estimator=estimator).make(log.start)
@@ -199,6 +197,8 @@ def _name_of(estimator: SlamEstimator, given: str | None) -> str:
     """Return a given name, or that of the class; of a managed filter, the filter's."""
     if given:
         return given
+    from ...estimator.map_management.managed_slam import ManagedFilter  # noqa: PLC0415 (many)
+
     if isinstance(estimator, ManagedFilter):
         return type(estimator.filter).__name__
     return type(estimator).__name__

@@ -24,13 +24,13 @@ from ...estimator.smoother.batch_smoother import smooth_repaired, smoother_in
 from ...estimator.smoother.drive import Sightings
 from ...evaluation import nees
 from ..logs.ground_truth import path_accuracy, true_landmarks_of, true_poses_of
-from ..logs.importers.any_format import as_log
 from ..logs.recording import predictions_until
 from ..logs.slamlog import SlamLog
 from . import summary
 from .filter_settings import (
     SMOOTHER,
     FilterSettings,
+    given_log,
     noise_or_assumed,
     one_blas_thread,
     settings_for,
@@ -157,7 +157,7 @@ def smooth_log(
     numpy.linalg.LinAlgError
         If the smoother does not converge.
     """
-    log = as_log(log)
+    log = given_log(log)
     if settings is None:
         stds: dict[str, Any] = {**noise_or_assumed(log, {})}
         settings = settings_for(log, estimator=SMOOTHER, **stds)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ...arrays import AnyArray, Array, IntArray
 from ...estimator import interface
-from ...estimator.map_management.policy import policy_of
 from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation import association_scores, trajectory_error
 from ..logs.ground_truth import TrueLandmarks
@@ -224,6 +223,8 @@ class DecisionRecorder:
         true_ids = [ids for ids in self._true_ids if ids is not None]
         if [len(scan.row_ids) for scan in made] != [len(ids) for ids in true_ids]:
             return None
+        from ...estimator.map_management.policy import policy_of  # noqa: PLC0415 (many)
+
         confirm = policy_of(self._slam).confirm
         return RunDecisions(made, true_ids, confirm, alarm_of(self._slam))
 

@@ -22,6 +22,7 @@ from ...estimator.filters.ekf import EkfSlam
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.motions import UNICYCLE, Motion, find_motion, only_unicycle
 from ...estimator.models.rigid_motion import composed
+from ...leaves import is_here
 from ...sim_configs import Scenario
 from ...sim_configs.field_types import unknown_choice
 from ...sim_configs.scenario_files import scenario_text
@@ -412,11 +413,17 @@ def _trajectory(log: slamlog.SlamLog, about: dict[str, Any]) -> Trajectory:
 
 
 #: The formats, or the modules that define them and load a library.
-FORMATS = {
+_ALL: dict[str, TrajectoryFormat | str] = {
     "slamlog": TrajectoryFormat(_write_slamlog, _read_slamlog),
     "npz": TrajectoryFormat(_write_npz, _read_npz, ENDING=".npz", HOLDS_BELIEFS=True),
     "parquet": "parquet",
     "minari": "minari_dataset",
     "tum": TrajectoryFormat(_write_tum, _read_tum, check=_check_tum),
     "g2o": "g2o",
+}
+#: The formats by name, or the modules to load them from.
+FORMATS = {
+    name: found
+    for name, found in _ALL.items()
+    if not isinstance(found, str) or is_here(f"experiments.trajectories.{found}")
 }

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import gymnasium
 
+from .leaves import is_here
 from .public_names import attach
 
 __version__ = "0.1.0"
@@ -52,8 +53,9 @@ gymnasium.register(
     entry_point="slamgym.envs.landmark_world:LandmarkWorldEnv",
     vector_entry_point="slamgym.envs.vector.landmark_world_vector:LandmarkWorldVectorEnv",
 )
-gymnasium.register(
-    id="slamgym/ActiveSlam-v0",
-    entry_point="slamgym.agents.active_slam:ActiveSlamEnv",
-    vector_entry_point="slamgym.agents.active_slam:ActiveSlamVectorEnv",
-)
+if is_here("agents.active_slam"):
+    gymnasium.register(
+        id="slamgym/ActiveSlam-v0",
+        entry_point="slamgym.agents.active_slam:ActiveSlamEnv",
+        vector_entry_point="slamgym.agents.active_slam:ActiveSlamVectorEnv",
+    )

@@ -10,6 +10,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from import_graph import PACKAGES
 
 import slamgym
 from slamgym.estimator import list_estimators, make_estimator
@@ -250,6 +251,16 @@ def test_contributing_lists_the_checks_of_ci():
     named = {"ruff check", "ruff format --check", "codespell", "mypy"}
     shown = [line for line in ci if line in named]
     assert checks.splitlines() == [*shown, "pytest -n auto"]
+
+
+def test_functions_and_classes_that_contributing_names_exist():
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    named = set(re.findall(r"`([A-Za-z]\w*(?:_\w+|[a-z][A-Z]\w+))`", text))
+    assert {"EkfSlam", "check_estimator", "AssociationPolicy"} <= named
+    folders = ["src/slamgym", *PACKAGES]
+    files = [file for folder in folders for file in (ROOT / folder).rglob("*.py")]
+    known = set(re.findall(r"\w+", "\n".join(file.read_text() for file in files)))
+    assert named <= known
 
 
 def test_version_licence_and_python_agree_everywhere():

@@ -126,7 +126,7 @@ def test_filters_may_be_told_another_noise():
         (("lop",), "did you mean 'loop'"),
         (("loop", "-e", "ekg"), "did you mean 'ekf'"),
         (("loop", "--runs", "0"), "runs must be an integer >= 1"),
-        (("loop", "--scheduler", "tcp://a:1"), "--scheduler is for"),
+        (("loop", "--scheduler", "tcp://a:1"), "--scheduler requires"),
         (("loop", "--backend", "spark"), "backend must be one of"),
         (("loop", "--assume", "motion.sdt=1"), "sdt"),
     ],

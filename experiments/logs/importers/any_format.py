@@ -130,21 +130,6 @@ def read_log(
     return log if landmarks is None else _with_landmarks(log, landmarks)
 
 
-def as_log(log: slamlog.SlamLog | str | PathLike[str]) -> slamlog.SlamLog:
-    """Return a log, or read it from a path.
-
-    Raises
-    ------
-    TypeError
-        If it is neither.
-    """
-    if isinstance(log, slamlog.SlamLog):
-        return log
-    if isinstance(log, str | PathLike):
-        return read_log(log)
-    raise TypeError(f"log must be a SlamLog or the path of one, got {log!r}")
-
-
 def read_true_path(path: str | PathLike[str]) -> TruePath:
     """Read the true path of a robot from a file of any known format.
 
