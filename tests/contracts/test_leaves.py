@@ -35,15 +35,20 @@ def slamgym(line):
 slamgym("run six_landmarks --steps 4 --out run")
 slamgym("replay run/log.csv -e ekf --out replay")
 slamgym("generate six_landmarks --episodes 2 --steps 4 --out data")
-slamgym("monte-carlo six_landmarks -e ekf,invariant --runs 2 --steps 4 --out many")
 slamgym("estimators")
-for file in ("run/map.png", "replay/summary.json", "data", "many/report.html"):
+for file in ("run/map.png", "replay/summary.json", "data"):
     assert Path(file).exists(), file
 
 import slamgym as package
 for part in (package, package.estimator, package.experiments, package.agents):
     for name in part.__all__:
         getattr(part, name)
+"""
+
+
+MANY_RUNS = """
+slamgym("monte-carlo six_landmarks -e ekf,invariant --runs 2 --steps 4 --out many")
+assert Path("many/report.html").exists()
 """
 
 
@@ -111,7 +116,7 @@ def test_the_commands_of_the_core_work_without_a_leaf(name, tmp_path):
 @pytest.mark.slow
 def test_the_core_works_without_any_leaf(tmp_path):
     copy_without(tmp_path, LEAVES)
-    without_leaves(tmp_path, "-c", COMMANDS)
+    without_leaves(tmp_path, "-c", COMMANDS + MANY_RUNS)
     for name in ("tests", "pyproject.toml"):
         source, target = ROOT / name, tmp_path / name
         (shutil.copytree if source.is_dir() else shutil.copy)(source, target)
