@@ -32,8 +32,8 @@ def slamgym(line):
     except SystemExit as end:
         assert not end.code, line
 
-slamgym("run six_landmarks --steps 4 --out run")
-slamgym("replay run/log.csv -e ekf --out replay")
+slamgym("run six_landmarks --steps 4 --no-every-step --out run")
+slamgym("replay run/log.csv -e ekf --no-every-step --out replay")
 slamgym("generate six_landmarks --episodes 2 --steps 4 --out data")
 slamgym("estimators")
 for file in ("run/map.png", "replay/summary.json", "data"):
