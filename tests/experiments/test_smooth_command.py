@@ -11,7 +11,7 @@ from drives import MEASUREMENT_STD, MOTION_STD, drive
 
 from slamgym.estimator.smoother import Drive, SmoothedDrive, smooth
 from slamgym.evaluation.trajectory_error import Alignment
-from slamgym.experiments.figures.maps import smoothed_figure
+from slamgym.experiments.figures.smoothed import smoothed_figure
 from slamgym.experiments.logs.ground_truth import true_poses_of, without_identities
 from slamgym.experiments.logs.slamlog import (
     OdometryRow,
