@@ -253,7 +253,7 @@ class EkfSlam(MapFilter):
         "full" correlates a new landmark with the pose from which it was seen.
         "independent" omits this correlation, which makes the filter overconfident;
         it serves to reproduce published results.  "delayed" places a landmark once
-        readings from several poses determine it, see :mod:`.delayed_landmarks`. It
+        readings from several poses determine it, see ``delayed_landmarks``. It
         serves sensors with bearings that are coarse for their ranges, r σβ²/2 > σr.
     gate_probability : float or None
         Readings of mapped landmarks outside this chi-square region of their own
