@@ -24,6 +24,7 @@ import numpy as np
 from numba import config, njit, types
 from numba.core import caching, event
 from numba.core.cpu import CPUTargetOptions
+from numba.core.runtime.nrt import rtsys
 from numba.extending import intrinsic
 
 _PLAIN = bool(getattr(config, "DISABLE_JIT", 0))
@@ -386,7 +387,9 @@ class KernelCache:
         if self._files is None:
             return None
         try:
-            found = self._files.load_overload(signature, target_context)
+            # What numba's own function does, but for loading its compiler.
+            rtsys.initialize(target_context)
+            found = self._files._load_overload(signature, target_context)
         except Exception:  # a damaged file can raise any error
             found = None
             with contextlib.suppress(OSError):

@@ -6,6 +6,7 @@ A package lists its public names once, as imports below ``if TYPE_CHECKING:`` in
 
 import ast
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ def attach(package: str) -> Any:
     return lazy_loader.attach(package, names.pop("", ()), names)
 
 
+@cache
 def listed(file: Path) -> dict[str, str]:
     """Return each public name of a package, and the module below it that has the name.
 

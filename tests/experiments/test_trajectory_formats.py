@@ -91,7 +91,7 @@ def odd_numbers():
     """Return a drive with numbers that careless writers lose."""
     (drive,) = drives("loop", steps=4, seeds=(0,))
     odometry = drive.odometry.copy()
-    odometry[:3] = (-0.0, 5e-324), (1e-300, -1e300), (0.1, -0.3)
+    odometry[:3] = (-0.0, 5e-324), (1e-300, -1e99), (0.1, -0.3)
     return replace(drive, odometry=odometry, actions=-odometry)
 
 
