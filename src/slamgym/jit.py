@@ -244,14 +244,26 @@ def digest_of_sources() -> str:
     for name, value in sorted(os.environ.items()):
         if name.startswith("NUMBA_") and not name.startswith(_UNRELATED):
             digest.update(f"{name}={value}".encode())
-    for place in (Path(__file__).parent / part for part in SOURCES):
-        files = [place] if place.is_file() else sorted(place.rglob("*.py"))
-        for file in filter(Path.is_file, files):  # not a link of an editor
-            digest.update(f"{file.relative_to(place.parent)}".encode())
-            digest.update(file.read_bytes())
+    home = Path(__file__).parent
+    for file in _source_files():
+        digest.update(f"{file.relative_to(home)}".encode())
+        digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
 
 
+def _source_files() -> Iterator[Path]:
+    for place in (Path(__file__).parent / part for part in SOURCES):
+        files = [place] if place.is_file() else sorted(place.rglob("*.py"))
+        yield from filter(Path.is_file, files)  # no link of an editor
+
+
+def _stamp(file: Path) -> tuple[int, int, int]:
+    """Return what every write to a file changes."""
+    state = file.stat()
+    return state.st_ctime_ns, state.st_mtime_ns, state.st_size
+
+
+_STAMPS = {file: _stamp(file) for file in _source_files()}
 _DIGEST = digest_of_sources()  # at import: later edits are not in this process
 
 
@@ -413,9 +425,10 @@ class KernelCache:
             raise TypeError(f"{self._kernel} hands on arrays: use njit_allocating")
         if self._files is None or result.library.has_dynamic_globals or result.lifted:
             return  # these hold addresses in the memory of this process
-        # The folder may be read only, and its files damaged.
+        # The folder may be read only, its files damaged, and the sources edited since
+        # the import.
         with contextlib.suppress(Exception):
-            if digest_of_sources() == _DIGEST:  # else edited since the import
+            if all(_stamp(file) == stamp for file, stamp in _STAMPS.items()):
                 self._files.save_overload(signature, result)
 
 
