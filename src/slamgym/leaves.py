@@ -57,7 +57,12 @@ LEAVES: dict[str, tuple[str, ...]] = {
 
 def is_here(module: str) -> bool:
     """Return whether a module or folder of the package exists, by its dotted name."""
-    place = Path(__file__).parent.joinpath(*module.split("."))
+    return holds(Path(__file__).parent, module)
+
+
+def holds(folder: Path, module: str) -> bool:
+    """Return whether a folder holds a module or room, by its dotted name in it."""
+    place = folder.joinpath(*module.split("."))
     return (place / "__init__.py").is_file() or place.with_suffix(".py").is_file()
 
 

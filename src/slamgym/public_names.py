@@ -12,6 +12,8 @@ from typing import Any
 
 import lazy_loader
 
+from .leaves import holds
+
 
 def attach(package: str) -> Any:
     """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package.
@@ -47,24 +49,11 @@ def listed(file: Path) -> dict[str, str]:
         if isinstance(node, ast.ImportFrom):
             module = node.module or ""
             for alias in node.names:
-                if alias.name != "*" and not _is_there(file.parent, module, alias.name):
+                if not holds(file.parent, module or alias.name):
                     continue
                 if alias.name == "*":
-                    if not (file.parent / module / "__init__.py").is_file():
-                        continue
                     inner = listed(file.parent / module / "__init__.py")
                     names |= {name: module for name, its in inner.items() if its}
                 else:
                     names[alias.name] = module
     return names
-
-
-def _is_there(folder: Path, module: str, name: str) -> bool:
-    """Return whether a name of a package can be imported: its leaf may be deleted."""
-    place = folder.joinpath(*(module or name).split("."))
-    if place.with_suffix(".py").is_file():
-        return True
-    room = place / "__init__.py"
-    if not room.is_file():
-        return False
-    return not module or name in listed(room) or (place / f"{name}.py").is_file()
