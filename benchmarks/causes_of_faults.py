@@ -157,11 +157,17 @@ class Fault(NamedTuple):
 
 def correlated(world: Scenario, runs: Any) -> Any:
     """Return runs whose bearing noise is AR(1) with φ = .9."""
-    phi, noise = 0.9, np.random.default_rng(5).standard_normal(runs.visible.shape)
+    noise = autoregressive(runs.visible.shape, phi=0.9, seed=5)
+    return with_noise(runs, 0, world.sensor.std[0] * noise)
+
+
+def autoregressive(shape: tuple[int, ...], phi: float, seed: int) -> Array:
+    """Return AR(1) noise of variance 1 over the second axis."""
+    noise = np.random.default_rng(seed).standard_normal(shape)
     for step in range(1, noise.shape[1]):
         fresh = np.sqrt(1 - phi**2) * noise[:, step]
         noise[:, step] = phi * noise[:, step - 1] + fresh
-    return with_noise(runs, 0, world.sensor.std[0] * noise)
+    return noise
 
 
 def with_outliers(world: Scenario, runs: Any) -> Any:
@@ -329,10 +335,7 @@ def wild_bearings(world: Scenario, runs: Any) -> Any:
 
 def correlated_ranges(world: Scenario, runs: Any) -> Any:
     """Return runs whose noise of ranges is AR(1) with φ = .7."""
-    phi, noise = 0.7, np.random.default_rng(8).standard_normal(runs.visible.shape)
-    for step in range(1, noise.shape[1]):
-        fresh = np.sqrt(1 - phi**2) * noise[:, step]
-        noise[:, step] = phi * noise[:, step - 1] + fresh
+    noise = autoregressive(runs.visible.shape, phi=0.7, seed=8)
     return with_noise(runs, 1, world.sensor.std[1] * noise)
 
 
