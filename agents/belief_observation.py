@@ -21,9 +21,9 @@ from ..envs import LandmarkWorldEnv
 from ..envs.vector.landmark_world_vector import final_infos
 from ..estimator.filters.batch import BatchBeliefs, BatchSlam, BatchStorage, can_batch
 from ..estimator.filters.ekf import EkfSlam
+from ..estimator.guards import argument_checks
 from ..estimator.interface import resume, snapshot
 from ..estimator.registry import accepted_models, find_estimator, make_batch, read_label
-from ..estimator.support import argument_checks
 from ..restorable import Restorable, State
 from ..sim_configs import Scenario
 from .belief_features import (

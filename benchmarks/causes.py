@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import xarray as xr
 
 from slamgym.estimator import Belief, InvariantEkfSlam
-from slamgym.estimator.support.argument_checks import LandmarkIds
+from slamgym.estimator.guards.argument_checks import LandmarkIds
 from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
 from slamgym.sim_configs import Scenario, load_scenario
 

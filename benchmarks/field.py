@@ -28,8 +28,11 @@ from slamgym.estimator.check_estimator import CHECKS, find_breaches
 from slamgym.estimator.interface import SlamEstimator
 from slamgym.estimator.registry import accepted_options, find_estimator
 from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
-from slamgym.experiments.runs.filter_settings import EstimatorChoice, estimator_choices
-from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.experiments.run_and_replay.filter_settings import (
+    EstimatorChoice,
+    estimator_choices,
+)
+from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import Scenario, load_scenario
 
 WORLDS = {"six_landmarks": 29, "loop": 260, "coarse_loop": 260}

@@ -9,7 +9,7 @@ import numpy as np
 from slamgym.envs.controllers import OpenLoop
 from slamgym.experiments.logs import SlamLog, record_episode
 from slamgym.experiments.noise_fitting import NoiseFit, fit_noise
-from slamgym.experiments.runs import settings_for
+from slamgym.experiments.run_and_replay import settings_for
 from slamgym.sim_configs import action_sequence, load_scenario
 
 WORLDS = ("loop", "corridor", "dense")

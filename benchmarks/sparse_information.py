@@ -37,7 +37,10 @@ from slamgym.estimator.large_maps.sparse_information.sparse_information_slam imp
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.motions import predict_pose
 from slamgym.evaluation.nees import pose_nees
-from slamgym.experiments.runs.simulated_runs import SimulatedRuns, simulate_runs
+from slamgym.experiments.run_and_replay.simulated_runs import (
+    SimulatedRuns,
+    simulate_runs,
+)
 from slamgym.sim_configs import Scenario, load_scenario
 
 Array = NDArray[np.float64]

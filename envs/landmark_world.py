@@ -20,11 +20,11 @@ from ..sim_configs import Scenario, load_scenario
 from .bearing_range import BearingRangeSensor, hide_identities
 from .drives import drive_of
 from .noise_streams import NoiseRows, PoseSensors, WorldNoise, row_of
+from .random_numbers import EpisodeStarts, drawn_scenarios, episode_keys
 from .rendering.episode_renderer import EpisodeRenderer
 from .rendering.render_state import RENDER_MODES, BeliefLike
 from .robot import OdometrySensor, UnicycleBody
 from .spaces import action_space, clipped_action, observation_space
-from .streams import EpisodeStarts, drawn_scenarios, episode_keys
 
 Observation = dict[str, Any]
 

@@ -16,7 +16,7 @@ from ..arrays import Array, IntArray, WordArray
 from ..restorable import Restorable
 from ..sim_configs import Scenario
 from ..sim_configs.scenario import Sensor
-from . import streams
+from . import random_numbers
 
 Row = TypeVar("Row")
 
@@ -133,9 +133,9 @@ class WorldNoise:
         self._landmarks = count = scenario.landmarks.count
         hidden, rows = not sensor.identities, sensor.max_clutter
         widths = {  # of uniform numbers per step; one and two for each false row
-            streams.DROPOUT: count * (sensor.dropout > 0),
-            streams.CLUTTER: (1 + 2 * rows) * (hidden and sensor.clutter > 0),
-            streams.ORDER: (count + rows) * hidden,
+            random_numbers.DROPOUT: count * (sensor.dropout > 0),
+            random_numbers.CLUTTER: (1 + 2 * rows) * (hidden and sensor.clutter > 0),
+            random_numbers.ORDER: (count + rows) * hidden,
         }
         self._widths = {stream: width for stream, width in widths.items() if width}
         self._settings = SensorSettings.of(sensor)
@@ -154,7 +154,7 @@ class WorldNoise:
             Of each world, where worlds differ.
         """
         unit = np.empty((len(steps), 3))
-        streams.draw_normals(keys, steps, streams.MOTION, unit)
+        random_numbers.draw_normals(keys, steps, random_numbers.MOTION, unit)
         noise: Array = heavy_tails(unit, self._faults.motion_dof)
         noise *= self._motion_std if std is None else std
         return noise
@@ -165,17 +165,17 @@ class WorldNoise:
         """Draw the sensor noise; see `motion`."""
         settings = settings or self._settings
         unit = np.empty((len(steps), 2 * self._landmarks))
-        streams.draw_normals(keys, steps, streams.MEASUREMENT, unit)
+        random_numbers.draw_normals(keys, steps, random_numbers.MEASUREMENT, unit)
         unit = heavy_tails(unit, self._faults.sensor_dof)
         drawn = {
             stream: _uniform(keys, steps, stream, width)
             for stream, width in self._widths.items()
         }
-        lots = drawn.get(streams.DROPOUT, unit[:, :0])
-        if streams.ORDER not in drawn:
+        lots = drawn.get(random_numbers.DROPOUT, unit[:, :0])
+        if random_numbers.ORDER not in drawn:
             return unit, lots, None, None
-        clutter = self._clutter(len(steps), drawn.get(streams.CLUTTER), settings)
-        return unit, lots, clutter, drawn[streams.ORDER]
+        clutter = self._clutter(len(steps), drawn.get(random_numbers.CLUTTER), settings)
+        return unit, lots, clutter, drawn[random_numbers.ORDER]
 
     def _clutter(
         self, count: int, drawn: Array | None, settings: SensorSettings
@@ -227,7 +227,7 @@ class PoseSensors:
             True poses [m, m, rad].
         """
         unit = np.empty((len(steps), 3))
-        streams.draw_normals(keys, steps, streams.POSE, unit)
+        random_numbers.draw_normals(keys, steps, random_numbers.POSE, unit)
         readings = poses + unit * self.std
         readings[:, 2] = (readings[:, 2] + np.pi) % (2 * np.pi) - np.pi
         is_due = (self._every > 0) & (steps[:, None] % np.maximum(self._every, 1) == 0)
@@ -243,7 +243,7 @@ class PoseSensors:
 def _uniform(keys: WordArray, steps: IntArray, stream: int, width: int) -> Array:
     """Draw uniform numbers, shape (K, width)."""
     drawn = np.empty((len(steps), width))
-    streams.draw_uniforms(keys, steps, stream, drawn)
+    random_numbers.draw_uniforms(keys, steps, stream, drawn)
     return drawn
 
 

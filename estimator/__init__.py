@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .check_estimator import EstimatorContractError as EstimatorContractError
     from .check_estimator import check_estimator as check_estimator
     from .filters import *
+    from .guards import argument_checks as argument_checks
     from .interface import Belief as Belief
     from .interface import ScanDecisions as ScanDecisions
     from .interface import SlamEstimator as SlamEstimator
@@ -34,6 +35,5 @@ if TYPE_CHECKING:
     from .registry import make_estimator as make_estimator
     from .registry import register_estimator as register_estimator
     from .smoother import *
-    from .support import argument_checks as argument_checks
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array
 from ..suggestions import counted
+from .guards.undo import Undo, to_the_end, undo_all, undone_on_error
 from .models import rigid_motion
 from .models.bearing_range import wrap_angle
-from .support.undo import Undo, to_the_end, undo_all, undone_on_error
 
 __all__ = [
     "Belief",

@@ -26,10 +26,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array
+from ..estimator.guards.argument_checks import as_floats
 from ..estimator.interface import ScanDecisions
 from ..estimator.models.rigid_motion import rotation
 from ..estimator.models.sensors import Sensor, find_sensor
-from ..estimator.support.argument_checks import as_floats
 
 CLUTTER = -1  # the true landmark of a reading that has none
 

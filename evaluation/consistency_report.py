@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Array, BoolArray, IntArray
+from ..estimator.guards import argument_checks
 from ..estimator.models.rigid_motion import ErrorFrame
-from ..estimator.support import argument_checks
 from ..suggestions import counted
 from . import hypothesis_tests as tests
 from . import map_consistency

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 from scipy.special import bdtrc, chdtri, stdtr, stdtrit
 
 from ..arrays import Array, BoolArray
-from ..estimator.support import argument_checks
+from ..estimator.guards import argument_checks
 from ..suggestions import counted
 from . import noise_findings
 from .hypothesis_tests import time_average_test

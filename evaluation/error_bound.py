@@ -25,10 +25,10 @@ from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
 from ..arrays import Array, BoolArray, IntArray
+from ..estimator.guards import argument_checks
 from ..estimator.models.bearing_range import reading_slopes_jit
 from ..estimator.models.rigid_motion import seen_from
 from ..estimator.models.sensors import BEARING_RANGE, POSITION, Sensor, find_sensor
-from ..estimator.support import argument_checks
 from ..jit import jit, njit_allocating, njit_internal
 
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtr, chdtrc, gammaincinv, stdtr, stdtrit
 
 from ..arrays import Array, BoolArray, IntArray
-from ..estimator.support import argument_checks
+from ..estimator.guards import argument_checks
 
 
 class HypothesisTest(NamedTuple):

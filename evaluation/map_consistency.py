@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtr, chdtrc, chndtr
 
 from ..arrays import Array, BoolArray, IntArray
-from ..estimator.support.argument_checks import shaped
+from ..estimator.guards.argument_checks import shaped
 from .hypothesis_tests import EQUIVALENCE_MARGIN, EquivalenceTest, equivalence_test
 from .sequential_tests import EProcess, MeanEProcess, average_of
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Array
+from ..estimator.guards.argument_checks import one_of
 from ..estimator.models.rigid_motion import (
     ERROR_FRAMES,
     ErrorFrame,
@@ -21,7 +22,6 @@ from ..estimator.models.rigid_motion import (
     invariant_error,
     seen_from,
 )
-from ..estimator.support.argument_checks import one_of
 
 #: Conditional variance, as a share of the variance, below which it counts as zero.
 SINGULAR = 1e-10

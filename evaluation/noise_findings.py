@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtr, chdtrc, ndtr, stdtr
 
 from ..arrays import Array, BoolArray, IntArray
+from ..estimator.guards import argument_checks
 from ..estimator.models.bearing_range import wrap_angle
 from ..estimator.models.sensors import Sensor, only_bearing_range
-from ..estimator.support import argument_checks
 
 #: The five noises: εx, εy, εα of the motion, εβ, εr of the readings.
 CHANNELS = ("along", "sideways", "turn", "bearing", "range")

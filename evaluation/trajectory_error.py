@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, IntArray
+from ..estimator.guards.argument_checks import as_floats, shaped
 from ..estimator.models.bearing_range import wrap_angle
 from ..estimator.models.rigid_motion import rotation
-from ..estimator.support.argument_checks import as_floats, shaped
 
 _ROUNDING = 4 * np.finfo(np.float64).eps
 _LEAST_TO_EXCHANGE = 5  # positions, so that most of them are right

@@ -1,7 +1,8 @@
 """What people do with worlds and estimators.
 
 * :mod:`~slamgym.experiments.logs` reads, writes and records logs of readings.
-* :mod:`~slamgym.experiments.runs` filters a log or simulated runs, and summarises them.
+* :mod:`~slamgym.experiments.run_and_replay` filters a log or simulated runs, and
+  summarises them.
 * :mod:`~slamgym.experiments.figures` draws a run: map, errors, covariance.
 * :mod:`~slamgym.experiments.monte_carlo` tests the consistency of filters in many runs.
 * :mod:`~slamgym.experiments.judging` judges the estimates of other programs, and
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from . import monte_carlo as monte_carlo
     from . import noise_fitting as noise_fitting
     from . import noise_study as noise_study
-    from . import runs as runs
+    from . import run_and_replay as run_and_replay
     from . import trajectories as trajectories
     from . import viewers as viewers
     from .figures import *
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
     from .noise_study import scaled_scenario as scaled_scenario
     from .noise_study import study_log as study_log
     from .noise_study import study_scenario as study_scenario
-    from .runs import *
+    from .run_and_replay import *
     from .space_poses import judge_in_space as judge_in_space
     from .trajectories import *
     from .viewers import *

@@ -19,15 +19,15 @@ import numpy as np
 
 from ..arrays import AnyArray, Array
 from ..estimator.filters.batch import BatchTrace
+from ..estimator.guards import argument_checks
 from ..estimator.models.rigid_motion import pose_rotation
-from ..estimator.support import argument_checks
 from ..evaluation.consistency_report import evaluate_consistency
 from ..evaluation.error_bound import PosteriorBound
 from ..evaluation.nees import normalised_squared_error, whitened
 from ..evaluation.noise_findings import CHANNELS, MOMENTS
 from ..evaluation.trajectory_error import Alignment, align_positions, poses_at
 from ..sim_configs.scenario_files import scenario_text
-from . import conventions
+from . import estimate_conventions
 from .estimate_files import (
     Estimate,
     beliefs_of,
@@ -53,7 +53,7 @@ from .monte_carlo.run_measures import (
     write_failures,
 )
 from .monte_carlo.verdict import POSE_FREEDOM
-from .runs.simulated_runs import SimulatedRuns
+from .run_and_replay.simulated_runs import SimulatedRuns
 from .trajectories.manifest import MANIFEST, TrajectoryDataset, load_trajectories
 from .trajectories.trajectory import Trajectory, array_of
 
@@ -522,7 +522,7 @@ def _measured(
             failures[run] = Failure(-1, reason)
         else:
             poses[run], claims[run] = each.poses, each.covariances
-    additive = conventions.additive_covariances(poses, claims, frame)
+    additive = estimate_conventions.additive_covariances(poses, claims, frame)
     moved = poses
     if align is not None:
         moved, additive = _aligned(poses, additive, truth, align)
@@ -720,20 +720,20 @@ def _mistakes(parts: Sequence[_Part], task: _Task, frame: str, decides: str) -> 
         np.concatenate([part.arrays[place][:, steps] for part in parts])
         for place in range(3)
     )
-    additive = conventions.additive_covariances(poses, claims, frame)
+    additive = estimate_conventions.additive_covariances(poses, claims, frame)
     counts = np.cumsum([len(part.arrays[0]) for part in parts])
-    few = parts[: int(np.searchsorted(counts, conventions.MOST_DRIVES)) + 1]
+    few = parts[: int(np.searchsorted(counts, estimate_conventions.MOST_DRIVES)) + 1]
     first = [np.concatenate([part.arrays[place] for part in few]) for place in range(4)]
     (truth_at, *others) = [part.truth_at for part in few]
     ratios = np.concatenate([p.block["pose_nees_invariant"] for p in parts]) / 3
     return (
-        conventions.swapped_drives(truth, poses, additive, task.names)
-        or conventions.mistake_in(
+        estimate_conventions.swapped_drives(truth, poses, additive, task.names)
+        or estimate_conventions.mistake_in(
             *(first[0], first[1], first[2], first[3], frame),
             decides=decides,
             truth_at=None if others else truth_at,
         )
-        or conventions.stray_poses(ratios, task.names)
+        or estimate_conventions.stray_poses(ratios, task.names)
     )
 
 

@@ -33,8 +33,8 @@ from ..estimator.models.bearing_range import wrap_angle
 from ..evaluation.trajectory_error import position_accuracy
 from .logs import ground_truth, recording, slamlog
 from .noise_fitting import search
-from .runs.filter_settings import NOISE_KEYS, FilterSettings, one_blas_thread
-from .runs.summary import MOST_REJECTED
+from .run_and_replay.filter_settings import NOISE_KEYS, FilterSettings, one_blas_thread
+from .run_and_replay.summary import MOST_REJECTED
 
 #: Size of the part of a log that is read in other conventions: its first landmarks and
 #: rows of odometry, and blocks of scans spread over them.
@@ -146,7 +146,7 @@ def mistake_in(log: slamlog.SlamLog, settings: FilterSettings) -> Mistake | None
     --------
     >>> from slamgym.envs.controllers import OpenLoop
     >>> from slamgym.experiments.logs import record_episode
-    >>> from slamgym.experiments.runs import settings_for
+    >>> from slamgym.experiments.run_and_replay import settings_for
     >>> from slamgym.sim_configs import action_sequence, load_scenario
     >>> world = load_scenario("loop").with_changes(steps=60)
     >>> driver = OpenLoop(action_sequence(world), world.robot)

@@ -30,10 +30,16 @@ from ..sim_configs.field_types import unknown_choice
 from .figures.style import GREY, INK, dress, legend, new_figure, write_title
 from .logs.ground_truth import path_accuracy
 from .logs.slamlog import SlamLog
-from .runs.filter_settings import SIGMAS, FilterSettings, settings_for
-from .runs.log_replay import Progress, Replay, replay
-from .runs.summary import map_accuracy, nees_summary, nis_summary, rmse_table
-from .runs.trace import RunTrace, finite, mean, root_mean_square, standard_error
+from .run_and_replay.filter_settings import SIGMAS, FilterSettings, settings_for
+from .run_and_replay.log_replay import Progress, Replay, replay
+from .run_and_replay.summary import map_accuracy, nees_summary, nis_summary, rmse_table
+from .run_and_replay.trace import (
+    RunTrace,
+    finite,
+    mean,
+    root_mean_square,
+    standard_error,
+)
 
 if TYPE_CHECKING:
     from .monte_carlo.figures import EstimatorLook

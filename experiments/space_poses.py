@@ -27,10 +27,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
-from ..estimator.support.argument_checks import one_of
+from ..estimator.guards.argument_checks import one_of
 from ..evaluation.consistency_report import evaluate_consistency
 from ..evaluation.nees import normalised_squared_error
-from .conventions import unit_of
+from .estimate_conventions import unit_of
 from .estimate_files import (
     content_lines,
     files_in,
@@ -44,7 +44,7 @@ from .estimate_files import (
     tum_table,
 )
 from .monte_carlo import verdict
-from .runs.trace import finite
+from .run_and_replay.trace import finite
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -28,9 +28,9 @@ from ...sim_configs.scenario_files import widest_scenario
 from ..bearing_range import BearingRangeSensor, hide_identities
 from ..drives import drive_of
 from ..noise_streams import PoseSensors, SensorSettings, WorldNoise
+from ..random_numbers import EpisodeStarts, drawn_scenarios, episode_keys
 from ..robot import UnicycleBodies, VectorOdometrySensor
 from ..spaces import commands_of, count_rows
-from ..streams import EpisodeStarts, drawn_scenarios, episode_keys
 
 Generators = Sequence[np.random.Generator]
 Scan = tuple[Array, BoolArray, IntArray | None]

@@ -28,9 +28,9 @@ import numpy as np
 from scipy.special import chdtri
 
 from ...arrays import Array, BoolArray, ComplexArray, IntArray
+from ..guards import argument_checks
 from ..kernels.assignment_search import compare_pairs, search_clique
 from ..models.rigid_motion import left_jacobian, rotation, squared_offsets
-from ..support import argument_checks
 
 #: Most pairs of landmarks that are compared.
 LARGEST_GRAPH = 800

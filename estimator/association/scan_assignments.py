@@ -19,6 +19,7 @@ from scipy.special import chdtri
 
 from ...arrays import Array, IntArray
 from ...jit import jit, jit_in_place, njit_allocating
+from ..guards import argument_checks
 from ..interface import MapView
 from ..kernels.assignment_search import (
     UNPAIRED,
@@ -34,7 +35,6 @@ from ..models.bearing_range import (
     wrap_angle_jit,
 )
 from ..models.sensors import DELAYED, bearing_range_std, only_bearing_range, sensor_in
-from ..support import argument_checks
 
 #: Assignments of a scan e^8 times less likely than the best one are not considered.
 BRANCH_SPREAD = 16.0

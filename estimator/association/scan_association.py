@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import Array, IntArray
+from ..guards import saved_states
 from ..interface import MapView
-from ..support import saved_states
-from .detections import Detections, LostEvidence
+from .missed_landmarks import Detections, LostEvidence
 from .scan_assignments import (
     AMBIGUOUS,
     NEW,

@@ -35,10 +35,10 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
+from ..guards import saved_states
 from ..interface import MapView
 from ..models.bearing_range import predict_measurement, wrap_angle
 from ..models.rigid_motion import as_covariance, predict, rotation
-from ..support import saved_states
 from .scan_assignments import Noise, with_readings
 
 #: Cells over the bearings, and over the ranges up to the longest reading.

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST, AnyArray, Array, BoolArray, IntArray
 from ...restorable import Restorable, State
+from ..guards import argument_checks, saved_states
+from ..guards.argument_checks import aligned_zeros, shaped, usable_cores
 from ..interface import Belief, columns_of
 from ..kernels.batch import (
     NEVER,
@@ -27,11 +29,9 @@ from ..kernels.batch import (
 from ..kernels.kalman_gain import Workspace, workspace_for
 from ..models.bearing_range import wrap_angle
 from ..models.sensors import for_sensor, only_placing
-from ..support import argument_checks, saved_states
-from ..support.argument_checks import aligned_zeros, shaped, usable_cores
-from .conditioning import FRAMES, ObservedMap, PoseReading, gate_of
 from .ekf import EkfSlam
 from .gaussian_map import GaussianMap
+from .pose_readings import FRAMES, ObservedMap, PoseReading, gate_of
 
 
 class BatchSlam(Restorable):

@@ -44,14 +44,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import LARGEST, Array, BoolArray, IntArray
+from ..guards import saved_states
+from ..guards.argument_checks import LOWEST_ID, RESERVED_IDS
+from ..guards.saved_states import NUMBERS, WHOLE, Table, with_prefix, without_prefix
 from ..kernels.kalman_gain import AT_ESTIMATE, INVARIANT, BeliefArrays, Rules
 from ..models.rigid_motion import seen_from
 from ..models.sensors import Sensor
-from ..support import saved_states
-from ..support.argument_checks import LOWEST_ID, RESERVED_IDS
-from ..support.saved_states import NUMBERS, WHOLE, Table, with_prefix, without_prefix
-from .conditioning import moves_of, retracted
 from .gaussian_map import GaussianMap
+from .pose_readings import moves_of, retracted
 
 #: Largest number of past poses. Beyond it, the pose nearest to its predecessor is
 #: removed, or the oldest of several equally near ones.

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST, Array, IntArray
 from ...jit import jit, njit_internal
+from ..guards import argument_checks
+from ..guards.argument_checks import aligned_zeros, usable_cores
 from ..kernels import kalman_gain as gain
 from ..kernels.batch import share_out
 from ..kernels.kalman_gain import BeliefArrays, Rules, Workspace
@@ -29,8 +31,6 @@ from ..kernels.scan_update import (
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import predict
 from ..models.sensors import only_bearing_range
-from ..support import argument_checks
-from ..support.argument_checks import aligned_zeros, usable_cores
 from .batch import can_batch
 from .ekf import EkfSlam
 from .gaussian_map import GaussianMap

@@ -17,6 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
+from ..guards import argument_checks, saved_states
+from ..guards.argument_checks import LandmarkIds, covariance_bytes, landmark_pairs
+from ..guards.saved_states import with_prefix
+from ..guards.undo import Undo, attributes, undo_all, undone_on_error, with_copies
 from ..interface import Belief, MapView, UpdateReport, describe_filter
 from ..kernels import kalman_gain as gain
 from ..kernels.kalman_gain import BeliefArrays, Rules
@@ -30,11 +34,6 @@ from ..models.sensors import (
     for_sensor,
     two_stds,
 )
-from ..support import argument_checks, saved_states
-from ..support.argument_checks import LandmarkIds, covariance_bytes, landmark_pairs
-from ..support.saved_states import with_prefix
-from ..support.undo import Undo, attributes, undo_all, undone_on_error, with_copies
-from .conditioning import ObservesPoses, coincide
 from .delayed_landmarks import Waiting, collect, is_landmark, read_waiting
 from .gaussian_map import (
     MAP_STATE,
@@ -44,6 +43,7 @@ from .gaussian_map import (
     move_pose,
     update_map,
 )
+from .pose_readings import ObservesPoses, coincide
 
 #: How a new landmark enters the map.
 LANDMARK_INITS = ("full", "independent", DELAYED)

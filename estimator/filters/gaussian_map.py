@@ -17,14 +17,14 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ...jit import jit_in_place, njit_inlined, njit_internal
+from ..guards import saved_states as saved
+from ..guards.argument_checks import aligned_copy, aligned_zeros, landmarks_that_fit
+from ..guards.undo import Undo
 from ..interface import Belief, MapView, UpdateReport, columns_of
 from ..kernels import kalman_gain as gain
 from ..kernels.kalman_gain import BeliefArrays, Rules
 from ..kernels.scan_update import DONE, update_lower_half
 from ..models.rigid_motion import ErrorFrame, predict
-from ..support import saved_states as saved
-from ..support.argument_checks import aligned_copy, aligned_zeros, landmarks_that_fit
-from ..support.undo import Undo
 
 FIRST_LANDMARKS = FIRST_READINGS = 8  # that a new map has room for
 

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array
+from ..guards import argument_checks, saved_states
+from ..guards.argument_checks import LandmarkIds
+from ..guards.undo import Undo, attributes, undo_all, undone_on_error
 from ..interface import UpdateReport
 from ..kernels.kalman_gain import AT_ESTIMATE, AT_TRUTH, BeliefArrays
 from ..models.rigid_motion import composed, pose_rotation
 from ..models.sensors import only_bearing_range
-from ..support import argument_checks, saved_states
-from ..support.argument_checks import LandmarkIds
-from ..support.undo import Undo, attributes, undo_all, undone_on_error
 from .ekf import EkfSlam
 
 

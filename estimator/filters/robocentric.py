@@ -10,15 +10,15 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ...jit import jit_in_place, njit_internal
+from ..guards import argument_checks, saved_states
+from ..guards.argument_checks import LandmarkIds
 from ..interface import Belief, MapView, part_of
 from ..kernels.scan_update import DONE
 from ..models.rigid_motion import as_covariance
 from ..models.sensors import only_placing
-from ..support import argument_checks, saved_states
-from ..support.argument_checks import LandmarkIds
-from .conditioning import ObservedMap, PoseReading, observe
 from .ekf import EkfSlam
 from .gaussian_map import LANDMARKS, complete, parts_jit, update_map
+from .pose_readings import ObservedMap, PoseReading, observe
 
 # The state that the kernels see, in the robot's frame at the last scan: the motion
 # since that scan in place of the pose; the start (x, y), the world's heading and a zero

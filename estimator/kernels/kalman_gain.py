@@ -13,8 +13,8 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ...jit import fma, njit_apart, njit_inlined, njit_internal
+from ..guards.argument_checks import aligned_zeros
 from ..models.rigid_motion import turn_coefficients_jit
-from ..support.argument_checks import aligned_zeros
 
 # Share of a variance below which the remainder counts as rounding.
 SINGULAR = 1e-14

@@ -28,7 +28,7 @@ from scipy.sparse import bsr_array, csc_array
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit
-from ..support import saved_states
+from ..guards import saved_states
 
 
 class Node(NamedTuple):

@@ -16,13 +16,13 @@ from numpy.typing import ArrayLike
 from ...arrays import Array
 from ..association.scan_assignments import SAME
 from ..association.scan_association import ScanAssociation
-from ..filters.conditioning import PoseReading
+from ..filters.pose_readings import PoseReading
+from ..guards import argument_checks, saved_states
+from ..guards.argument_checks import LandmarkIds
+from ..guards.saved_states import with_prefix, without_prefix
+from ..guards.undo import Undo, attributes, to_the_end, undo_all, undone_on_error
 from ..interface import Answer, MapView, SlamEstimator, UpdateReport
 from ..models.bearing_range import wrap_angle
-from ..support import argument_checks, saved_states
-from ..support.argument_checks import LandmarkIds
-from ..support.saved_states import with_prefix, without_prefix
-from ..support.undo import Undo, attributes, to_the_end, undo_all, undone_on_error
 from .loop_closing import AROUND
 from .managed_slam import ManagedFilter, ManagedSlam
 from .policy import LandmarkPolicy, as_policy

@@ -45,10 +45,10 @@ from ..association.constellations import (
     turn_between,
 )
 from ..association.scan_assignments import Noise, with_readings
+from ..guards import argument_checks
 from ..interface import MapView
 from ..models.bearing_range import wrap_angle
 from ..models.rigid_motion import squared_offsets
-from ..support import argument_checks
 
 #: Landmarks that are the same: (kept, gone).
 Pairs = list[tuple[int, int]]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
-from ..association.detections import LOST_SCORE
+from ..association.missed_landmarks import LOST_SCORE
 from ..association.scan_assignments import Sensor
 from ..association.scan_association import (
     Candidates,
@@ -23,7 +23,11 @@ from ..association.scan_association import (
     ScanAssociation,
     associate,
 )
-from ..filters.conditioning import PoseReading, observe_relative_pose
+from ..filters.pose_readings import PoseReading, observe_relative_pose
+from ..guards import argument_checks, saved_states
+from ..guards.argument_checks import LandmarkIds
+from ..guards.saved_states import with_prefix, without_prefix
+from ..guards.undo import Undo, attributes, undo_all, undone_on_error
 from ..interface import (
     Belief,
     MapView,
@@ -43,10 +47,6 @@ from ..interface import (
 )
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.rigid_motion import rotation
-from ..support import argument_checks, saved_states
-from ..support.argument_checks import LandmarkIds
-from ..support.saved_states import with_prefix, without_prefix
-from ..support.undo import Undo, attributes, undo_all, undone_on_error
 from .loop_closing import AROUND, FEWEST_READINGS, is_astray, places_of_scan
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy

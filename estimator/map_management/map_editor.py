@@ -25,8 +25,9 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
-from ..filters.conditioning import coincide
 from ..filters.gaussian_map import without_landmarks
+from ..filters.pose_readings import coincide
+from ..guards.undo import Undo
 from ..interface import (
     MapView,
     SlamEstimator,
@@ -36,7 +37,6 @@ from ..interface import (
     restore,
     view_map,
 )
-from ..support.undo import Undo
 
 #: What the saved state of a filter must hold so that its belief can be changed.
 DENSE = "mean", "covariance", "landmark_ids"

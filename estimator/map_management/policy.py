@@ -13,8 +13,8 @@ from ...arrays import Array, BoolArray
 from ...suggestions import closest
 from ..association.constellations import Constellations
 from ..association.scan_assignments import AssociationPolicy
+from ..guards import argument_checks
 from ..models.bearing_range import wrap_angle
-from ..support import argument_checks
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from ...jit import jit_in_place
 from ...restorable import Restorable
 from ..association.scan_assignments import Noise
 from ..association.scan_association import ScanAssociation
-from ..filters.conditioning import separation
+from ..filters.pose_readings import separation
+from ..guards import saved_states
 from ..interface import MapView
-from ..support import saved_states
 from .loop_closing import Pairs, lost, same_landmarks, slots_of, without_lost
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy

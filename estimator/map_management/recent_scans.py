@@ -18,7 +18,10 @@ import numpy as np
 from ...arrays import Array
 from ...restorable import Restorable
 from ..association.scan_association import LABEL_BITS, NO_LABEL, ScanAssociation
-from ..filters.conditioning import PoseReading
+from ..filters.pose_readings import PoseReading
+from ..guards import saved_states
+from ..guards.saved_states import with_prefix, without_prefix
+from ..guards.undo import Undo, attributes
 from ..interface import (
     ScanDecisions,
     SlamEstimator,
@@ -27,9 +30,6 @@ from ..interface import (
     UpdateReport,
     restore,
 )
-from ..support import saved_states
-from ..support.saved_states import with_prefix, without_prefix
-from ..support.undo import Undo, attributes
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy
 

@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST, Array
 from ...suggestions import closest, imported
-from ..support import argument_checks
+from ..guards import argument_checks
 from .rigid_motion import composed
 
 Real = Any  # a number, or an array of any shape

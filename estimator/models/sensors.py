@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from ...arrays import LARGEST_RANGE_GROWTH, Array
 from ...jit import jit, njit_allocating, njit_inlined, specialised
 from ...suggestions import closest, imported
-from ..support import argument_checks
+from ..guards import argument_checks
 from . import bearing_range
 from .bearing_range import LandmarkLocation, MeasurementPrediction, wrap_angle_jit
 from .rigid_motion import rotation

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array
+from ..guards import argument_checks, saved_states
 from ..models.bearing_range import locate_landmark
 from ..models.rigid_motion import pose_rotation
-from ..support import argument_checks, saved_states
 from . import peer_slam
 
 X, L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L

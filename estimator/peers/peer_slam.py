@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
+from ..guards import argument_checks, saved_states
+from ..guards.argument_checks import LandmarkIds
 from ..interface import Belief, UpdateReport
 from ..models.bearing_range import locate_landmark, predict_measurement, wrap_angle
 from ..models.motions import UNICYCLE, Motion, MotionNoise, predict_pose
 from ..models.sensors import Sensor, only_bearing_range
-from ..support import argument_checks, saved_states
-from ..support.argument_checks import LandmarkIds
 
 # Least deviation of the first pose [m, rad]: the libraries take no certain one.
 START_FLOOR = 1e-6

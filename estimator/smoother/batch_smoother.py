@@ -15,13 +15,13 @@ from numpy.typing import ArrayLike
 from scipy.linalg import cho_solve, solve_triangular
 
 from ...arrays import Array, IntArray
+from ..guards import argument_checks
+from ..guards.argument_checks import LandmarkIds
 from ..interface import Belief, SlamEstimator, SupportsSmoothing
 from ..map_management.managed_slam import ManagedFilter
 from ..models.bearing_range import locate_landmark, wrap_angle
 from ..models.rigid_motion import seen_from
 from ..models.sensors import BEARING_RANGE
-from ..support import argument_checks
-from ..support.argument_checks import LandmarkIds
 from .drive import Drive, Sightings, path_between
 from .elimination import conditionals
 from .optimiser import (

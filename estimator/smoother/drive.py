@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
-from ..filters.conditioning import PoseReading
 from ..filters.ekf import checked_rules
+from ..filters.pose_readings import PoseReading
+from ..guards import argument_checks
 from ..kernels.kalman_gain import AT_ESTIMATE
 from ..models.bearing_range import wrap_angle
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.motions import Motion as DriveMotion
 from ..models.rigid_motion import pose_rotation, predict
 from ..models.sensors import Sensor, find_sensor
-from ..support import argument_checks
 
 
 class Motion(NamedTuple):

@@ -15,6 +15,7 @@ from scipy.linalg import cho_factor, cho_solve
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
 from ..filters.ekf import InvariantEkfSlam
+from ..guards.argument_checks import refuse_beyond_memory
 from ..interface import Belief, part_of
 from ..kernels.kalman_gain import Rules
 from ..kernels.scan_update import as_rules, variances
@@ -26,7 +27,6 @@ from ..models.bearing_range import (
     wrap_angle,
 )
 from ..models.sensors import Sensor, for_sensor
-from ..support.argument_checks import refuse_beyond_memory
 from . import elimination
 from .drive import Drive, DriveArrays, Sightings
 

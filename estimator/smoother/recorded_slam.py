@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import interface
-from ..filters.conditioning import PoseReading
+from ..filters.pose_readings import PoseReading
+from ..guards import argument_checks, saved_states
+from ..guards.undo import Undo, attributes, undo_all, undone_on_error
 from ..interface import bookmark
 from ..map_management.map_editor import MapEditor
 from ..models.motions import UNICYCLE, Motion
 from ..models.sensors import Sensor
 from ..registry import accepted_options, find_estimator, make_estimator, read_label
-from ..support import argument_checks, saved_states
-from ..support.undo import Undo, attributes, undo_all, undone_on_error
 from .batch_smoother import SmoothedDrive, robust_kernel, smooth
 from .drive import Drive
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from ...leaves import leaf
+from .commands import Reporter, command, main
 from .options import Options, takes
-from .program import Reporter, command, main
 
 __all__ = ["main"]
 __dir__ = __all__.copy

@@ -6,8 +6,8 @@ from typing import Any
 from rich.text import Text
 
 from .. import figures, noise_fitting
+from .commands import Reporter, command
 from .options import LogFile, Options, declared, takes
-from .program import Reporter, command
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ def fit_noise(log: LogFile, *, given: FitNoiseOptions) -> None:
     slamgym fit-noise MRCLAM_Dataset6 --robot 3 --estimator ekf
     """
     from ..noise_fitting.fit import refuse_other_formats, write_noise
-    from ..runs.filter_settings import noise_or_assumed, settings_for
+    from ..run_and_replay.filter_settings import noise_or_assumed, settings_for
     from .output_folder import default_folder, output_folder, write_summary
     from .run_files import explaining, mistake_in
     from .tables import written
@@ -91,7 +91,7 @@ def fit_noise(log: LogFile, *, given: FitNoiseOptions) -> None:
 def _show_fit(summary: dict[str, Any], mistake: object, reporter: Reporter) -> None:
     """Print a fit; for a log with a mistake, print the mistake first, and no noise."""
     from ..noise_fitting.search import ENTRIES, noise_of
-    from ..runs.filter_settings import FilterSettings
+    from ..run_and_replay.filter_settings import FilterSettings
     from .tables import advice, heading, noise_comparison_table, noise_table
 
     settings = FilterSettings("", **summary["runs"]["suggested"]["settings"])

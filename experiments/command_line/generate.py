@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from ...suggestions import counted
 from .. import trajectories
+from .commands import command, interruptible
 from .monte_carlo import connected
 from .options import REQUIRED, Options, ScenarioName, declared, refuse_broken, takes
-from .program import command, interruptible
 
 if TYPE_CHECKING:
     from ..trajectories.manifest import Manifest

@@ -9,9 +9,9 @@ from typing import Any
 from rich.text import Text
 
 from ...sim_configs.field_types import unknown_choice
+from .commands import BadInputError, command
 from .monte_carlo import show_study
 from .options import FilesOfEstimates, Options, declared, takes
-from .program import BadInputError, command
 
 
 @dataclass(frozen=True, kw_only=True)

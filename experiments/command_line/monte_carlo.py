@@ -16,7 +16,7 @@ from rich.text import Text
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.field_types import unknown_choice
 from . import options
-from .program import FAILURE, BadInputError, Reporter, command, interruptible
+from .commands import FAILURE, BadInputError, Reporter, command, interruptible
 
 FORMATS = ("pdf", "svg", "png")
 
@@ -91,7 +91,7 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
     slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://b:8786
     """  # noqa: D400 (the list of commands shows the question)
     from .. import monte_carlo
-    from ..jobs import replace_own
+    from ..job_folders import replace_own
     from ..monte_carlo.report import write_figures, write_html_report
     from ..monte_carlo.results import REPORT, RESULTS, SUMMARY
     from ..monte_carlo.runner import SMALL_NOISE_SHARE

@@ -15,14 +15,14 @@ from ...sim_configs.field_types import unknown_choice
 from ...sim_configs.scenario_files import naming_file
 from ...suggestions import closest
 from .. import figures
-from . import options, program
-from .program import BadInputError, Reporter
+from . import commands, options
+from .commands import BadInputError, Reporter
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ..noise_study import NoiseEffect, NoiseRow, NoiseRun
-    from ..runs.filter_settings import FilterSettings
+    from ..run_and_replay.filter_settings import FilterSettings
 
 _LOG, _SCENARIO = "a log", "a scenario"
 _ONE_RUN, _MANY_RUNS = "one run of a scenario", "a scenario with --runs above 1"
@@ -59,7 +59,7 @@ class NoiseStudyOptions(options.Options):
     change: str = options.declared("all", "both|world|filter|all")
 
 
-@program.command
+@commands.command
 @options.takes(
     "estimator motion_std measurement_std initial_pose_std landmark_init "
     "gate_probability range_std_per_metre noise_at_rest option_texts hide_identities "
@@ -95,7 +95,7 @@ def noise_study(
     slamgym noise-study six_landmarks --runs 100 -e ekf,invariant
     """
     from ..noise_study import study_log, study_scenario
-    from ..runs.filter_settings import settings_for, settings_for_scenario
+    from ..run_and_replay.filter_settings import settings_for, settings_for_scenario
 
     many = given.runs != 1
     is_scenario, estimator = _is_scenario(source), given.estimator
@@ -154,7 +154,7 @@ def one_run_study(
     study: "Callable[..., list[NoiseRun]]",
 ) -> Study:
     """Prepare the study of a log or of one run of a scenario."""
-    from ..runs.summary import settings_table
+    from ..run_and_replay.summary import settings_table
 
     def run(reporter: Reporter) -> Results:
         from .run_files import warm_up
@@ -255,5 +255,5 @@ def _refuse_without_effect(context: typer.Context, *kinds: str) -> None:
             source = context.get_parameter_source(name)
             if source is not None and source.name == "COMMANDLINE":
                 option = f"--{name.strip('_').replace('_', '-')}"
-                hint = program.way_to_set(option)
+                hint = commands.way_to_set(option)
                 raise BadInputError(f"{option} is for the noise study of {kind}{hint}")

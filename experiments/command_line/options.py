@@ -21,12 +21,12 @@ import typer
 
 from ...sim_configs import Scenario, list_presets, load_scenario
 from ...sim_configs.field_types import unknown_choice
-from .program import BadInputError, BrokenFilterError, Reporter
+from .commands import BadInputError, BrokenFilterError, Reporter
 
 if TYPE_CHECKING:
     from ...envs.controllers import Controller
     from ..logs.slamlog import SlamLog
-    from ..runs.filter_settings import FilterSettings
+    from ..run_and_replay.filter_settings import FilterSettings
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -267,8 +267,8 @@ class Options:
         {'motion_std': (0.2, 0.1, 0.01)}
         >>> Options(measurement_std="0.2,-1").stds()
         Traceback (most recent call last):
-        slamgym.experiments.command_line.program.BadInputError: --measurement-std must \
-be 2 numbers >= 0 with commas between, got '0.2,-1'
+        slamgym.experiments.command_line.commands.BadInputError: --measurement-std \
+must be 2 numbers >= 0 with commas between, got '0.2,-1'
         """
         counts = {"motion_std": 3, "measurement_std": 2, "initial_pose_std": 3}
         return {
@@ -341,12 +341,12 @@ be 2 numbers >= 0 with commas between, got '0.2,-1'
         Examples
         --------
         >>> from functools import partial
-        >>> from slamgym.experiments.runs import settings_for_scenario
+        >>> from slamgym.experiments.run_and_replay import settings_for_scenario
         >>> set_up = partial(settings_for_scenario, load_scenario("loop"))
         >>> list(Options(labels="ekf,invariant[iterations=3]").filters(set_up))
         ['ekf', 'invariant[iterations=3]']
         """
-        from ..runs.filter_settings import estimator_choices
+        from ..run_and_replay.filter_settings import estimator_choices
 
         options = self.filter_options()
         refuse_broken(self.labels, options)
@@ -531,7 +531,7 @@ def refuse_broken(estimators: str, options: Mapping[str, Any] | None = None) -> 
     """
     from ...estimator.check_estimator import find_breaches, listed
     from ...estimator.registry import find_estimator
-    from ..runs.filter_settings import estimator_choices
+    from ..run_and_replay.filter_settings import estimator_choices
 
     for _, name, own in estimator_choices(estimators):
         if ":" in name and not name.startswith("slamgym."):

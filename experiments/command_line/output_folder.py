@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from ...sim_configs.scenario_files import naming_file, unfinished
-from .. import jobs
+from .. import job_folders
 from ..logs.slamlog import LogError
-from .program import BadInputError
+from .commands import BadInputError
 
 #: Every output folder holds it; its ``files`` lists the files of the command.
 SUMMARY = "summary.json"
@@ -53,16 +53,20 @@ def output_folder(path: Path) -> Iterator[Path]:
     if folder.exists() and not folder.is_dir():
         raise BadInputError(f"--out must be a folder, got the file {path}")
     staging = folder / STAGING
-    with _made(folder), jobs.locked_folder(folder), _naming_in_place(staging, folder):
+    with (
+        _made(folder),
+        job_folders.locked_folder(folder),
+        _naming_in_place(staging, folder),
+    ):
         _publish(folder)  # what a killed command left
-        with jobs.naming(f"the folder {folder}"):
+        with job_folders.naming(f"the folder {folder}"):
             staging.mkdir()
         unfinished.add(staging)
         try:
             yield staging
-            names = jobs.files_below(staging)
-            new = {jobs.measured(staging / name, name) for name in names}
-            jobs.write_own_files(staging, new)  # from here on they are complete
+            names = job_folders.files_below(staging)
+            new = {job_folders.measured(staging / name, name) for name in names}
+            job_folders.write_own_files(staging, new)  # from here on they are complete
         except BaseException:
             shutil.rmtree(staging, ignore_errors=True)
             raise
@@ -76,7 +80,7 @@ def _made(folder: Path) -> Iterator[None]:
     """Make a folder and those above it; after an error, remove those that are empty."""
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        with jobs.naming(f"the folder {folder}"):
+        with job_folders.naming(f"the folder {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
         yield
     except BaseException:
@@ -111,31 +115,31 @@ def _publish(folder: Path) -> None:
     new files do not prove to be slamgym's.
     """
     staging = folder / STAGING
-    old, new = jobs.own_files(folder), jobs.own_files(staging)
+    old, new = job_folders.own_files(folder), job_folders.own_files(staging)
     present = set()
-    for name in jobs.files_below(folder):
+    for name in job_folders.files_below(folder):
         if name.startswith(f"{STAGING}/") and not staging.is_symlink():
             continue
-        if jobs.own_entry(folder, name, old | new) is None:
+        if job_folders.own_entry(folder, name, old | new) is None:
             raise BadInputError(_in_the_way(folder, name, old | new))
         present.add(name)
-    if (staging / jobs.MANIFEST).exists():
+    if (staging / job_folders.MANIFEST).exists():
         names = {entry.name for entry in new}
-        for name in names.intersection(jobs.files_below(staging)):
+        for name in names.intersection(job_folders.files_below(staging)):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (staging / name).replace(folder / name)
         for name in present - names:
             _remove(folder, name)
-        (staging / jobs.MANIFEST).replace(folder / jobs.MANIFEST)
+        (staging / job_folders.MANIFEST).replace(folder / job_folders.MANIFEST)
     shutil.rmtree(staging, ignore_errors=True)
 
 
-def _in_the_way(folder: Path, name: str, own: set[jobs.OwnFile]) -> str:
+def _in_the_way(folder: Path, name: str, own: set[job_folders.OwnFile]) -> str:
     """Describe a file that keeps a folder from being written, and the way out."""
     known = any(name == entry.name for entry in own)
     what = "was changed since" if known else "slamgym did not write there"
     kept = folder / STAGING
-    complete = (kept / jobs.MANIFEST).exists()
+    complete = (kept / job_folders.MANIFEST).exists()
     waiting = f"; the new files stay in {kept}" if complete else ""
     return (
         f"{folder} holds {name}, which {what}: move it away, or choose another --out"
@@ -170,7 +174,7 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
     dict
         The summary with ``files``.
     """
-    complete = {**summary, "files": sorted([*jobs.files_below(folder), SUMMARY])}
+    complete = {**summary, "files": sorted([*job_folders.files_below(folder), SUMMARY])}
     with naming_file(folder / SUMMARY):
         (folder / SUMMARY).write_text(as_json_text(complete), encoding="utf-8")
     return complete

@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...sim_configs import Scenario
+from .commands import Tick, command
 from .options import REQUIRED, Options, ScenarioName, declared, refuse_broken, takes
-from .program import Tick, command
 
 if TYPE_CHECKING:
     from ...envs.controllers import Controller
     from ...envs.landmark_world import LandmarkWorldEnv, Observation
     from ...estimator.interface import SlamEstimator
-    from ..runs.filter_settings import FilterSettings
+    from ..run_and_replay.filter_settings import FilterSettings
 
 _DURATION = 12.0  # [s] of a film by default
 _SLOWEST, _FASTEST = 4.0, 30.0  # [frames/s]
@@ -52,7 +52,7 @@ def render(scenario: ScenarioName, *, given: RenderOptions) -> None:
     slamgym render corridor --out corridor.mp4 --fps 20 --controller waypoints
     """
     from ...envs.rendering import check_video, write_video
-    from ..runs.filter_settings import settings_for_scenario
+    from ..run_and_replay.filter_settings import settings_for_scenario
     from .run_files import warm_up
 
     world = given.scenario(scenario)

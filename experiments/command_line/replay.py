@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from . import options, program
+from . import commands, options
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class ReplayOptions(options.Options):
     hide_identities: bool = options.declared(False, "--hide-identities")
 
 
-@program.command
+@commands.command
 @options.takes(
     "labels motion_std measurement_std initial_pose_std landmark_init gate_probability "
     "range_std_per_metre noise_at_rest option_texts hide_identities resolution robot "
@@ -57,7 +57,7 @@ def replay(
     slamgym replay results/loop-invariant/log.csv --estimator ekf,invariant
     slamgym replay graph.txt --truth true.g2o --noise-from-file
     """
-    from ..runs.filter_settings import settings_for
+    from ..run_and_replay.filter_settings import settings_for
     from .output_folder import default_folder, output_folder
     from .run_files import check_rerun, filter_and_write, show_run
 

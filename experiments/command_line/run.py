@@ -4,8 +4,8 @@ import shlex
 from functools import partial
 
 from ...sim_configs import save_scenario
+from .commands import command
 from .options import Options, ScenarioName, takes, tested_filters, with_options
-from .program import command
 
 
 @command
@@ -30,7 +30,7 @@ def run(scenario: ScenarioName, *, given: Options) -> None:
     slamgym run hidden_identities -e invariant --resolution 0.5
     slamgym run mine.toml --controller random --estimator mine:MyFilter
     """
-    from ..runs.filter_settings import settings_for_scenario
+    from ..run_and_replay.filter_settings import settings_for_scenario
     from .output_folder import default_folder, output_folder
     from .run_files import check_rerun, filter_and_write, show_run
 

@@ -16,13 +16,13 @@ from .. import figures
 from ..figures.style import sign
 from ..logs.recording import steps_of
 from ..logs.slamlog import SlamLog, write_slamlog
-from ..runs.filter_settings import FilterSettings
-from ..runs.log_replay import Replay, replay
-from ..runs.summary import association_failure, summarise
-from ..runs.trace import RunTrace
-from . import options, program, tables
+from ..run_and_replay.filter_settings import FilterSettings
+from ..run_and_replay.log_replay import Replay, replay
+from ..run_and_replay.summary import association_failure, summarise
+from ..run_and_replay.trace import RunTrace
+from . import commands, options, tables
+from .commands import Reporter
 from .output_folder import write_summary
-from .program import Reporter
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,12 +46,12 @@ def check_rerun(path: Path | None) -> None:
     if path is None:
         return
     if path.suffix != ".rrd":
-        raise program.BadInputError(f"--rerun must end in .rrd, got {path}")
+        raise commands.BadInputError(f"--rerun must end in .rrd, got {path}")
     if not path.absolute().parent.is_dir():
-        raise program.BadInputError(f"--rerun: the folder of {path} does not exist")
+        raise commands.BadInputError(f"--rerun: the folder of {path} does not exist")
     viewers = leaf("experiments.viewers.rerun_recording")
     if viewers is None:
-        raise program.BadInputError("--rerun: this installation has no viewers")
+        raise commands.BadInputError("--rerun: this installation has no viewers")
     viewers.import_rerun()
 
 

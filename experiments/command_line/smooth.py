@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 from rich.text import Text
 
-from .. import figures, runs
-from . import options, program
+from .. import figures, run_and_replay
+from . import commands, options
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class SmoothOptions(options.Options):
     associate: bool = options.declared(False, "--associate")
 
 
-@program.command
+@commands.command
 @options.takes(
     "estimator motion_std measurement_std initial_pose_std robust associate "
     "gate_probability range_std_per_metre noise_at_rest option_texts robot truth "
@@ -46,7 +46,11 @@ def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
     slamgym smooth log.csv --associate
     """
     from ...estimator.registry import read_label
-    from ..runs.filter_settings import SMOOTHER, noise_or_assumed, settings_for
+    from ..run_and_replay.filter_settings import (
+        SMOOTHER,
+        noise_or_assumed,
+        settings_for,
+    )
     from .output_folder import default_folder, output_folder, write_summary
     from .run_files import explaining, mistake_in
     from .tables import heading, smoothing_figures, smoothing_table, written
@@ -67,7 +71,7 @@ def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
             reporter.note_if_compiling("the smoother"),
             explaining(drive, settings),
         ):
-            smoothed = runs.smooth_log(
+            smoothed = run_and_replay.smooth_log(
                 drive,
                 settings,
                 associate=given.associate,
@@ -77,7 +81,7 @@ def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
         figures.save_figure(figures.smoothed_figure(smoothed), folder / "map.png")
         mistake = mistake_in(drive, settings)
         summary = {
-            **runs.summarise_smoothing(smoothed, settings),
+            **run_and_replay.summarise_smoothing(smoothed, settings),
             "mistake": None if mistake is None else mistake.as_dict(),
         }
         summary = write_summary(folder, summary)

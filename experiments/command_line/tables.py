@@ -10,7 +10,7 @@ from rich.text import Text
 
 from ...suggestions import counted
 from ..noise_study import Variation
-from ..runs.summary import MOST_REJECTED
+from ..run_and_replay.summary import MOST_REJECTED
 
 if TYPE_CHECKING:
     from ..noise_study import NoiseEffect, NoiseRun
@@ -276,7 +276,7 @@ def association_table(scores: dict[str, Any]) -> Table:
     Parameters
     ----------
     scores : dict
-        As in :func:`slamgym.experiments.runs.summary.association_summary`.
+        As in :func:`slamgym.experiments.run_and_replay.summary.association_summary`.
     """
     title, found = "Association", scores["gospa"]
     if scores["resolution"]:

@@ -22,7 +22,7 @@ from ...arrays import Array, BoolArray, IntArray
 from ...envs.rendering.scene import EllipseKind
 from ...estimator.models.rigid_motion import additive_error
 from ...evaluation.trajectory_error import LandmarkDistances, landmark_distances
-from ..runs.trace import RunTrace
+from ..run_and_replay.trace import RunTrace
 from . import style
 from .maps import Walls, box_around, draw_walls, shared_limits, wall_ends
 

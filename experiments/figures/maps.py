@@ -21,7 +21,7 @@ from ...arrays import Array
 from ...envs.rendering import BlittedFigure, scene
 from ...sim_configs.scenario_files import replace_when_written
 from ...suggestions import counted
-from ..runs.trace import RunTrace
+from ..run_and_replay.trace import RunTrace
 from . import style
 
 

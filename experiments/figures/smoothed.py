@@ -9,7 +9,7 @@ from ...envs.rendering import scene
 from ...estimator.models.rigid_motion import rotation
 from ...evaluation.trajectory_error import PositionAccuracy, poses_at
 from ..logs.ground_truth import path_accuracy
-from ..runs.log_smoothing import SmoothedLog
+from ..run_and_replay.log_smoothing import SmoothedLog
 from . import style
 from .maps import box_around
 

@@ -17,17 +17,17 @@ from ...envs.robot import wall_distances
 from ...estimator import interface
 from ...estimator.filters.batch import BatchSlam, BatchTrace, can_batch
 from ...estimator.filters.ekf import EkfSlam
+from ...estimator.guards.saved_states import is_semidefinite
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.motions import find_motion
 from ...estimator.models.sensors import Sensor, find_sensor
-from ...estimator.support.saved_states import is_semidefinite
 from ...evaluation.error_bound import PosteriorBound, posterior_bound
 from ...evaluation.nees import SINGULAR
 from ...evaluation.noise_findings import noise_sums
 from ...sim_configs import Scenario
-from ..runs.filter_settings import FilterSettings, refuse_large_maps
-from ..runs.simulated_runs import SimulatedRuns
-from ..runs.trace import DecisionRecorder, RunDecisions, is_finite
+from ..run_and_replay.filter_settings import FilterSettings, refuse_large_maps
+from ..run_and_replay.simulated_runs import SimulatedRuns
+from ..run_and_replay.trace import DecisionRecorder, RunDecisions, is_finite
 
 _NOT_FINITE = "the pose, its covariance or the NIS is not finite"
 _MAP_NOT_FINITE = "the belief about the map is not finite"

@@ -35,7 +35,7 @@ from ...evaluation.sequential_tests import (
     average_of,
 )
 from ...suggestions import counted
-from ..runs.trace import finite
+from ..run_and_replay.trace import finite
 from .run_measures import Block, gaps_of
 from .verdict import (
     CONSISTENT,

@@ -24,7 +24,7 @@ from ...evaluation.diagnosis import p_text
 from ...sim_configs.scenario_files import replace_when_written
 from ...suggestions import counted
 from ..figures import style
-from ..jobs import replace_own
+from ..job_folders import replace_own
 from .figures import MOST_DOTS, PURPLE, SKY, grid_steps, report_figures
 from .runner import ASSUMED_FILE, python_call
 from .summary import NOTHING, measures, number, percent

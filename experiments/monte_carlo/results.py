@@ -30,8 +30,8 @@ from ...evaluation.noise_findings import CHANNELS, MOMENTS
 from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import replace_when_written, scenario_text
 from ...suggestions import counted
-from .. import jobs
-from ..runs.filter_settings import EstimatorChoice
+from .. import job_folders
+from ..run_and_replay.filter_settings import EstimatorChoice
 from . import run_measures
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def write_results(
         As in :func:`dataset_of`.
     """
     kept, full = "; its blocks stay, to continue from", RuntimeError  # of netCDF
-    with jobs.naming(path, kept, full), jobs.replace_own(path) as partial:
+    with job_folders.naming(path, kept, full), job_folders.replace_own(path) as partial:
         _write(partial, job, blocks, runs, command)
         if more:
             _add_attributes(partial, more)
@@ -134,7 +134,10 @@ def add_to_results(path: Path, added: Mapping[str, Array]) -> None:
     """
     import netCDF4  # noqa: PLC0415
 
-    with jobs.naming(path, also=RuntimeError), jobs.replace_own(path) as partial:
+    with (
+        job_folders.naming(path, also=RuntimeError),
+        job_folders.replace_own(path) as partial,
+    ):
         shutil.copyfile(path, partial)
         with netCDF4.Dataset(partial, "a") as file:
             for name, values in added.items():
@@ -287,7 +290,7 @@ class BlockFolder(NamedTuple):
         for file in self._files_from(runs.start):
             problem = problem_with(file, self.digest)
             if problem:
-                jobs.set_aside(file, f"{problem}, and its runs are repeated")
+                job_folders.set_aside(file, f"{problem}, and its runs are repeated")
             elif int(file.stem.rpartition("-")[2]) >= runs.stop:
                 return True
         return False
@@ -302,7 +305,7 @@ class BlockFolder(NamedTuple):
         file = self.path / BLOCKS / f"runs-{runs.start:07d}-{runs.stop:07d}.npz"
         whole = len(blocks_in(self.path))
         kept = f"; {whole} complete blocks stay there, to continue from"
-        with jobs.naming(file, kept), replace_when_written(file) as partial:
+        with job_folders.naming(file, kept), replace_when_written(file) as partial:
             np.savez(partial, allow_pickle=False, job=self.digest, **arrays)
         for shorter in self._files_from(runs.start):
             if shorter != file:
@@ -369,12 +372,12 @@ def opened(
     OSError
         If it cannot be written.
     """
-    with jobs.claimed(path) as anything:
+    with job_folders.claimed(path) as anything:
         found = identity_in(path) if anything else None
         if found and not fresh:
             refuse_other(path, found, identity)
-        with jobs.naming(f"the folder {path}"):
-            jobs.remove_leftovers(path, path / BLOCKS)
+        with job_folders.naming(f"the folder {path}"):
+            job_folders.remove_leftovers(path, path / BLOCKS)
             if found and fresh:
                 _clear(path, found)
             _write_job(path, identity, _looks_in(path) if found and not fresh else [])
@@ -393,20 +396,20 @@ def _write_job(
 
 def _clear(path: Path, identity: dict[str, Any]) -> None:
     """Remove the results of a job, and set aside what is not proven to be one."""
-    digest, own = digest_of(identity), jobs.own_files(path)
+    digest, own = digest_of(identity), job_folders.own_files(path)
     for block in blocks_in(path):
         problem = problem_with(block, digest)
         if problem:
-            jobs.set_aside(block, problem)
+            job_folders.set_aside(block, problem)
         else:
             block.unlink()
     for name in (RESULTS, REPORT, SUMMARY):
         if not os.path.lexists(path / name):
             continue
-        if jobs.own_entry(path, name, own):
+        if job_folders.own_entry(path, name, own):
             (path / name).unlink()
         else:
-            jobs.set_aside(path / name, "is not as slamgym wrote it")
+            job_folders.set_aside(path / name, "is not as slamgym wrote it")
 
 
 def blocks_in(path: Path) -> list[Path]:
@@ -496,7 +499,7 @@ def refuse_other(path: Path, found: dict[str, Any], asked: dict[str, Any]) -> No
     ValueError
         With the first difference.
     """
-    key = jobs.difference(found, asked)
+    key = job_folders.difference(found, asked)
     if key is not None:
         raise ValueError(
             f"{path} holds results of {_described(key, found.get(key))}, "

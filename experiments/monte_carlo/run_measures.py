@@ -30,9 +30,9 @@ from ...evaluation.trajectory_error import ellipse_areas, position_accuracy
 from ...sim_configs import Scenario
 from ..logs.ground_truth import TrueLandmarks
 from ..logs.slamlog import NO_LANDMARK
-from ..runs.filter_settings import FilterSettings
-from ..runs.simulated_runs import SimulatedRuns
-from ..runs.trace import compare_association
+from ..run_and_replay.filter_settings import FilterSettings
+from ..run_and_replay.simulated_runs import SimulatedRuns
+from ..run_and_replay.trace import compare_association
 from .filtered_runs import (
     Failure,
     FilteredRuns,

@@ -22,19 +22,19 @@ import numpy as np
 from ...arrays import Array
 from ...envs.spaces import count_rows
 from ...estimator import registry
+from ...estimator.guards.argument_checks import one_of, usable_cores
 from ...estimator.interface import SupportsTruth
-from ...estimator.support.argument_checks import one_of, usable_cores
 from ...evaluation.diagnosis import SMALLEST_NOISE
 from ...sim_configs import Scenario, load_scenario
-from ..jobs import Progress, blocks_at_once, blocks_of, engage_workers, resume
-from ..runs.filter_settings import (
+from ..job_folders import Progress, blocks_at_once, blocks_of, engage_workers, resume
+from ..run_and_replay.filter_settings import (
     EstimatorChoice,
     FilterSettings,
     estimator_choices,
     integer,
     one_blas_thread,
 )
-from ..runs.simulated_runs import simulate_runs
+from ..run_and_replay.simulated_runs import simulate_runs
 from .filtered_runs import bound_runs, filter_runs, noise_of_runs
 from .looks import DECIDED, Look, Watch, earlier_looks, error_rate_after, verdict_of
 from .results import (

@@ -26,7 +26,7 @@ from ...evaluation.hypothesis_tests import (
 )
 from ...evaluation.map_consistency import ERROR_RATE as MAP_ERROR_RATE
 from ...evaluation.map_consistency import MapReport, farthest
-from ..runs.trace import finite, mean, quotient, root_mean_square
+from ..run_and_replay.trace import finite, mean, quotient, root_mean_square
 from .looks import is_sequential, looks_summary, verdict_of, watched
 from .run_measures import (
     ALARM,

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
+from ...estimator.guards.argument_checks import one_of
 from ...estimator.models.rigid_motion import ERROR_FRAMES, ErrorFrame
 from ...estimator.models.sensors import DELAYED
-from ...estimator.support.argument_checks import one_of
 from ...evaluation.consistency_report import (
     FEW_AVERAGES,
     FEW_RUNS,
@@ -41,8 +41,13 @@ from ...evaluation.hypothesis_tests import EQUIVALENCE_MARGIN, EquivalenceTest
 from ...evaluation.map_consistency import BIAS_MARGIN, TESTS, MapReport, map_test
 from ...evaluation.map_consistency import ERROR_RATE as MAP_ERROR_RATE
 from ...suggestions import counted
-from ..runs.summary import MOST_REJECTED, NIS_RANGE, coarse_suspicion, nis_suspicion
-from ..runs.trace import finite, quotient
+from ..run_and_replay.summary import (
+    MOST_REJECTED,
+    NIS_RANGE,
+    coarse_suspicion,
+    nis_suspicion,
+)
+from ..run_and_replay.trace import finite, quotient
 from .run_measures import (
     DEVIATIONS,
     KNOWN_IDS_ATE,

@@ -29,14 +29,14 @@ from ...evaluation.nees import pose_nees
 from ..logs import slamlog
 from ..logs.ground_truth import hides_identities, true_poses_of
 from ..logs.log_lines import read_lines, write_whole
-from ..runs.filter_settings import (
+from ..run_and_replay.filter_settings import (
     FilterSettings,
     given_log,
     noise_or_assumed,
     one_blas_thread,
     settings_for,
 )
-from ..runs.log_replay import Progress
+from ..run_and_replay.log_replay import Progress
 from . import search
 from .scoring import associated_log, events_of
 
@@ -123,7 +123,7 @@ def fit_noise(
     --------
     >>> from slamgym.envs.controllers import OpenLoop
     >>> from slamgym.experiments.logs import record_episode
-    >>> from slamgym.experiments.runs import settings_for
+    >>> from slamgym.experiments.run_and_replay import settings_for
     >>> from slamgym.sim_configs import action_sequence, load_scenario
     >>> world = load_scenario("six_landmarks").with_changes(steps=60)
     >>> driver = OpenLoop(action_sequence(world), world.robot)

@@ -28,8 +28,8 @@ from ...estimator.smoother import Drive, RecordedSlam
 from ...estimator.smoother.drive import Sightings
 from ..logs.recording import predictions, predictions_until, steps_of
 from ..logs.slamlog import OdometryRow, Scan, SlamLog
-from ..runs.filter_settings import SMOOTHER, FilterSettings
-from ..runs.log_replay import Progress, replay
+from ..run_and_replay.filter_settings import SMOOTHER, FilterSettings
+from ..run_and_replay.log_replay import Progress, replay
 
 #: Of parameters (B, p), the log likelihoods (B, S) of the steps.
 Likelihoods = Callable[[Array], Array]

@@ -24,7 +24,7 @@ from ...estimator.filters.drive_likelihood import (
 )
 from ...estimator.filters.ekf import EkfSlam
 from ...estimator.kernels.kalman_gain import GATED
-from ..runs.filter_settings import FilterSettings
+from ..run_and_replay.filter_settings import FilterSettings
 from . import scoring
 from .intervals import NOT_ZERO, Verdict, intervals
 

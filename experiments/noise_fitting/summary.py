@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from ... import __version__
 from ...arrays import Array
 from ..figures.style import ALARM, INK, TEAL, dress, new_figure, write_title
-from ..runs.filter_settings import FilterSettings
-from ..runs.log_replay import Progress, replay
-from ..runs.summary import settings_table, summarise
-from ..runs.trace import finite
+from ..run_and_replay.filter_settings import FilterSettings
+from ..run_and_replay.log_replay import Progress, replay
+from ..run_and_replay.summary import settings_table, summarise
+from ..run_and_replay.trace import finite
 from .fit import FACTORS, GATE_PROBABILITY, Fitted, NoiseFit
 
 STAGES = ("before", "fitted", "suggested")

@@ -21,10 +21,10 @@ from ...estimator.map_management.policy import LandmarkPolicy
 from ...estimator.registry import find_estimator, read_label
 from ...sim_configs import Scenario, drawn_scenario
 from ..logs.slamlog import NO_LANDMARK
-from ..runs.filter_settings import FilterSettings, settings_for_scenario
-from ..runs.log_replay import replay
-from ..runs.simulated_runs import empty_record, take
-from ..runs.trace import is_finite
+from ..run_and_replay.filter_settings import FilterSettings, settings_for_scenario
+from ..run_and_replay.log_replay import replay
+from ..run_and_replay.simulated_runs import empty_record, take
+from ..run_and_replay.trace import is_finite
 from .formats import to_slamlog
 from .trajectory import Trajectory
 

@@ -28,7 +28,7 @@ from ...sim_configs.field_types import unknown_choice
 from ...sim_configs.scenario_files import scenario_text
 from ..logs import slamlog
 from ..logs.recording import log_of_episode
-from ..runs.filter_settings import settings_for_scenario
+from ..run_and_replay.filter_settings import settings_for_scenario
 from .trajectory import (
     ARRAYS,
     BELIEFS,

@@ -18,7 +18,7 @@ from ...envs.controllers import CONTROLLERS
 from ...envs.spaces import count_rows
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.field_types import unknown_choice
-from ..jobs import (
+from ..job_folders import (
     Progress,
     claimed,
     difference,
@@ -30,7 +30,7 @@ from ..jobs import (
     set_aside,
     staging_folder,
 )
-from ..runs.filter_settings import integer
+from ..run_and_replay.filter_settings import integer
 from .formats import TrajectoryFormat, trajectory_format
 from .manifest import (
     MANIFEST,

@@ -18,8 +18,8 @@ from typing import Any, Literal
 from ...sim_configs import Scenario
 from ...sim_configs.field_types import unknown_choice
 from ...sim_configs.scenario_files import replace_when_written, scenario_text
-from ..jobs import blocks_of, sha256_of
-from ..runs.filter_settings import integer
+from ..job_folders import blocks_of, sha256_of
+from ..run_and_replay.filter_settings import integer
 from .formats import trajectory_format
 from .trajectory import Trajectory, scenario_from_text
 

@@ -13,7 +13,7 @@ from ...envs.rendering.render_state import drawn_readings
 from ...sim_configs.scenario_files import replace_when_written
 from ..logs.recording import steps_of
 from ..logs.slamlog import SlamLog
-from ..runs.summary import pose_nees
+from ..run_and_replay.summary import pose_nees
 from . import run_page as run_frames
 from .run_page import ViewedRun, map_at, shown_steps
 

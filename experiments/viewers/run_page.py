@@ -34,9 +34,9 @@ from ..figures.style import deviations, page_environment
 from ..logs.ground_truth import true_ids_of
 from ..logs.recording import steps_of
 from ..logs.slamlog import Scan, SlamLog
-from ..runs.log_replay import ThinnedSteps
-from ..runs.summary import pose_nees
-from ..runs.trace import RunTrace
+from ..run_and_replay.log_replay import ThinnedSteps
+from ..run_and_replay.summary import pose_nees
+from ..run_and_replay.trace import RunTrace
 
 _PARTS = Path(__file__).parent / "run_page_parts"
 _SCRIPTS = ("data.js", "map.js", "chart.js", "player.js")
@@ -310,7 +310,7 @@ class RunFrames:
     Examples
     --------
     >>> from slamgym.estimator import make_estimator
-    >>> from slamgym.experiments.runs import replay
+    >>> from slamgym.experiments.run_and_replay import replay
     >>> log = SlamLog("one scan", events=(Scan(0, [(0.0, 5.0), (1.0, 4.0)], [4, 9]),))
     >>> frames = RunFrames(log)
     >>> slam = make_estimator("ekf", motion_std=(0.1,) * 3, measurement_std=(0.1, 0.1))

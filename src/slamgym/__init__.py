@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from .experiments.monte_carlo import consistency_of as consistency_of
     from .experiments.monte_carlo import monte_carlo as monte_carlo
     from .experiments.noise_fitting import fit_noise as fit_noise
-    from .experiments.runs import replay as replay
-    from .experiments.runs.log_smoothing import smooth as smooth
+    from .experiments.run_and_replay import replay as replay
+    from .experiments.run_and_replay.log_smoothing import smooth as smooth
     from .experiments.trajectories import generate_trajectories as generate_trajectories
     from .experiments.trajectories import load_trajectories as load_trajectories
     from .sim_configs import Scenario as Scenario

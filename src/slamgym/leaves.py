@@ -18,7 +18,7 @@ LEAVES: dict[str, tuple[str, ...]] = {
     "other libraries": ("estimator.peers",),
     "smoother": (
         "estimator.smoother",
-        "experiments.runs.log_smoothing",
+        "experiments.run_and_replay.log_smoothing",
         "experiments.figures.smoothed",
         "experiments.command_line.smooth",
     ),
@@ -31,7 +31,7 @@ LEAVES: dict[str, tuple[str, ...]] = {
     "judge": (
         "experiments.judging",
         "experiments.estimate_files",
-        "experiments.conventions",
+        "experiments.estimate_conventions",
         "experiments.space_poses",
         "experiments.command_line.judge",
     ),

@@ -15,7 +15,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
     """,
     "envs": """
         drives
-        robot streams
+        robot random_numbers
         noise_streams controllers
         bearing_range
         spaces rendering
@@ -23,7 +23,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         vector
     """,
     "estimator": """
-        support
+        guards
         models
         interface
         kernels
@@ -50,13 +50,13 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
     """,
     "experiments": """
         logs
-        runs
-        figures jobs
+        run_and_replay
+        figures job_folders
         viewers
         monte_carlo
         noise_study noise_fitting
         trajectories
-        conventions estimate_files log_conventions
+        estimate_conventions estimate_files log_conventions
         judging space_poses
         command_line
     """,
@@ -77,7 +77,7 @@ STRANGERS = {
     ("envs", "evaluation"),
     ("estimator", "sim_configs"),
 }
-EVALUATION_KNOWS = {"models", "support", "interface"}
+EVALUATION_KNOWS = {"models", "guards", "interface"}
 MAY_IMPORT = {  # besides the standard library
     "sim_configs": {"numpy", "pydantic", "pydantic_core"},
     "envs": {"numpy", "scipy", "gymnasium", "pymunk"},

@@ -88,7 +88,7 @@ def test_public_names_need_no_import_deeper_than_two_levels(name):
 @pytest.mark.slow
 def test_a_public_name_is_the_object_and_not_the_module_of_the_same_name():
     code = (
-        "import slamgym.estimator.check_estimator, slamgym.experiments.runs\n"
+        "import slamgym.estimator.check_estimator, slamgym.experiments.run_and_replay\n"
         "from slamgym import check_estimator, replay\n"
         "print(check_estimator.__name__, replay.__name__)"
     )

@@ -9,7 +9,7 @@ from worlds import RANDOM_MAP
 
 from slamgym.envs.bearing_range import BearingRangeSensor, LineOfSight, hide_identities
 from slamgym.envs.noise_streams import NoiseRows, WorldNoise, row_of
-from slamgym.envs.streams import episode_keys
+from slamgym.envs.random_numbers import episode_keys
 from slamgym.sim_configs import load_scenario
 
 BASE = load_scenario("six_landmarks").with_changes(

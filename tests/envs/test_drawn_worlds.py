@@ -9,10 +9,10 @@ import pytest
 from worlds import RANGED
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.envs.streams import drawn_scenarios, episode_keys
+from slamgym.envs.random_numbers import drawn_scenarios, episode_keys
 from slamgym.envs.vector import LandmarkWorldVectorEnv
 from slamgym.experiments.logs import record_episode
-from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import ScenarioError, load_scenario
 from slamgym.sim_configs.scenario import RANGES
 from slamgym.sim_configs.scenario_files import copied_draw

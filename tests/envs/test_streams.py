@@ -9,8 +9,8 @@ import pytest
 from numpy_streams import NAMES, normals, philox, uniforms
 from scipy import stats
 
-from slamgym.envs import streams as episodes
-from slamgym.envs.streams import (
+from slamgym.envs import random_numbers as episodes
+from slamgym.envs.random_numbers import (
     EpisodeStarts,
     draw_normals,
     draw_uniforms,

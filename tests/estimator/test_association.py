@@ -20,6 +20,7 @@ from slamgym.estimator.association.tentative_landmarks import (
     TentativeLandmarks,
     UnexplainedDensity,
 )
+from slamgym.estimator.guards.saved_states import is_semidefinite
 from slamgym.estimator.interface import MapView
 from slamgym.estimator.kernels import scan_update as screening
 from slamgym.estimator.kernels.kalman_gain import (
@@ -37,7 +38,6 @@ from slamgym.estimator.kernels.kalman_gain import (
     Rules,
 )
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
-from slamgym.estimator.support.saved_states import is_semidefinite
 from slamgym.evaluation import score_association
 from slamgym.sim_configs import action_sequence, load_scenario
 

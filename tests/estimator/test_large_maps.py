@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from slamgym.estimator import make_estimator
-from slamgym.estimator.filters.conditioning import separation
+from slamgym.estimator.filters.pose_readings import separation
 from slamgym.estimator.map_management.policy import LandmarkPolicy
 from slamgym.evaluation.nees import normalised_squared_error, state_nees
 from slamgym.experiments.monte_carlo import (
@@ -18,7 +18,7 @@ from slamgym.experiments.monte_carlo import (
     monte_carlo,
     summarise_monte_carlo,
 )
-from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario, place_landmarks
 
 CITY = load_scenario("city")

@@ -11,7 +11,7 @@ from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import LandmarkPolicy, make_estimator
 from slamgym.estimator.association.constellations import Constellations
 from slamgym.estimator.association.scan_assignments import Noise
-from slamgym.estimator.filters.conditioning import observe_relative_pose
+from slamgym.estimator.filters.pose_readings import observe_relative_pose
 from slamgym.estimator.interface import Belief, MapView
 from slamgym.estimator.map_management.loop_closing import (
     AROUND,

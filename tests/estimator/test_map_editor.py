@@ -10,8 +10,8 @@ from scipy.linalg import expm
 from scipy.optimize import root
 
 from slamgym.estimator import EkfSlam, list_estimators, make_estimator
-from slamgym.estimator.filters.conditioning import coincide, separation
 from slamgym.estimator.filters.gaussian_map import without_landmarks
+from slamgym.estimator.filters.pose_readings import coincide, separation
 from slamgym.estimator.interface import marginal, view_map
 from slamgym.estimator.map_management.map_editor import MapEditor
 from slamgym.estimator.models.rigid_motion import invariant_covariance, invariant_error

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from town_drives import TOWN_MOTION_STD, map_all, wander
 
 from slamgym.estimator import check_estimator, list_estimators, make_estimator
-from slamgym.estimator.filters.conditioning import separation
+from slamgym.estimator.filters.pose_readings import separation
 from slamgym.estimator.map_management import policy as policies
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
 from slamgym.estimator.map_management.policy import FieldOfView, LandmarkPolicy
@@ -21,9 +21,9 @@ from slamgym.estimator.models.motions import UNICYCLE, differential
 from slamgym.evaluation.nees import normalised_squared_error
 from slamgym.experiments.logs.ground_truth import true_landmarks_of
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
-from slamgym.experiments.runs.filter_settings import settings_for
-from slamgym.experiments.runs.log_replay import replay
-from slamgym.experiments.runs.summary import summarise
+from slamgym.experiments.run_and_replay.filter_settings import settings_for
+from slamgym.experiments.run_and_replay.log_replay import replay
+from slamgym.experiments.run_and_replay.summary import summarise
 
 MANAGEABLE = list_estimators()
 

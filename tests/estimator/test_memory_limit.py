@@ -9,14 +9,17 @@ from comparison import assert_same_bits
 from town_drives import TOWN_MOTION_STD, map_all, town, wander
 
 from slamgym.estimator import EkfSlam, IteratedEkfSlam, SubmapSlam
+from slamgym.estimator.guards import argument_checks as memory_limit
 from slamgym.estimator.interface import Belief
 from slamgym.estimator.large_maps.compressed.compressed_slam import CompressedEkfSlam
 from slamgym.estimator.models.bearing_range import predict_measurement
-from slamgym.estimator.support import argument_checks as memory_limit
 from slamgym.experiments.command_line.app import main
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
-from slamgym.experiments.runs.filter_settings import refuse_large_map, refuse_large_maps
-from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.experiments.run_and_replay.filter_settings import (
+    refuse_large_map,
+    refuse_large_maps,
+)
+from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 
 NOISE = (TOWN_MOTION_STD, (0.01, 0.05))
 FILTERS = {

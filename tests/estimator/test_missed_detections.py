@@ -9,7 +9,7 @@ from plain_association import predicted_readings
 from scipy.stats import poisson
 
 from slamgym.estimator import make_estimator
-from slamgym.estimator.association.detections import (
+from slamgym.estimator.association.missed_landmarks import (
     EMPTY,
     FEWER,
     HIDDEN,

@@ -9,8 +9,8 @@ from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
 from interrupts import assert_all_or_nothing, is_interrupted, lines_of
 
 from slamgym.estimator import make_batch, make_estimator
-from slamgym.estimator.filters import conditioning
-from slamgym.estimator.filters.conditioning import PoseReading, gate_of
+from slamgym.estimator.filters import pose_readings
+from slamgym.estimator.filters.pose_readings import PoseReading, gate_of
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
 from slamgym.estimator.smoother import Drive
 
@@ -277,7 +277,7 @@ def test_slopes_equal_central_differences_in_the_invariant_frame():
     by_xi = np.transpose(numeric)
     to_xi = np.eye(3)
     to_xi[:2, 2] = prior[1], -prior[0]  # ξ = δ − (J p̂) δθ
-    slopes = conditioning.slopes_at(H, at[:2] - prior[:2])
+    slopes = pose_readings.slopes_at(H, at[:2] - prior[:2])
     np.testing.assert_allclose(slopes, by_xi @ to_xi, atol=1e-8)
 
 
@@ -293,7 +293,7 @@ def test_a_robot_at_rest_does_not_observe_its_heading_by_gps():
 def test_observe_conditions_on_any_first_components():
     mean, P = np.arange(5.0), np.diag([1.0, 2.0, 3.0, 4.0, 5.0])
     H, R = np.array([[0.0, 0.0, 1.0, 1.0]]), np.eye(1)
-    found = conditioning.observe(mean, P, H, R, np.array([9.0]) - H @ mean[:4])
+    found = pose_readings.observe(mean, P, H, R, np.array([9.0]) - H @ mean[:4])
     K = P[:, 2:4].sum(axis=1) / 8
     np.testing.assert_allclose(found.mean, mean + K * 4)
     np.testing.assert_allclose(found.covariance, P - 8 * np.outer(K, K))

@@ -35,7 +35,7 @@ from slamgym.estimator.models.sensors import (
     kernel_parts,
     read_bearing_range,
 )
-from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
 MOTION = 0.05, 0.03, 0.02

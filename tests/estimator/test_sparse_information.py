@@ -32,7 +32,7 @@ from slamgym.estimator.large_maps.sparse_information.sparse_information_slam imp
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.motions import predict_pose
 from slamgym.estimator.models.sensors import BEARING_RANGE
-from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
 MOTION_STD = (0.02, 0.01, 0.01)

@@ -15,8 +15,8 @@ from scipy.stats import chi2
 from test_submaps import LANDMARKS, MEASUREMENT_STD, MOTION_STD, START, laps, made
 from town_drives import run
 
-from slamgym.estimator.filters.conditioning import coincide
 from slamgym.estimator.filters.gaussian_map import without_landmarks
+from slamgym.estimator.filters.pose_readings import coincide
 from slamgym.estimator.large_maps.submaps import closed_submaps as neighbourhood
 from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam

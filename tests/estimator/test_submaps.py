@@ -27,7 +27,7 @@ from slamgym.estimator.models.bearing_range import predict_measurement, wrap_ang
 from slamgym.estimator.models.motions import predict_pose
 from slamgym.estimator.models.rigid_motion import invariant_covariance
 from slamgym.evaluation.nees import pose_nees
-from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
 MOTION_STD, MEASUREMENT_STD = np.array([0.03, 0.02, 0.01]), np.array([0.02, 0.05])

@@ -11,9 +11,9 @@ from scipy.stats import chi2
 
 from slamgym.envs.controllers import OpenLoop
 from slamgym.experiments.logs.recording import record_episode
-from slamgym.experiments.runs.filter_settings import settings_for
-from slamgym.experiments.runs.log_replay import replay
-from slamgym.experiments.runs.summary import pose_nees
+from slamgym.experiments.run_and_replay.filter_settings import settings_for
+from slamgym.experiments.run_and_replay.log_replay import replay
+from slamgym.experiments.run_and_replay.summary import pose_nees
 from slamgym.sim_configs import action_sequence, load_scenario
 
 RUNS = 200

@@ -16,7 +16,7 @@ from slamgym.experiments.monte_carlo.filtered_runs import noise_of_runs
 from slamgym.experiments.monte_carlo.report import escaped as escape
 from slamgym.experiments.monte_carlo.report import html_report
 from slamgym.experiments.monte_carlo.verdict import diagnosis_lines
-from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
 RUNS, SEED = 60, 4000

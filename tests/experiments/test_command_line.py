@@ -19,12 +19,15 @@ from typer.testing import CliRunner
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.experiments import figures
-from slamgym.experiments.command_line import program, run_files, tables
+from slamgym.experiments.command_line import commands, run_files, tables
 from slamgym.experiments.command_line.app import main
-from slamgym.experiments.jobs import MANIFEST
+from slamgym.experiments.job_folders import MANIFEST
 from slamgym.experiments.logs import read_log
-from slamgym.experiments.runs.filter_settings import estimator_choices, settings_for
-from slamgym.experiments.runs.log_replay import replay
+from slamgym.experiments.run_and_replay.filter_settings import (
+    estimator_choices,
+    settings_for,
+)
+from slamgym.experiments.run_and_replay.log_replay import replay
 from slamgym.jit import jit
 from slamgym.sim_configs import list_presets, load_scenario
 
@@ -555,13 +558,13 @@ def test_ctrl_c_leaves_the_older_output_as_it_was(log, without_pictures, monkeyp
 
 
 @pytest.mark.parametrize(
-    ("error", "code"), [(KeyboardInterrupt, 130), (program.TerminationError, 143)]
+    ("error", "code"), [(KeyboardInterrupt, 130), (commands.TerminationError, 143)]
 )
 def test_an_interrupt_before_the_command_begins_is_reported(error, code, monkeypatch):
     def interrupt(*_):
         raise error
 
-    monkeypatch.setattr(program.OneLineErrors, "parse_args", interrupt)
+    monkeypatch.setattr(commands.OneLineErrors, "parse_args", interrupt)
     assert refused("scenarios", code=code) == "interrupted; nothing was written"
 
 
@@ -828,7 +831,7 @@ def test_a_compilation_is_noted_once_and_nothing_else_is(capsys):
     def double(x):
         return 2 * x
 
-    report = program.Reporter(as_json=True)
+    report = commands.Reporter(as_json=True)
     for kinds, note in (((1.0, 1), "compiling the kernel, once"), ((1.0, 1), "")):
         with report.note_if_compiling("the kernel"):
             assert [double(x) for x in kinds] == [2, 2]
@@ -933,7 +936,7 @@ def test_a_log_too_large_for_memory_is_named(log, monkeypatch):
 
 
 def test_an_error_without_text_has_a_message():
-    assert program.message_of(MemoryError()) == "there is not enough memory"
+    assert commands.message_of(MemoryError()) == "there is not enough memory"
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from slamgym.experiments.monte_carlo.report import (
     measures,
     monte_carlo_table,
 )
-from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
 RUNS = 30

@@ -21,11 +21,11 @@ from comparison import tree
 from presets import PRESETS
 
 from slamgym.envs.controllers import CONTROLLERS
-from slamgym.experiments.command_line import program
+from slamgym.experiments.command_line import commands
+from slamgym.experiments.command_line.commands import InterruptedRunError, main
 from slamgym.experiments.command_line.generate import generate as generate_command
 from slamgym.experiments.command_line.options import Options
-from slamgym.experiments.command_line.program import InterruptedRunError, main
-from slamgym.experiments.jobs import claimed
+from slamgym.experiments.job_folders import claimed
 from slamgym.experiments.logs.slamlog import write_slamlog
 from slamgym.experiments.trajectories import driven_episodes, generate
 from slamgym.experiments.trajectories import generate as shard_work
@@ -617,7 +617,7 @@ def terminal(monkeypatch, between):
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
     monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setattr(program, "_BETWEEN", between)
+    monkeypatch.setattr(commands, "_BETWEEN", between)
     return screen
 
 
@@ -631,7 +631,7 @@ def test_the_bar_shows_speed_and_time_left_on_a_terminal(tmp_path, monkeypatch):
 def test_what_was_done_earlier_counts_for_no_speed(monkeypatch):
     screen = terminal(monkeypatch, between=0.0)
     earlier = 10**9
-    with program.Reporter(as_json=True).progress("driving", unit="steps") as tick:
+    with commands.Reporter(as_json=True).progress("driving", unit="steps") as tick:
         for done in range(4):
             tick(earlier + done, earlier + 4)
             time.sleep(0.1)
@@ -643,7 +643,7 @@ def test_what_was_done_earlier_counts_for_no_speed(monkeypatch):
 
 def test_a_bar_that_is_moved_all_the_time_looks_up_now_and_then(monkeypatch):
     screen = terminal(monkeypatch, between=60.0)
-    with program.Reporter(as_json=True).progress("driving", unit="steps") as tick:
+    with commands.Reporter(as_json=True).progress("driving", unit="steps") as tick:
         for done in range(1, 9):
             tick(done, 9)
         time.sleep(0.3)

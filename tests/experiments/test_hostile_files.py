@@ -17,15 +17,15 @@ from comparison import tree
 
 from slamgym.envs.rendering.scene import add_axes
 from slamgym.estimator import make_estimator
+from slamgym.experiments.command_line.commands import BadInputError
 from slamgym.experiments.command_line.output_folder import (
     STAGING,
     output_folder,
     write_summary,
 )
-from slamgym.experiments.command_line.program import BadInputError
 from slamgym.experiments.figures.style import new_figure
-from slamgym.experiments.jobs import MANIFEST as OWN_FILES
-from slamgym.experiments.jobs import files_below
+from slamgym.experiments.job_folders import MANIFEST as OWN_FILES
+from slamgym.experiments.job_folders import files_below
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.importers.utias import read_utias
 from slamgym.experiments.monte_carlo import monte_carlo

@@ -24,7 +24,7 @@ from slamgym.experiments import (
     runs_figure,
     summarise_monte_carlo,
 )
-from slamgym.experiments.conventions import (
+from slamgym.experiments.estimate_conventions import (
     additive_covariances,
     mistake_in,
     stray_poses,

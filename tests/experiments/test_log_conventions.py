@@ -20,7 +20,10 @@ from slamgym.experiments.logs import (
     record_episode,
     write_slamlog,
 )
-from slamgym.experiments.runs.filter_settings import noise_or_assumed, settings_for
+from slamgym.experiments.run_and_replay.filter_settings import (
+    noise_or_assumed,
+    settings_for,
+)
 from slamgym.sim_configs import action_sequence, load_scenario
 
 DATA = os.environ.get("SLAMGYM_DATA")

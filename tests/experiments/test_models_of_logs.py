@@ -15,8 +15,8 @@ from slamgym.experiments.monte_carlo.filtered_runs import (
     filter_runs,
     noise_of_runs,
 )
-from slamgym.experiments.runs.filter_settings import settings_for_scenario
-from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.experiments.run_and_replay.filter_settings import settings_for_scenario
+from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.experiments.trajectories import drive_episodes
 from slamgym.experiments.trajectories.formats import dead_reckoning, trajectory_format
 from slamgym.sim_configs import load_scenario

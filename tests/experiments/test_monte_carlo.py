@@ -39,13 +39,13 @@ from slamgym.experiments.monte_carlo.run_measures import (
     measure_runs,
 )
 from slamgym.experiments.monte_carlo.runner import python_call
-from slamgym.experiments.runs.filter_settings import (
+from slamgym.experiments.run_and_replay.filter_settings import (
     estimator_choices,
     settings_for,
     settings_for_scenario,
 )
-from slamgym.experiments.runs.log_replay import replay
-from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.experiments.run_and_replay.log_replay import replay
+from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
 RUNS = 20

@@ -15,11 +15,11 @@ import xarray as xr
 from typer.testing import CliRunner
 
 from slamgym.experiments.command_line.app import main
-from slamgym.experiments.command_line.program import Reporter
+from slamgym.experiments.command_line.commands import Reporter
 from slamgym.experiments.command_line.run_files import warm_up
-from slamgym.experiments.jobs import MANIFEST, WRITER, replace_own
+from slamgym.experiments.job_folders import MANIFEST, WRITER, replace_own
 from slamgym.experiments.monte_carlo import merge_blocks, monte_carlo
-from slamgym.experiments.runs.filter_settings import FilterSettings
+from slamgym.experiments.run_and_replay.filter_settings import FilterSettings
 
 RUNS = 12
 JOB = {"scenario": "six_landmarks", "estimators": "ekf", "block_size": 4}
@@ -152,7 +152,7 @@ def test_a_writer_that_fails_lets_the_next_one_in(tmp_path, whole):
 def test_a_child_forked_meanwhile_does_not_keep_the_folder(tmp_path):
     code = """
         import os, pathlib, signal, sys, time
-        from slamgym.experiments.jobs import locked_folder
+        from slamgym.experiments.job_folders import locked_folder
         folder = pathlib.Path(sys.argv[1])
         with locked_folder(folder):
             child = os.fork()
@@ -333,7 +333,7 @@ def test_a_folder_of_submaps_is_refused_for_many_runs(tmp_path):
 
 THREADS = """
 from threadpoolctl import threadpool_info
-from slamgym.experiments.runs.filter_settings import one_blas_thread
+from slamgym.experiments.run_and_replay.filter_settings import one_blas_thread
 from slamgym.experiments.monte_carlo import monte_carlo
 
 

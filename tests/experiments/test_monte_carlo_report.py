@@ -18,8 +18,8 @@ from slamgym.evaluation import diagnose
 from slamgym.evaluation.consistency_report import evaluate_consistency
 from slamgym.evaluation.hypothesis_tests import equivalence_test, family_band
 from slamgym.experiments import nees_figure
+from slamgym.experiments.command_line.commands import Reporter
 from slamgym.experiments.command_line.monte_carlo import show_study
-from slamgym.experiments.command_line.program import Reporter
 from slamgym.experiments.monte_carlo import figures, monte_carlo
 from slamgym.experiments.monte_carlo.figures import report_figures, thinned
 from slamgym.experiments.monte_carlo.report import (

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from slamgym.experiments import monte_carlo as package
+from slamgym.experiments.command_line.commands import Reporter
 from slamgym.experiments.command_line.noise_study import (
     NoiseStudyOptions,
     effects_study,
     write_study,
 )
-from slamgym.experiments.command_line.program import Reporter
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.monte_carlo.verdict import scores_of
 from slamgym.experiments.noise_study import (
@@ -20,7 +20,7 @@ from slamgym.experiments.noise_study import (
     noise_effects_figure,
     scaled_scenario,
 )
-from slamgym.experiments.runs.filter_settings import SIGMAS
+from slamgym.experiments.run_and_replay.filter_settings import SIGMAS
 from slamgym.sim_configs import load_scenario
 
 RUNS = 30

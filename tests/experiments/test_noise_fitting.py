@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from slamgym.envs.controllers import OpenLoop
 from slamgym.experiments.command_line.tables import advice
-from slamgym.experiments.jobs import files_below
+from slamgym.experiments.job_folders import files_below
 from slamgym.experiments.logs import (
     OdometryRow,
     Scan,
@@ -41,7 +41,7 @@ from slamgym.experiments.noise_fitting.scoring import (
 )
 from slamgym.experiments.noise_fitting.search import LogLikelihood, noise_of
 from slamgym.experiments.noise_fitting.summary import options_line
-from slamgym.experiments.runs import replay, settings_for, summarise
+from slamgym.experiments.run_and_replay import replay, settings_for, summarise
 from slamgym.sim_configs import action_sequence, load_scenario
 
 MOTION, SENSOR = (0.05, 0.03, 0.02), (0.02, 0.08)

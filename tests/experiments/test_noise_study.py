@@ -13,7 +13,7 @@ from slamgym.experiments.command_line.tables import runs_table
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.logs.slamlog import Scan
 from slamgym.experiments.noise_study import scaled_scenario, study_log, study_scenario
-from slamgym.experiments.runs.filter_settings import (
+from slamgym.experiments.run_and_replay.filter_settings import (
     SIGMAS,
     FilterSettings,
     settings_for,

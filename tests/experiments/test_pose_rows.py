@@ -15,10 +15,10 @@ from slamgym.experiments.logs.slamlog import (
     write_slamlog,
 )
 from slamgym.experiments.monte_carlo import filtered_runs
-from slamgym.experiments.runs.filter_settings import settings_for
-from slamgym.experiments.runs.log_replay import replay
-from slamgym.experiments.runs.log_smoothing import smooth_log
-from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.experiments.run_and_replay.filter_settings import settings_for
+from slamgym.experiments.run_and_replay.log_replay import replay
+from slamgym.experiments.run_and_replay.log_smoothing import smooth_log
+from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import action_sequence, load_scenario
 
 NAN = float("nan")

@@ -13,8 +13,8 @@ from slamgym.experiments.logs.slamlog import (
     read_slamlog,
     write_slamlog,
 )
-from slamgym.experiments.runs.filter_settings import settings_for
-from slamgym.experiments.runs.log_replay import replay
+from slamgym.experiments.run_and_replay.filter_settings import settings_for
+from slamgym.experiments.run_and_replay.log_replay import replay
 from slamgym.sim_configs import action_sequence, load_scenario
 
 

@@ -27,10 +27,13 @@ from slamgym.experiments.logs.slamlog import (
     numbers,
     write_slamlog,
 )
-from slamgym.experiments.runs.filter_settings import FilterSettings, settings_for
-from slamgym.experiments.runs.log_replay import MapHistory, replay
-from slamgym.experiments.runs.log_smoothing import smooth_log
-from slamgym.experiments.runs.summary import LOST, pose_nees, summarise
+from slamgym.experiments.run_and_replay.filter_settings import (
+    FilterSettings,
+    settings_for,
+)
+from slamgym.experiments.run_and_replay.log_replay import MapHistory, replay
+from slamgym.experiments.run_and_replay.log_smoothing import smooth_log
+from slamgym.experiments.run_and_replay.summary import LOST, pose_nees, summarise
 from slamgym.sim_configs import load_scenario
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.02, 0.1)}

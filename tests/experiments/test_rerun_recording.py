@@ -7,7 +7,7 @@ import pytest
 
 from slamgym.estimator import make_estimator
 from slamgym.experiments.logs import OdometryRow, Scan, SlamLog
-from slamgym.experiments.runs import replay
+from slamgym.experiments.run_and_replay import replay
 from slamgym.experiments.viewers import RunFrames, ViewedRun, write_rerun
 from slamgym.experiments.viewers.rerun_recording import import_rerun
 

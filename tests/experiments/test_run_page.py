@@ -14,8 +14,8 @@ from slamgym.estimator import EkfSlam, make_estimator
 from slamgym.estimator.interface import MapView, UpdateReport
 from slamgym.experiments.logs import OdometryRow, Scan, SlamLog
 from slamgym.experiments.logs.recording import record_episode
-from slamgym.experiments.runs import replay
-from slamgym.experiments.runs.summary import pose_nees
+from slamgym.experiments.run_and_replay import replay
+from slamgym.experiments.run_and_replay.summary import pose_nees
 from slamgym.experiments.viewers import RunFrames, ViewedRun, write_run_page
 from slamgym.experiments.viewers import run_page as run_frames
 from slamgym.experiments.viewers.run_page import (

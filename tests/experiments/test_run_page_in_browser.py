@@ -9,7 +9,7 @@ from PIL import Image
 from slamgym.envs.controllers import make_controller
 from slamgym.estimator import make_estimator
 from slamgym.experiments.logs.recording import record_episode
-from slamgym.experiments.runs import replay
+from slamgym.experiments.run_and_replay import replay
 from slamgym.experiments.viewers import RunFrames, ViewedRun, write_run_page
 from slamgym.sim_configs import load_scenario
 

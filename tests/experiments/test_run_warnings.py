@@ -11,14 +11,17 @@ from slamgym.estimator import make_estimator
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
-from slamgym.experiments.runs.filter_settings import (
+from slamgym.experiments.run_and_replay.filter_settings import (
     SMOOTHER,
     FilterSettings,
     settings_for,
 )
-from slamgym.experiments.runs.log_replay import replay
-from slamgym.experiments.runs.log_smoothing import smooth_log, summarise_smoothing
-from slamgym.experiments.runs.summary import (
+from slamgym.experiments.run_and_replay.log_replay import replay
+from slamgym.experiments.run_and_replay.log_smoothing import (
+    smooth_log,
+    summarise_smoothing,
+)
+from slamgym.experiments.run_and_replay.summary import (
     abandoned_landmarks,
     association_failure,
     run_warnings,

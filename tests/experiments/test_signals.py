@@ -10,13 +10,13 @@ import jobs_to_kill
 import psutil
 import pytest
 
-from slamgym.experiments.command_line.options import Options
-from slamgym.experiments.command_line.output_folder import STAGING
-from slamgym.experiments.command_line.program import (
+from slamgym.experiments.command_line.commands import (
     TerminationError,
     interruptible,
     terminable,
 )
+from slamgym.experiments.command_line.options import Options
+from slamgym.experiments.command_line.output_folder import STAGING
 from slamgym.experiments.logs.slamlog import write_slamlog
 from slamgym.sim_configs import load_scenario
 

@@ -5,7 +5,7 @@ import pytest
 from presets import KINDS
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.experiments.runs.simulated_runs import simulate_runs
+from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import action_sequence, load_scenario
 
 SEED = 30

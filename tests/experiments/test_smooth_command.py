@@ -20,9 +20,12 @@ from slamgym.experiments.logs.slamlog import (
     read_slamlog,
     write_slamlog,
 )
-from slamgym.experiments.runs.filter_settings import SMOOTHER, settings_for
-from slamgym.experiments.runs.log_smoothing import smooth_log, summarise_smoothing
-from slamgym.experiments.runs.summary import summarise
+from slamgym.experiments.run_and_replay.filter_settings import SMOOTHER, settings_for
+from slamgym.experiments.run_and_replay.log_smoothing import (
+    smooth_log,
+    summarise_smoothing,
+)
+from slamgym.experiments.run_and_replay.summary import summarise
 
 SIX = np.array([[3, 6], [3, 12], [7, 8], [7, 14], [11, 6], [11, 12.0]])
 NOISE = {

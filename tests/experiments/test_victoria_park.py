@@ -10,9 +10,9 @@ import pytest
 
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.slamlog import Scan
-from slamgym.experiments.runs.filter_settings import settings_for
-from slamgym.experiments.runs.log_replay import replay
-from slamgym.experiments.runs.summary import summarise
+from slamgym.experiments.run_and_replay.filter_settings import settings_for
+from slamgym.experiments.run_and_replay.log_replay import replay
+from slamgym.experiments.run_and_replay.summary import summarise
 
 DATA = os.environ.get("SLAMGYM_DATA")
 LOG = Path(DATA or ".") / "victoria_park.csv"

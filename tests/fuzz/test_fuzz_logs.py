@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from slamgym.estimator import make_estimator
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.slamlog import read_slamlog, write_slamlog
-from slamgym.experiments.runs import replay
+from slamgym.experiments.run_and_replay import replay
 
 SLAMLOG = """# format: slamlog 1
 # name: little

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slamgym.experiments.runs.trace import RunTrace
+from slamgym.experiments.run_and_replay.trace import RunTrace
 
 
 def covariances(rng, count, size, scale):

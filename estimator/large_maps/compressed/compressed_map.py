@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam, InvariantEkfSlam
 from ...filters.gaussian_map import MAP_STATE
+from ...guards import saved_states
+from ...guards.argument_checks import LOWEST_ID, covariance_bytes, refuse_beyond_memory
+from ...guards.saved_states import with_prefix, without_prefix
 from ...interface import Belief
-from ...support import saved_states
-from ...support.argument_checks import LOWEST_ID, covariance_bytes, refuse_beyond_memory
-from ...support.saved_states import with_prefix, without_prefix
 from ..multifrontal import pairs, symmetric
 from . import phase_update
 from .deferred_covariance import BLOCK, DeferredCovariance, subtract

@@ -16,11 +16,11 @@ from ...filters.ekf import (
     IteratedEkfSlam,
     ObservabilityConstrainedEkfSlam,
 )
+from ...guards import argument_checks, saved_states
+from ...guards.argument_checks import LandmarkIds, covariance_bytes
+from ...guards.undo import Undo, attributes, undo_all, undone_on_error
 from ...interface import Belief, MapView, UpdateReport, advance, describe_filter
 from ...models.sensors import only_placing
-from ...support import argument_checks, saved_states
-from ...support.argument_checks import LandmarkIds, covariance_bytes
-from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from .compressed_map import (
     SHORT_PHASE,
     SMALLEST_LOCAL_MAP,

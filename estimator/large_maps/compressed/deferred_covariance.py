@@ -12,9 +12,9 @@ import numpy as np
 
 from ....arrays import Array, IntArray
 from ....jit import jit
-from ...support import saved_states
-from ...support.argument_checks import refuse_beyond_memory
-from ...support.undo import Undo, contents
+from ...guards import saved_states
+from ...guards.argument_checks import refuse_beyond_memory
+from ...guards.undo import Undo, contents
 from ..multifrontal import symmetric
 
 # Rows of one block: 68 landmarks.

@@ -17,11 +17,11 @@ from scipy.linalg import lapack, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
 from ...filters import ekf
+from ...guards import argument_checks
 from ...interface import UpdateReport
 from ...models.bearing_range import locate_landmark, predict_measurement, wrap_angle
 from ...models.motions import UNICYCLE, MotionNoise
 from ...models.sensors import only_bearing_range
-from ...support import argument_checks
 from .local_information import (
     ConditionalPose,
     LinearScan,

@@ -10,9 +10,9 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
 from ...filters.ekf import EkfSlam
+from ...guards.undo import Undo, contents, undo_all, undone_on_error
 from ...interface import Belief, UpdateReport
 from ...models.rigid_motion import as_covariance
-from ...support.undo import Undo, contents, undo_all, undone_on_error
 from ..multifrontal import pairs
 from .local_information import (
     ConditionalPose,

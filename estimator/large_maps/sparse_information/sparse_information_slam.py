@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike
 
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
+from ...guards import argument_checks, saved_states
+from ...guards.argument_checks import LandmarkIds
+from ...guards.saved_states import with_prefix, without_prefix
+from ...guards.undo import Undo, attributes, undo_all, undone_on_error
 from ...interface import Belief, MapView, UpdateReport, describe_filter
 from ...models.bearing_range import wrap_angle
-from ...support import argument_checks, saved_states
-from ...support.argument_checks import LandmarkIds
-from ...support.saved_states import with_prefix, without_prefix
-from ...support.undo import Undo, attributes, undo_all, undone_on_error
 from ..multifrontal import PLACES, ROWS
 from . import local_information
 from .local_information import link_count

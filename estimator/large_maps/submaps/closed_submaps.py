@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ....arrays import Array, IntArray
-from ...filters.conditioning import coincide
 from ...filters.ekf import InvariantEkfSlam
 from ...filters.gaussian_map import without_landmarks
+from ...filters.pose_readings import coincide
+from ...guards import argument_checks, saved_states
+from ...guards.argument_checks import LandmarkIds
+from ...guards.undo import Undo, attributes, undo_all
 from ...interface import Belief, MapView, UpdateReport
 from ...models.rigid_motion import ErrorFrame
-from ...support import argument_checks, saved_states
-from ...support.argument_checks import LandmarkIds
-from ...support.undo import Undo, attributes, undo_all
 from . import joining
 from .factor import Gaussian, retract
 from .store import LostSubmapError, Submap, SubmapStore

@@ -15,8 +15,10 @@ from scipy.linalg import block_diag, solve_triangular
 from scipy.linalg.blas import dsyrk
 
 from ....arrays import Array, IntArray
-from ...filters.conditioning import FRAMES
 from ...filters.ekf import EkfSlam
+from ...filters.pose_readings import FRAMES
+from ...guards import argument_checks
+from ...guards.undo import Undo, attributes, undo_all
 from ...interface import Belief
 from ...models.bearing_range import wrap_angle
 from ...models.rigid_motion import (
@@ -28,8 +30,6 @@ from ...models.rigid_motion import (
     seen_from,
     state_of,
 )
-from ...support import argument_checks
-from ...support.undo import Undo, attributes, undo_all
 from ..multifrontal import pairs, symmetric
 from .closed_submaps import ClosedSubmaps, Region
 from .factor import Gaussian, retract, times, with_uncertain_start

@@ -15,8 +15,8 @@ from uuid import uuid4
 import numpy as np
 
 from ....arrays import Array, IntArray
-from ...support.argument_checks import LOWEST_ID
-from ...support.undo import Undo
+from ...guards.argument_checks import LOWEST_ID
+from ...guards.undo import Undo
 
 CACHE_SIZE = 8  # number of submaps of a folder that are kept in memory
 MARKER = "submaps.txt"

@@ -32,7 +32,7 @@ from filelock import FileLock, Timeout
 
 from ..sim_configs.field_types import unknown_choice
 from ..sim_configs.scenario_files import replace_when_written
-from .runs.filter_settings import integer, one_blas_thread
+from .run_and_replay.filter_settings import integer, one_blas_thread
 
 Result = TypeVar("Result")
 Progress = Callable[[int, int], object]

@@ -9,7 +9,7 @@ from gymnasium.utils import seeding
 
 from ...arrays import AnyArray, Array, BoolArray, IntArray
 from ...envs.vector import WorldBatch
-from ...estimator.support.argument_checks import refuse_beyond_memory
+from ...estimator.guards.argument_checks import refuse_beyond_memory
 from ...sim_configs import Scenario, action_sequence, load_scenario
 from ...sim_configs.scenario_files import refuse_ranges
 

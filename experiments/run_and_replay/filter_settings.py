@@ -22,8 +22,8 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from ...estimator import interface, registry
+from ...estimator.guards import argument_checks
 from ...estimator.models.sensors import Sensor, sensor_in
-from ...estimator.support import argument_checks
 from ...leaves import is_here
 from ...sim_configs import Scenario
 from ...suggestions import closest

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import Array, IntArray
+from ..guards import argument_checks
+from ..guards.undo import attributes, undone_on_error
 from ..interface import Belief, UpdateReport
 from ..kernels.kalman_gain import ADDITIVE, INVARIANT, BeliefArrays, Rules
 from ..models.bearing_range import wrap_angle
@@ -24,8 +26,6 @@ from ..models.rigid_motion import (
     squared_offsets,
     state_of,
 )
-from ..support import argument_checks
-from ..support.undo import attributes, undone_on_error
 from .gaussian_map import GaussianMap
 
 FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
