@@ -32,7 +32,6 @@ __all__ = [
     "SupportsDecisions",
     "SupportsJoin",
     "SupportsLocalView",
-    "SupportsMemoryEstimate",
     "SupportsPoses",
     "SupportsSmoothing",
     "SupportsTruth",
@@ -166,15 +165,6 @@ class SupportsJoin(SupportsLocalView, Protocol):
 
     def join(self) -> None:
         """Join the parts of the map, and continue from the joined map."""
-
-
-@runtime_checkable
-class SupportsMemoryEstimate(Protocol):
-    """An estimator that knows how much memory a map takes."""
-
-    def memory_for(self, landmarks: int) -> int:
-        """Return the least memory that a map of this many landmarks takes [bytes]."""
-        ...
 
 
 @runtime_checkable
@@ -380,7 +370,7 @@ def describe_map(landmarks: int, pose: Array, pose_covariance: Array) -> str:
 
 def optional_members(estimator: SlamEstimator) -> dict[str, Any]:
     """Return what an estimator offers that a wrapper passes on unchanged, by name."""
-    large = "local_view", "join", "smoothed", "memory_for", "belief_limit"
+    large = "local_view", "join", "smoothed", "belief_limit"
     offered = (name for name in ("observe_truth", *large) if hasattr(estimator, name))
     return {name: getattr(estimator, name) for name in offered}
 

@@ -27,7 +27,6 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-import psutil
 from filelock import FileLock, Timeout
 
 from ..sim_configs.field_types import unknown_choice
@@ -194,7 +193,7 @@ def _end_with(engaging: int) -> None:
 
 
 def _watch(engaging: int) -> None:
-    while os.getppid() == engaging and psutil.pid_exists(engaging):
+    while os.getppid() == engaging:
         time.sleep(_PATIENCE)
     os._exit(1)
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ..guards import argument_checks, saved_states
-from ..guards.argument_checks import LandmarkIds, covariance_bytes, landmark_pairs
+from ..guards.argument_checks import LandmarkIds, landmark_pairs
 from ..guards.saved_states import with_prefix
 from ..guards.undo import Undo, attributes, undo_all, undone_on_error, with_copies
 from ..interface import Belief, MapView, UpdateReport, describe_filter
@@ -217,10 +217,6 @@ class MapFilter(ObservesPoses):
         """Return the report of the last update once more; empty after an edit."""
         return self.map.last_report() if self._report is None else self._report
 
-    def memory_for(self, landmarks: int) -> int:
-        """Return the least memory of a map with this many landmarks [bytes]."""
-        return covariance_bytes(landmarks)
-
 
 class EkfSlam(MapFilter):
     """Extended Kalman filter over the robot pose and a growing landmark map.
@@ -377,7 +373,7 @@ class EkfSlam(MapFilter):
             If an innovation covariance is not positive definite, naming the
             reading; the belief is then as before.
         MemoryError
-            If the map would exceed the available memory; the belief is then as before.
+            If memory cannot hold the map; the belief is then as before.
         """
         sensor, kernel = self.sensor, self._update_map
         readings = argument_checks.scan(measurements, sensor.columns)

@@ -18,7 +18,12 @@ import numpy as np
 from ...arrays import Array, IntArray
 from ...jit import jit_in_place, njit_inlined, njit_internal
 from ..guards import saved_states as saved
-from ..guards.argument_checks import aligned_copy, aligned_zeros, landmarks_that_fit
+from ..guards.argument_checks import (
+    aligned_copy,
+    aligned_zeros,
+    covariance_bytes,
+    too_large,
+)
 from ..guards.undo import Undo
 from ..interface import Belief, MapView, UpdateReport, columns_of
 from ..kernels import kalman_gain as gain
@@ -196,13 +201,18 @@ class GaussianMap:
         readings : int
             Readings of a scan that must have room.
         """
-        fitting = landmarks_that_fit(landmarks, landmarks + more)
         most = len(self.parts.scan_ids)
         if readings > most:
             most = 8 + 2 * readings
-        capacity = self.capacity_for(fitting) // 8 * 8  # it is rounded up
+        capacity = self.capacity_for(landmarks + more) // 8 * 8  # it is rounded up
         capacity = max(capacity, self.capacity_for(landmarks))
-        return new_block(capacity, most, self.parts.values[:NIS])  # no NIS yet
+        try:
+            return new_block(capacity, most, self.parts.values[:NIS])  # no NIS yet
+        except MemoryError:
+            if more:
+                return self.blank(landmarks, readings=readings)
+            what = f"a covariance of {landmarks} landmarks"
+            raise too_large(what, covariance_bytes(landmarks)) from None
 
     def hold(
         self,

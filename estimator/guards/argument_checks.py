@@ -1,19 +1,16 @@
-"""Checks of public arguments, with messages that name the argument, and of memory.
+"""Checks of public arguments, with messages that name the argument.
 
-Those of every step take well-formed arguments through without a copy.  A covariance
-that does not fit into memory is refused before it is filled.
+Those of every step take well-formed arguments through without a copy.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from math import inf, isfinite, prod, sqrt
-from pathlib import Path
+from math import inf, isfinite, prod
 from typing import Any
 
 import numpy as np
-import psutil
 from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import LARGEST, SMALLEST, AnyArray, Array, IntArray
@@ -23,10 +20,6 @@ LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]
 # The lowest identity that 64 bits hold, and how many from there on are no landmarks.
 LOWEST_ID, RESERVED_IDS = -(2**63), 2**20
 
-# Less than this is not checked [bytes].
-SMALL = 2**24
-
-_CONTAINER = Path("/sys/fs/cgroup")
 CACHE_LINE = 64  # [bytes]
 
 _FLOAT64, _INT64 = np.dtype(np.float64), np.dtype(np.int64)
@@ -375,86 +368,12 @@ def covariance_bytes(landmarks: int) -> int:
     return 8 * (3 + 2 * landmarks) ** 2
 
 
-def available_memory() -> float:
-    """Return what may be filled without swapping [bytes], inf where it is unknown."""
-    try:
-        free = float(psutil.virtual_memory().available)
-    except (OSError, KeyError):
-        free = inf
-    return min(free, _left_to_container())
-
-
-def _left_to_container() -> float:
-    """Return what the limit of a control group leaves [bytes].
-
-    Cached files count as free.
-    """
-    try:
-        limit, used = (
-            float((_CONTAINER / name).read_text().strip().replace("max", "inf"))
-            for name in ("memory.max", "memory.current")
-        )
-        lines = (_CONTAINER / "memory.stat").read_text().splitlines()
-        cached = next(int(n) for name, n in map(str.split, lines) if name == "file")
-    except (OSError, StopIteration, ValueError):
-        return inf
-    return limit - used + cached
-
-
-def refuse_beyond_memory(
-    what: str, needed: float, instead: str, *, held: float = 0.0
-) -> None:
-    """Refuse what takes more memory than is available.
-
-    Parameters
-    ----------
-    what : str
-        What takes the memory.
-    needed : float
-        How much it takes [bytes].
-    instead : str
-        What the user may do.
-    held : float
-        How much of it is held already [bytes].
-
-    Raises
-    ------
-    MemoryError
-        If it does not fit, with both figures.
-    """
-    if needed < SMALL:
-        return
-    free = available_memory() + held
-    if needed > free:
-        raise MemoryError(
-            f"{what} takes {1e-9 * needed:.1f} GB of memory, and {1e-9 * free:.1f} GB "
-            f"are available: {instead}"
-        )
-
-
-def landmarks_that_fit(least: int, wished: int) -> int:
-    """Return the number of landmarks to allocate for, as far as memory allows.
-
-    Parameters
-    ----------
-    least, wished : int
-        Smallest and desired number of landmarks.
-
-    Raises
-    ------
-    MemoryError
-        If the smallest number does not fit.
-    """
-    if covariance_bytes(wished) < SMALL:
-        return wished
-    refuse_beyond_memory(
-        f"a covariance of {least} landmarks",
-        covariance_bytes(least),
-        "'submaps' and 'sparse_information' take less",
+def too_large(what: str, size: float) -> MemoryError:
+    """Return the error of a map that memory does not hold, with its size [bytes]."""
+    return MemoryError(
+        f"{what} takes {1e-9 * size:.1f} GB, and memory does not hold it: "
+        "'submaps' and 'sparse_information' take less"
     )
-    free = available_memory()
-    most = wished if free == inf else int((sqrt(free / 8) - 3) / 2)
-    return max(least, min(wished, most))
 
 
 def aligned_zeros(*shape: int) -> Array:

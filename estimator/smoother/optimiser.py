@@ -15,7 +15,6 @@ from scipy.linalg import cho_factor, cho_solve
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
 from ..filters.ekf import InvariantEkfSlam
-from ..guards.argument_checks import refuse_beyond_memory
 from ..interface import Belief, part_of
 from ..kernels.kalman_gain import Rules
 from ..kernels.scan_update import as_rules, variances
@@ -112,11 +111,6 @@ class Optimiser:
     def __init__(self, drive: DriveArrays, noise: Noise) -> None:
         self._drive, self._sensor = drive, noise.sensor
         poses, landmarks = len(drive.increments), int(drive.widths[0]) // 2
-        refuse_beyond_memory(
-            f"smoothing {poses} poses among {landmarks} landmarks",
-            8 * (6 * poses * 2 * landmarks + 3 * (2 * landmarks) ** 2),
-            "smooth a part of the drive, or a drive with fewer landmarks",
-        )
         self._room = elimination.new_elimination(poses, landmarks)
         rules = noise.rules
         self._rule_values = np.array(rules)

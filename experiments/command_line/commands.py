@@ -139,19 +139,17 @@ def _end_after_a_signal(reader: socket.socket, line: threading.Lock) -> None:
         else:
             return
     deadline = time.monotonic() + _PATIENCE
-    import psutil
+    from multiprocessing import active_children
 
     time.sleep(max(deadline - time.monotonic(), 0))
     message = _remaining[-1] if _remaining else _NOTHING_WRITTEN
     if line.acquire(blocking=False):
         shown = _SHOW_CURSOR if os.isatty(2) else b""
         os.write(2, shown + f"slamgym: {message}\n".encode())
-    with contextlib.suppress(psutil.Error):
-        for process in psutil.Process().children(recursive=True):
-            with contextlib.suppress(psutil.Error):
-                # That of joblib cleans up, and then ends by itself.
-                if "resource_tracker" not in " ".join(process.cmdline()):
-                    process.kill()
+    for process in active_children():  # those of joblib ignore SIGTERM
+        if process.pid is not None:
+            with contextlib.suppress(OSError):
+                os.kill(process.pid, signal.SIGKILL)
     for path in tuple(unfinished):
         with contextlib.suppress(OSError):
             path.unlink() if path.is_file() else shutil.rmtree(path)

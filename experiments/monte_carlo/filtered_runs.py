@@ -25,7 +25,7 @@ from ...evaluation.error_bound import PosteriorBound, posterior_bound
 from ...evaluation.nees import SINGULAR
 from ...evaluation.noise_findings import noise_sums
 from ...sim_configs import Scenario
-from ..run_and_replay.filter_settings import FilterSettings, refuse_large_maps
+from ..run_and_replay.filter_settings import FilterSettings, refuse_large_map
 from ..run_and_replay.simulated_runs import SimulatedRuns
 from ..run_and_replay.trace import DecisionRecorder, RunDecisions, is_finite
 
@@ -86,7 +86,8 @@ def filter_runs(
     first = settings.make(runs.initial_poses[0])
     is_batch = can_batch(first) and runs.true_ids is None
     is_batch = is_batch and cast(EkfSlam, first).sensor.places
-    refuse_large_maps(runs, first, at_once=is_batch)
+    read = runs.identified().visible.any(axis=1).sum(axis=1)  # by each run
+    refuse_large_map(int(read.max()), first)
     if is_batch:
         return _in_a_batch(cast(EkfSlam, first), settings, runs, threads)
     found = FilteredRuns.unknown(runs)

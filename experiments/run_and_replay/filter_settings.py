@@ -1,7 +1,7 @@
 """Set up an estimator for a log, from the header of the log and the user's choices.
 
 `settings_for` returns the settings of one filter, and `estimator_choices` those that a
-Monte Carlo compares. `refuse_large_map` checks the memory before the filters run.
+Monte Carlo compares. `refuse_large_map` checks the size of the final belief first.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ..logs.recording import log_header
 from ..logs.slamlog import UNICYCLES, LogError, SlamLog
 
 if TYPE_CHECKING:
-    from .simulated_runs import SimulatedRuns
+    pass
 
 
 #: Import path of the smoother; its option ``follow`` names the filter that it follows,
@@ -462,69 +462,17 @@ def _name_of(label: str, what: str | Callable[..., Any]) -> str:
     return name
 
 
-def refuse_large_map(log: SlamLog, estimator: interface.SlamEstimator) -> None:
-    """Refuse a log with more landmarks than memory holds for this filter.
-
-    The check counts the least memory of a run: the filter's map and the final belief of
-    the landmarks that the log names. It accepts a log without names, and a filter that
-    does not estimate its memory (``memory_for``).
+def refuse_large_map(landmarks: int, estimator: interface.SlamEstimator) -> None:
+    """Refuse more landmarks than the final belief of this filter may hold.
 
     Raises
     ------
     ValueError
         If they exceed the filter's ``belief_limit``.
-    MemoryError
-        With the required and the available memory.
     """
-    if landmarks := len(log.read_ids):
-        what = f"a map of the {landmarks} landmarks that {log.name} reads"
-        _refuse_maps([landmarks], estimator, what, "take fewer steps, or landmarks")
-
-
-def refuse_large_maps(
-    runs: SimulatedRuns, estimator: interface.SlamEstimator, *, at_once: bool
-) -> None:
-    """Refuse runs with more landmarks than memory holds for this filter.
-
-    Parameters
-    ----------
-    runs : SimulatedRuns
-        Input of the filters.
-    estimator : SlamEstimator
-        One of them.
-    at_once : bool
-        Whether all filters are in memory together; the final beliefs always are.
-
-    Raises
-    ------
-    ValueError
-        If they exceed the filter's ``belief_limit``.
-    MemoryError
-        With the required and the available memory.
-    """
-    read = runs.identified().visible.any(axis=1).sum(axis=1).tolist()  # by each run
-    what = f"a block of {len(read)} runs that read up to {max(read)} landmarks each"
-    way_out = "take a smaller block_size, or fewer steps"
-    _refuse_maps(read, estimator, what, way_out, at_once=at_once)
-
-
-def _refuse_maps(
-    landmarks: Sequence[int],
-    estimator: interface.SlamEstimator,
-    what: str,
-    way_out: str,
-    *,
-    at_once: bool = False,
-) -> None:
-    """Refuse runs with so many landmarks each, if belief or memory cannot hold them."""
     if isinstance(estimator, interface.SupportsBeliefLimit):
         most = estimator.belief_limit
-        argument_checks.refuse_large_belief(max(landmarks), most, "take fewer steps")
-    if isinstance(estimator, interface.SupportsMemoryEstimate):
-        maps = [estimator.memory_for(count) for count in landmarks]
-        beliefs = sum(argument_checks.covariance_bytes(count) for count in landmarks)
-        need = beliefs + (sum(maps) if at_once else max(maps))
-        argument_checks.refuse_beyond_memory(what, need, way_out)
+        argument_checks.refuse_large_belief(landmarks, most, "take fewer steps")
 
 
 _LARGEST = 2**63 - 1  # of int64

@@ -120,8 +120,6 @@ def replay(
         If the estimator is no filter, but a class, for example, or the log is none.
     numpy.linalg.LinAlgError
         If its covariance degenerates or is not finite, naming the time too.
-    MemoryError
-        If memory does not suffice for the landmarks that the log names.
 
     Examples
     --------
@@ -141,7 +139,7 @@ def replay(
         raise TypeError(
             f"estimator must be a filter, as make_estimator returns it, got {estimator}"
         )
-    refuse_large_map(log, estimator)
+    refuse_large_map(len(log.read_ids), estimator)
     steps = list(recording.steps_of(log))
     times = np.array([step.t for step in steps], dtype=np.float64)
     show_truth = _truth_source(estimator, log, times)

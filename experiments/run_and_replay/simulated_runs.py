@@ -9,7 +9,6 @@ from gymnasium.utils import seeding
 
 from ...arrays import AnyArray, Array, BoolArray, IntArray
 from ...envs.vector import WorldBatch
-from ...estimator.guards.argument_checks import refuse_beyond_memory
 from ...sim_configs import Scenario, action_sequence, load_scenario
 from ...sim_configs.scenario_files import refuse_ranges
 
@@ -136,7 +135,7 @@ def simulate_runs(
     scans = len(actions) + 1
     record, readings = empty_record(batch, _EACH_SCAN, scans), _Readings(batch, scans)
     if not only_read:
-        readings.keep(slice(None))
+        readings.kept[:] = True
     take(record, 0, batch)
     readings.take(batch)
     for step, action in enumerate(actions, start=1):
@@ -177,33 +176,20 @@ class _Readings:
             for name, array in now.items()
             if array is not None
         }
-        self._kept = np.zeros(worlds.mask.shape[1], dtype=np.bool_)
+        self.kept = np.zeros(worlds.mask.shape[1], dtype=np.bool_)
         self._shape = len(worlds.mask), scans
         self._scans: list[tuple[IntArray, dict[str, AnyArray]]] = []
-
-    def keep(self, rows: slice | IntArray) -> None:
-        """Keep rows from now on; refuse those that will not fit into memory."""
-        if self._kept[rows].all():
-            return
-        self._kept[rows] = True
-        (runs, scans), count = self._shape, int(self._kept.sum())
-        refuse_beyond_memory(
-            f"a block of {runs} runs of {scans} scans of {count} landmarks",
-            # a reading, whether there is one, and where it is hidden, of what
-            (25 if "landmark_ids" in self._blank else 17) * runs * scans * count,
-            "take fewer runs at a time (block_size), or fewer steps",
-        )
 
     def take(self, worlds: WorldBatch) -> None:
         """Take the present scan of the worlds."""
         rows = np.flatnonzero(worlds.mask.any(axis=0))
-        self.keep(rows)
+        self.kept[rows] = True
         scan = {name: getattr(worlds, name)[:, rows] for name in self._blank}
         self._scans.append((rows, scan))
 
     def joined(self) -> tuple[IntArray, dict[str, AnyArray]]:
         """Return the kept rows, and the arrays (B, T, M, …) of all scans, once."""
-        kept = np.flatnonzero(self._kept)
+        kept = np.flatnonzero(self.kept)
         shape = (*self._shape, len(kept))
         arrays = {
             name: np.full((*shape, *rest), blank, dtype)

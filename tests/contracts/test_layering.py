@@ -81,7 +81,7 @@ EVALUATION_KNOWS = {"models", "guards", "interface"}
 MAY_IMPORT = {  # besides the standard library
     "sim_configs": {"numpy", "pydantic", "pydantic_core"},
     "envs": {"numpy", "scipy", "gymnasium", "pymunk"},
-    "estimator": {"numpy", "scipy", "numba", "psutil"},
+    "estimator": {"numpy", "scipy", "numba"},
     "evaluation": {"numpy", "scipy"},
     "agents": {"numpy", "scipy", "gymnasium"},
 }

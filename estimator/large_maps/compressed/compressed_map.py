@@ -16,7 +16,7 @@ from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam, InvariantEkfSlam
 from ...filters.gaussian_map import MAP_STATE
 from ...guards import saved_states
-from ...guards.argument_checks import LOWEST_ID, covariance_bytes, refuse_beyond_memory
+from ...guards.argument_checks import LOWEST_ID, covariance_bytes
 from ...guards.saved_states import with_prefix, without_prefix
 from ...interface import Belief
 from ..multifrontal import pairs, symmetric
@@ -81,11 +81,6 @@ class CompressedMap:
 
     def belief(self, ids: Sequence[int]) -> Belief:
         """Return the marginal of the pose and some landmarks."""
-        refuse_beyond_memory(
-            f"belief() of {len(ids)} landmarks",
-            2 * covariance_bytes(len(ids)),  # the belief takes a copy
-            "give landmark_ids",
-        )
         now = self._phase()
         order = {i: place for place, i in enumerate(self.local)}
         mean = np.zeros(3 + 2 * len(ids))
@@ -141,11 +136,6 @@ class CompressedMap:
         hurried : bool
             Whether the change must not take several steps.
         """
-        refuse_beyond_memory(
-            f"a local map of {size} landmarks",
-            covariance_bytes(3 * size),  # including virtual landmarks
-            "take a smaller local_size",
-        )
         self.finish_handover()
         now, own = self._phase(), self._columns(list(self.local))
         self._make_room()

@@ -17,7 +17,7 @@ from ...filters.ekf import (
     ObservabilityConstrainedEkfSlam,
 )
 from ...guards import argument_checks, saved_states
-from ...guards.argument_checks import LandmarkIds, covariance_bytes
+from ...guards.argument_checks import LandmarkIds
 from ...guards.undo import Undo, attributes, undo_all, undone_on_error
 from ...interface import Belief, MapView, UpdateReport, advance, describe_filter
 from ...models.sensors import only_placing
@@ -27,7 +27,6 @@ from .compressed_map import (
     CompressedMap,
     extra_landmarks,
 )
-from .deferred_covariance import stored_bytes
 
 BASES: dict[str, type[EkfSlam]] = {
     "ekf": EkfSlam,
@@ -262,10 +261,6 @@ class CompressedEkfSlam:
     def nbytes(self) -> int:
         """Memory of the belief [bytes]."""
         return self._map.nbytes
-
-    def memory_for(self, landmarks: int) -> int:
-        """Return the least memory of a map with this many landmarks [bytes]."""
-        return min(stored_bytes(landmarks), covariance_bytes(landmarks))
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the whole state, as arrays; large for a large map."""

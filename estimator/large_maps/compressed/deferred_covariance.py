@@ -13,7 +13,7 @@ import numpy as np
 from ....arrays import Array, IntArray
 from ....jit import jit
 from ...guards import saved_states
-from ...guards.argument_checks import refuse_beyond_memory
+from ...guards.argument_checks import covariance_bytes, too_large
 from ...guards.undo import Undo, contents
 from ..multifrontal import symmetric
 
@@ -88,14 +88,15 @@ class DeferredCovariance:
         """
         if self.width >= columns:
             return
-        refuse_beyond_memory(
-            f"half a covariance of {columns // 2} landmarks",
-            stored_bytes(columns // 2),
-            "'submaps' and 'sparse_information' take less",
-            held=stored_bytes(self.width // 2),
-        )
-        while self.width < columns:
-            self._blocks.append(np.zeros((BLOCK, self.width + BLOCK)))
+        try:
+            more = [
+                np.zeros((BLOCK, width + BLOCK))
+                for width in range(self.width, columns, BLOCK)
+            ]
+        except MemoryError:
+            what, size = f"half a covariance of {columns // 2} landmarks", columns // 2
+            raise too_large(what, covariance_bytes(size) / 2) from None
+        self._blocks.extend(more)
 
     def read(
         self, blocks: range, columns: IntArray, rows: Array, coming: Downdate
@@ -296,12 +297,6 @@ class DeferredCovariance:
         # No line of Python runs between the change of a block and the note of it: an
         # interrupt finds neither or both.
         applied.extend(map(len, starmap(dgemm, calls)))
-
-
-def stored_bytes(landmarks: int) -> int:
-    """Return the size of the blocks for this many landmarks [bytes]."""
-    blocks = -(-2 * landmarks // BLOCK)
-    return 8 * BLOCK**2 * blocks * (blocks + 1) // 2
 
 
 def _bounds(columns: IntArray, blocks: range) -> list[int]:
