@@ -234,10 +234,19 @@ class PoseSensors:
         return np.where(is_due, readings, np.nan)
 
     def by_name(self, readings: Array) -> dict[str, Array]:
-        """Return readings (…, 3) as ``gps`` (…, 2) and ``compass`` (…), if present."""
-        found = {"gps": readings[..., :2], "compass": readings[..., 2]}
-        here = zip(found, self.std[[0, 2]] > 0, strict=True)
-        return {name: found[name] for name, is_here in here if is_here}
+        """Return readings (…, 3) as ``gps`` (…, 2) and ``compass`` (…), if present.
+
+        ``gps_mask`` and ``compass_mask`` (…) are true where there is a reading; where
+        there is none, it is 0.
+        """
+        is_read = np.isfinite(readings)
+        values = np.where(is_read, readings, 0.0)
+        found: dict[str, Array] = {}
+        if self.std[0] > 0:
+            found |= {"gps": values[..., :2], "gps_mask": is_read[..., 0]}
+        if self.std[2] > 0:
+            found |= {"compass": values[..., 2], "compass_mask": is_read[..., 2]}
+        return found
 
 
 def _uniform(keys: WordArray, steps: IntArray, stream: int, width: int) -> Array:

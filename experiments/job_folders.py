@@ -114,9 +114,10 @@ def resume(
                 if done < finished * unit:
                     advance(finished * unit - done)
     except BrokenProcessPool as error:
-        raise OSError(
-            f"a worker process was killed, perhaps for lack of memory; {kept}"
-        ) from error
+        end = "was killed, perhaps for lack of memory"
+        if finished == runs - sum(map(len, missing)):
+            end = f"ended before its first block: its error is above, or it {end}"
+        raise OSError(f"a worker process {end}; {kept}") from error
 
 
 def _computed(
@@ -166,10 +167,33 @@ def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
         begin: dict[str, Any] = {}
         if isinstance(parallel.get_active_backend()[0], parallel.BACKENDS["loky"]):
             begin = {"initializer": _end_with, "initargs": (os.getpid(),)}
-        workers: Workers = parallel.Parallel(
+        compute = parallel.Parallel(
             return_as="generator_unordered", pre_dispatch="2*n_jobs", **begin
         )
-        return workers
+
+    def workers(calls: Iterable[Call]) -> Iterator[Any]:
+        with _safe_path():
+            yield from compute(calls)
+
+    return workers
+
+
+@contextlib.contextmanager
+def _safe_path() -> Iterator[None]:
+    """Let processes that begin during the block import nothing from this folder.
+
+    Else a file of the user named like a module of Python, such as ``random.py``, would
+    replace it in the workers.
+    """
+    name = "PYTHONSAFEPATH"
+    before = os.environ.get(name)
+    os.environ[name] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[name]
+        if before is not None:
+            os.environ[name] = before
 
 
 def blocks_at_once(jobs: int | None, backend: str | None) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -187,16 +189,22 @@ _PLAIN: dict[Any, Any] = {"text.usetex": False}
 class PlainTextFigure(Figure):
     """A figure that never needs LaTeX, even where matplotlibrc sets text.usetex."""
 
-    def draw(self, renderer: Any) -> None:
-        """Draw the figure."""
+    @contextmanager
+    def plain(self) -> Iterator[None]:
+        """Make no text by LaTeX during the block, where text is drawn or measured."""
         for text in self.findobj(Text):
             text.set_usetex(False)
         with rc_context(_PLAIN):  # for the labels that matplotlib makes meanwhile
+            yield
+
+    def draw(self, renderer: Any) -> None:
+        """Draw the figure."""
+        with self.plain():
             super().draw(renderer)
 
     def savefig(self, *args: Any, **kwargs: Any) -> None:
         """Write the figure to a file."""
-        with rc_context(_PLAIN):
+        with self.plain():
             super().savefig(*args, **kwargs)
 
 

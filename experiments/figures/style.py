@@ -1,6 +1,7 @@
 """The common style of all figures and web pages, and their files."""
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from string import ascii_uppercase
 from typing import Any, Literal
@@ -37,10 +38,12 @@ def new_figure(width: float, height: float) -> Figure:
 def lay_out(figure: Figure, dpi: float) -> None:
     """Lay a figure out for good: with its engine, each drawing would do so anew."""
     figure.set_dpi(dpi)
-    if (layout := figure.get_layout_engine()) is not None:
+    if (layout := figure.get_layout_engine()) is None:
+        return
+    with figure.plain() if isinstance(figure, PlainTextFigure) else nullcontext():
         for _ in range(2):  # equal axes need a second time
             layout.execute(figure)
-        figure.set_layout_engine("none")
+    figure.set_layout_engine("none")
 
 
 def save_figure(figure: Figure, path: str | Path, dpi: float = 200) -> None:

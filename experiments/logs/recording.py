@@ -102,13 +102,16 @@ def _scan(t: float, observation: Observation, info: dict[str, Any]) -> list[Scan
 
 def _fix(t: float, scenario: Scenario, info: dict[str, Any]) -> list[PoseRow]:
     """Return the reading of GPS and compass in one step, if there is one."""
-    position = info.get("gps", np.full(2, np.nan)).tolist()
-    heading = float(info.get("compass", np.nan))
-    if not np.isfinite([*position, heading]).any():
+    x, y, heading = np.nan, np.nan, np.nan
+    if info.get("gps_mask", False):
+        x, y = info["gps"].tolist()
+    if info.get("compass_mask", False):
+        heading = float(info["compass"])
+    if np.isnan([x, y, heading]).all():
         return []
     gps, compass = scenario.gps, scenario.compass
     std = gps.std if gps else np.nan, compass.std if compass else np.nan
-    return [PoseRow(t, (*position, heading), std)]
+    return [PoseRow(t, (x, y, heading), std)]
 
 
 def log_of_episode(

@@ -1,5 +1,6 @@
 """What the documents say is so: their code runs, their commands work, links resolve."""
 
+import ast
 import os
 import re
 import shlex
@@ -14,7 +15,7 @@ from import_graph import PACKAGES
 
 import slamgym
 from slamgym.estimator import list_estimators, make_estimator
-from slamgym.sim_configs import list_presets
+from slamgym.sim_configs import list_presets, load_scenario
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
@@ -85,6 +86,22 @@ def test_python_in_a_document_runs_and_prints_what_it_shows(
     exec(compile(code, "document", "exec"), reader)
     printed = capsys.readouterr().out
     assert not output or printed == output
+
+
+@pytest.mark.parametrize(("code", "output"), PYTHON)
+def test_a_filter_in_a_document_has_the_noise_of_its_world(code, output):
+    calls = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Call)]
+    given = {k.arg: k.value for call in calls for k in call.keywords}
+    named = [
+        call.args[0] for call in calls if ast.unparse(call.func) == "load_scenario"
+    ]
+    for world in {*named, given.get("scenario")} - {None}:
+        if isinstance(world, ast.Constant) and world.value in list_presets():
+            known = load_scenario(world.value)
+            for part in ("motion", "sensor"):
+                std = given.get(f"{part.replace('sensor', 'measurement')}_std")
+                if isinstance(std, ast.Tuple):
+                    assert ast.literal_eval(std) == getattr(known, part).std
 
 
 @pytest.mark.slow

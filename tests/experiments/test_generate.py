@@ -278,6 +278,16 @@ def test_a_job_of_workers_killed_at_random_ends_with_the_bytes_of_one_process(tm
     assert tree(tmp_path / "killed") == tree(tmp_path / "whole")
 
 
+@pytest.mark.slow
+def test_workers_import_no_script_of_the_user_named_like_a_standard_module(tmp_path):
+    (tmp_path / "random.py").write_text("raise ImportError('a script of the user')")
+    program = "from slamgym.experiments.command_line.app import main; main()"
+    options = ["--episodes", "400", "--jobs", "2", "--out", "drives"]
+    line = [sys.executable, "-P", "-c", program, "generate", "six_landmarks", *options]
+    subprocess.run(line, cwd=tmp_path, check=True, capture_output=True)
+    assert read_manifest(tmp_path / "drives").is_complete
+
+
 def test_rests_of_a_killed_job_are_cleared_away_and_nothing_else(tmp_path):
     small(tmp_path / "whole")
     out = tmp_path / "out"

@@ -23,7 +23,7 @@ from slamgym.experiments.command_line.output_folder import (
     output_folder,
     write_summary,
 )
-from slamgym.experiments.figures.style import new_figure
+from slamgym.experiments.figures.style import lay_out, new_figure
 from slamgym.experiments.job_folders import MANIFEST as OWN_FILES
 from slamgym.experiments.job_folders import files_below
 from slamgym.experiments.logs.importers import read_log
@@ -311,6 +311,7 @@ def test_figures_need_no_latex(monkeypatch):
     monkeypatch.setitem(mpl.rcParams, "text.usetex", True)
     figure = new_figure(3, 2)
     axes = figure.add_subplot(title="3σ [m²]")
+    lay_out(figure, 100)
     figure.draw_without_rendering()
     assert not any(text.get_usetex() for text in figure.findobj(mpl.text.Text))
     assert axes.get_title()
