@@ -52,6 +52,7 @@ FILTERS = "ekf_slam filter_family"
 SCANS = "association decisions map_management hypotheses loop_closing"
 TESTS = {
     "estimator/models/bearing_range": "motions bearing_range ekf_slam",
+    "estimator/models/relative_geometry": "relative_geometry",
     "estimator/models/rigid_motion": "error_frames submaps joining ekf_slam",
     "estimator/models/motions": "motions ekf_slam",
     "estimator/models/sensors": "sensors",

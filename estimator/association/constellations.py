@@ -30,7 +30,8 @@ from scipy.special import chdtri
 from ...arrays import Array, BoolArray, ComplexArray, IntArray
 from ..guards import argument_checks
 from ..kernels.assignment_search import compare_pairs, search_clique
-from ..models.rigid_motion import left_jacobian, rotation, squared_offsets
+from ..models.relative_geometry import lever_of, offset_covariance, squared_offsets
+from ..models.rigid_motion import left_jacobian, rotation
 
 #: Most pairs of landmarks that are compared.
 LARGEST_GRAPH = 800
@@ -149,19 +150,18 @@ def _candidates(feasible: BoolArray) -> IntArray:
 
 def tables(places: TwoPlaces) -> tuple[Array, Array]:
     """Return distance, variance and direction between landmarks of each map."""
-    m = len(places.local)
-    P = _blocks(places.covariance)
-    return (_table(places.local, P[:m, :m]), _table(places.older, P[m:, m:]))
+    m, P = 2 * len(places.local), places.covariance
+    return _table(places.local, P[:m, :m]), _table(places.older, P[m:, m:])
 
 
 def _table(points: Array, P: Array) -> Array:
-    d = points[None] - points[:, None]
-    length = np.hypot(d[..., 0], d[..., 1])
-    u = d / np.maximum(length, 1e-12)[..., None]
-    own = P[np.arange(len(points)), np.arange(len(points))]
-    C = own[:, None] + own[None] - P - P.transpose(1, 0, 2, 3)
-    variance = np.einsum("ija,ijab,ijb->ij", u, C, u)
-    return np.stack([length, variance, np.arctan2(d[..., 1], d[..., 0])])
+    columns = 2 * np.arange(len(points))
+    xx, xy, yy = offset_covariance(P, columns[None], columns[:, None])
+    dx, dy = (points[None] - points[:, None]).transpose(2, 0, 1)
+    length = np.hypot(dx, dy)
+    squared = np.maximum(length, 1e-12) ** 2
+    variance = (dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy) / squared
+    return np.stack([length, variance, np.arctan2(dy, dx)])
 
 
 def largest_clique(
@@ -262,7 +262,7 @@ def misfit(places: TwoPlaces, match: Match) -> tuple[float, float]:
     """Return χ² of shape and displacement of a match, of 2k − 3 and 2 degrees."""
     r, S = _offsets(places, match, turn_between(places, match))
     b = places.older[match.older]
-    turned = ((b - b.mean(axis=0))[:, ::-1] * (-1.0, 1.0)).reshape(-1, 1)  # J b
+    turned = lever_of(b - b.mean(axis=0)).reshape(-1, 1)
     shifted = np.tile(np.eye(2), (len(b), 1))
     try:
         L = np.linalg.cholesky(S)

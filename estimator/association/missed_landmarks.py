@@ -94,12 +94,12 @@ import numpy as np
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
 from ..interface import MapView
-from ..kernels.assignment_search import reading_covariance
 from ..models.bearing_range import (
     expected_reading_jit,
     reading_slopes_jit,
     wrap_angle_jit,
 )
+from ..models.relative_geometry import reading_covariance
 from .tentative_landmarks import MEMORY, RINGS, SECTORS, UnexplainedDensity
 
 #: Weights of a Gaussian at 0, +2 σ and −2 σ, which keep its variance.

@@ -26,7 +26,6 @@ from ..kernels.assignment_search import (
     best_assignments,
     fill_expected,
     largest_change,
-    reading_covariance,
 )
 from ..models.bearing_range import (
     locate_landmark,
@@ -34,6 +33,7 @@ from ..models.bearing_range import (
     reading_variances_jit,
     wrap_angle_jit,
 )
+from ..models.relative_geometry import reading_covariance
 from ..models.sensors import DELAYED, bearing_range_std, only_bearing_range, sensor_in
 
 #: Assignments of a scan e^8 times less likely than the best one are not considered.

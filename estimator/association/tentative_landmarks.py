@@ -38,6 +38,7 @@ from ...jit import jit, njit_internal
 from ..guards import saved_states
 from ..interface import MapView
 from ..models.bearing_range import predict_measurement, wrap_angle
+from ..models.relative_geometry import lever_of
 from ..models.rigid_motion import as_covariance, predict, rotation
 from .scan_assignments import Noise, with_readings
 
@@ -168,8 +169,8 @@ class TentativeLandmarks(NamedTuple):
         places, P, back = left.places, left.covariance, rotation(-left.mean[2])
         if P[2, 2] <= STRAIGHT**2:
             return left
-        lever = places[:, ::-1] * (1.0, -1.0)
-        by_pose = np.hstack([np.tile(-back, (len(places), 1)), lever.reshape(-1, 1)])
+        lever = -lever_of(places).reshape(-1, 1)
+        by_pose = np.hstack([np.tile(-back, (len(places), 1)), lever])
         for _ in range(2):  # T P, then T (T P)ᵀ
             own = back @ P[3:].reshape(-1, 2, P.shape[1])
             P = (by_pose @ P[:3] + own.reshape(-1, P.shape[1])).T

@@ -19,13 +19,8 @@ from ..guards.undo import attributes, undone_on_error
 from ..interface import Belief, UpdateReport
 from ..kernels.kalman_gain import ADDITIVE, INVARIANT, BeliefArrays, Rules
 from ..models.bearing_range import wrap_angle
-from ..models.rigid_motion import (
-    ErrorFrame,
-    left_jacobian,
-    points_of,
-    squared_offsets,
-    state_of,
-)
+from ..models.relative_geometry import lever_of
+from ..models.rigid_motion import ErrorFrame, left_jacobian, points_of, state_of
 from .gaussian_map import GaussianMap
 
 FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
@@ -321,7 +316,7 @@ def _whitened(covariance: Array, H: Array, R: Array) -> tuple[Array, Array]:
 
 def slopes_at(H: Array, moved: Array) -> Array:
     """Return H_δ where the position has moved (..., 2) from the prior [m]."""
-    lever = moved[..., ::-1] * (-1.0, 1.0)  # J (p − p̂)
+    lever = lever_of(moved)  # J (p − p̂)
     slopes = np.broadcast_to(H, (*moved.shape[:-1], *H.shape)).copy()
     slopes[..., 2] += lever @ H[:, :2].T
     return slopes
@@ -356,9 +351,8 @@ def observe_relative_pose(
     if belief.frame == "invariant":
         nu[:2] = state_of(points_of(nu) / left_jacobian(nu[2]), nu[2])[:2]
         at = belief.pose[:2]
-    turned = (landmarks - centre)[:, ::-1] * (-1.0, 1.0)
-    turned = turned.ravel() / max((turned**2).sum(), 1e-12)
-    lever = (at - centre)[::-1] * (-1.0, 1.0)
+    turned = lever_of(landmarks - centre).ravel()
+    turned, lever = turned / max((turned**2).sum(), 1e-12), lever_of(at - centre)
     H, columns = np.eye(3, len(belief.mean)), _columns(slots.tolist())
     H[2, columns] = -turned
     H[:2, columns] = -np.tile(np.eye(2) / k, k) - np.outer(lever, turned)
@@ -368,43 +362,6 @@ def observe_relative_pose(
 
 # --------------------------------------------------------------------------------------
 # Landmarks that are one.
-
-
-class Separation(NamedTuple):
-    """Offset of two landmarks and its covariance."""
-
-    offset: Array  # D = l_i − l_j, shape (2,) [m]
-    covariance: Array  # C, shape (2, 2) [m²]
-
-    @property
-    def squared(self) -> float:
-        """Dᵀ C⁻¹ D: χ² of 2 degrees of freedom if both are one; ∞ if C is singular."""
-        return float(squared_offsets(self.offset, self.covariance))
-
-    @property
-    def largest_std(self) -> float:
-        """Standard deviation in the most uncertain direction [m]."""
-        return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance)[-1], 0.0)))
-
-
-def separation(mean: Array, covariance: Array, one: int, other: int) -> Separation:
-    """Return the offset of two landmarks and its covariance.
-
-    ::
-
-        D = l_i − l_j,    C = P_ii + P_jj − P_ij − P_ji
-
-    Parameters
-    ----------
-    mean, covariance : ndarray
-        The map; entries behind it are ignored.
-    one, other : int
-        Slots i and j.
-    """
-    i, j = slice(3 + 2 * one, 5 + 2 * one), slice(3 + 2 * other, 5 + 2 * other)
-    cross = covariance[i, j]
-    spread = covariance[i, i] + covariance[j, j] - cross - cross.T
-    return Separation(mean[i] - mean[j], spread)
 
 
 def coincide(
@@ -467,10 +424,9 @@ def coincide(
     rows = covariance[i] - covariance[j]
     if frame == "invariant" or reference is not None:
         at = mean if reference is None else reference
-        lever = (at[i] - at[j]).reshape(-1, 2)[:, ::-1] * (1.0, -1.0)
-        lever = lever.ravel()
-        rows = rows + np.outer(lever, covariance[2])
-        S = rows[:, i] - rows[:, j] + np.outer(rows[:, 2], lever)
+        lever = lever_of((at[i] - at[j]).reshape(-1, 2)).ravel()
+        rows = rows - np.outer(lever, covariance[2])
+        S = rows[:, i] - rows[:, j] - np.outer(rows[:, 2], lever)
     else:
         S = rows[:, i] - rows[:, j]
     L = np.linalg.cholesky((S + S.T) / 2)

@@ -354,26 +354,6 @@ def fill_expected(
                 joint[a, b] = joint[b, a] = value
 
 
-@njit_internal
-def reading_covariance(
-    P: Array, c: int, slopes: tuple[float, float, float, float]
-) -> tuple[float, float, float]:
-    """Return ββ, βr and rr of H P Hᵀ, of the landmark at column c.
-
-    The slopes are ∂β/∂x, ∂β/∂y, ∂r/∂x and ∂r/∂y by the position of the landmark; those
-    by the position of the robot are the opposite.
-    """
-    ax, ay, ex, ey = slopes
-    xx = P[0, 0] + P[c, c] - 2 * P[0, c]
-    yy = P[1, 1] + P[c + 1, c + 1] - 2 * P[1, c + 1]
-    xy = P[0, 1] + P[c, c + 1] - P[0, c + 1] - P[1, c]
-    gx, gy = P[2, c] - P[2, 0], P[2, c + 1] - P[2, 1]
-    bb = ax * ax * xx + 2 * ax * ay * xy + ay * ay * yy
-    br = ax * ex * xx + (ax * ey + ay * ex) * xy + ay * ey * yy - (ex * gx + ey * gy)
-    rr = ex * ex * xx + 2 * ex * ey * xy + ey * ey * yy
-    return bb + P[2, 2] - 2 * (ax * gx + ay * gy), br, rr
-
-
 # Numba counts the references to each view of an array, and to each array that it passes
 # to a function.  In the search this took a third of the time, so its inner loops index
 # whole arrays and pass numbers.  They repeat ν and S of a pair: one inlined

@@ -15,6 +15,7 @@ from ..models.bearing_range import (
     read_distance_jit,
     reading_variances_jit,
 )
+from ..models.relative_geometry import variance_from_robot
 from ..models.rigid_motion import turn_coefficients_jit
 from .kalman_gain import (
     ADDED,
@@ -292,19 +293,10 @@ def squared_ratio(n0: float, n1: float, s00: float, s10: float, s11: float) -> f
 def is_near(mean: Array, covariance: Array, column: int) -> bool:
     """Whether the robot is within 10 σ of a landmark, where linearisation fails.
 
-    σ is the largest standard deviation of the landmark's place in the robot's frame,
-    whose error is e_l − e_p − J δ e_θ: a common rotation of robot and map cancels.
+    σ is the largest standard deviation of the landmark's place relative to the robot.
     """
-    P, c = covariance, column
-    dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
-    x_turn, y_turn = P[c, 2] - P[0, 2], P[c + 1, 2] - P[1, 2]
-    xx = P[c, c] - 2 * P[c, 0] + P[0, 0] + 2 * dy * x_turn + dy * dy * P[2, 2]
-    yy = P[c + 1, c + 1] - 2 * P[c + 1, 1] + P[1, 1]
-    yy += dx * dx * P[2, 2] - 2 * dx * y_turn
-    xy = P[c, c + 1] - P[c, 1] - P[c + 1, 0] + P[0, 1]
-    xy += dy * y_turn - dx * x_turn - dx * dy * P[2, 2]
-    # the larger eigenvalue of [xx xy; xy yy]
-    spread = (xx + yy) / 2 + np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+    dx, dy = mean[column] - mean[0], mean[column + 1] - mean[1]
+    spread = variance_from_robot(covariance, column, dx, dy)
     return bool(dx * dx + dy * dy < 100 * spread)
 
 

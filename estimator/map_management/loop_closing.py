@@ -48,7 +48,16 @@ from ..association.scan_assignments import Noise, with_readings
 from ..guards import argument_checks
 from ..interface import MapView
 from ..models.bearing_range import wrap_angle
-from ..models.rigid_motion import squared_offsets
+from ..models.relative_geometry import (
+    covariance_with_heading,
+    largest_std,
+    lever_of,
+    relative_separation,
+    separation,
+    squared_offsets,
+    variance_from_robot,
+)
+from ..models.rigid_motion import invariant_covariance, seen_from
 
 #: Landmarks that are the same: (kept, gone).
 Pairs = list[tuple[int, int]]
@@ -271,11 +280,10 @@ def _gaps(view: MapView, readings: Array, noise: Noise) -> Array:
     n, P = len(view.ids), view.covariance
     variance, r = P[2, 2] + TINY, readings[:, 1, None, None]
     across_std, along_std = np.sqrt(noise.variances(readings[:, 1])).T[..., None, None]
-    d = view.landmarks - view.mean[:2]
-    cross = P[3 : 3 + 2 * n, :3].reshape(n, 2, 3) - P[:2, :3]
-    lever = cross[..., 2] / variance
-    C = view.landmark_covariances - P[:2, :2] - cross[..., :2] - cross[..., :2].mT
-    C = C - variance * lever[:, :, None] * lever[:, None]
+    columns = 3 + 2 * np.arange(n)
+    d, D = separation(view.mean, P, columns, 0)
+    lever = np.stack(covariance_with_heading(P, columns, 0), axis=-1) / variance
+    C = D - variance * lever[:, :, None] * lever[:, None]
     size = np.trace(view.landmark_covariances + P[:2, :2], axis1=1, axis2=2)
     size = size[:, None, None] + (along_std**2 + (r * across_std) ** 2)[..., None]
     C = C + TINY * (1 + size) * np.eye(2)  # rounded, it might be singular
@@ -285,7 +293,7 @@ def _gaps(view: MapView, readings: Array, noise: Noise) -> Array:
         turn = begin
         for _ in range(TURNS):
             along = np.stack([np.cos(ahead + turn), np.sin(ahead + turn)], axis=-1)
-            across = along[..., ::-1] * (-1.0, 1.0)
+            across = lever_of(along)
             stds = along_std * along, r * across_std * across
             S = C + sum(x[..., :, None] * x[..., None, :] for x in stds)
             slope = r * across - lever
@@ -300,7 +308,9 @@ def _gaps(view: MapView, readings: Array, noise: Noise) -> Array:
 
 def _two_places(view: MapView, local: IntArray, older: IntArray) -> TwoPlaces:
     turn = TURN_STDS * float(np.sqrt(view.covariance[2, 2])) + SLACK
-    covariance = _invariant(view, np.concatenate([local, older]))
+    part = view.part(np.concatenate([local, older]).tolist())
+    around = seen_from(part.mean[:2], part.mean)
+    covariance = invariant_covariance(around, part.covariance)[3:, 3:]
     points = view.landmarks[local], view.landmarks[older]
     return TwoPlaces(*points, covariance, min(turn, np.pi))
 
@@ -315,16 +325,9 @@ def _find_lost(
     """
     local, known = 0, 0
     for j in range(len(is_lost)):
-        x, y = 3 + 2 * j, 4 + 2 * j
-        along, across = mean[1] - mean[y], mean[x] - mean[0]  # J (l − p)
-        turn_x, turn_y = P[x, 2] - P[0, 2], P[y, 2] - P[1, 2]
-        xx = P[x, x] + P[0, 0] - 2 * P[x, 0] - 2 * turn_x * along
-        yy = P[y, y] + P[1, 1] - 2 * P[y, 1] - 2 * turn_y * across
-        xy = P[x, y] + P[0, 1] - P[x, 1] - P[y, 0]
-        xy = xy - turn_x * across - turn_y * along + P[2, 2] * along * across
-        xx, yy = xx + P[2, 2] * along * along, yy + P[2, 2] * across * across
-        largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
-        std = np.sqrt(max(largest, 0.0))
+        c = 3 + 2 * j
+        dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
+        std = np.sqrt(max(variance_from_robot(P, c, dx, dy), 0.0))
         is_lost[j] = std > limit
         local += std <= LOCAL_STD * limit
         known += not std > limit
@@ -333,23 +336,6 @@ def _find_lost(
 
 def _offsets(view: MapView, some: IntArray, others: IntArray) -> tuple[Array, Array]:
     """Return χ² and largest σ of the offsets of landmarks, shapes (m, n)."""
-    P = _invariant(view, np.concatenate([some, others]))
-    m, n = len(some), len(others)
-    blocks = P.reshape(m + n, 2, m + n, 2).transpose(0, 2, 1, 3)
-    own = blocks[np.arange(m + n), np.arange(m + n)]
-    cross = blocks[:m, m:]
-    C = own[:m, None] + own[None, m:] - cross - cross.transpose(0, 1, 3, 2)
-    d = view.landmarks[some][:, None] - view.landmarks[others][None]
-    xx, xy, yy = C[..., 0, 0], C[..., 0, 1], C[..., 1, 1]
-    largest = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
-    return squared_offsets(d, C), np.sqrt(np.maximum(largest, 0.0))
-
-
-def _invariant(view: MapView, slots: IntArray) -> Array:
-    """Return the covariance of ξ_q = e_q − J (q − p) e_θ of landmarks."""
-    columns = (3 + 2 * slots[:, None] + np.arange(2)).ravel()
-    P = view.covariance
-    lever = ((view.landmarks[slots] - view.mean[:2])[:, ::-1] * (-1.0, 1.0)).ravel()
-    cross = np.outer(lever, P[2, columns])
-    block = P[np.ix_(columns, columns)]
-    return np.asarray(block - cross - cross.T + P[2, 2] * np.outer(lever, lever))
+    columns = 3 + 2 * some[:, None], 3 + 2 * others
+    d, C = relative_separation(view.mean, view.covariance, *columns)
+    return squared_offsets(d, C), largest_std(C)

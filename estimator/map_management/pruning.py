@@ -12,9 +12,9 @@ from ...jit import jit_in_place
 from ...restorable import Restorable
 from ..association.scan_assignments import Noise
 from ..association.scan_association import ScanAssociation
-from ..filters.pose_readings import separation
 from ..guards import saved_states
 from ..interface import MapView
+from ..models.relative_geometry import largest_std, separation, squared_offsets
 from .loop_closing import Pairs, lost, same_landmarks, slots_of, without_lost
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy
@@ -165,9 +165,10 @@ class MapPruner:
     def _is_one(self, view: MapView, kept: int, gone: int) -> bool:
         if _ordered(view.ids[kept], view.ids[gone]) in self.records.apart:
             return False
-        between = separation(view.mean, view.covariance, kept, gone)
-        is_accurate = between.largest_std <= self._policy.worst_separation_std
-        return is_accurate and between.squared <= self._policy.merge_gate
+        columns, policy = (3 + 2 * kept, 3 + 2 * gone), self._policy
+        d, D = separation(view.mean, view.covariance, *columns)
+        is_accurate = largest_std(D) <= policy.worst_separation_std
+        return bool(is_accurate and squared_offsets(d, D) <= policy.merge_gate)
 
     def _close_loops(self, added: Collection[int], readings: Array) -> Pairs:
         """Merge landmarks around the robot with an older part of the map.

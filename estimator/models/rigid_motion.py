@@ -289,33 +289,6 @@ def state_of(points: ComplexArray, heading: Array | float) -> Array:
     return np.concatenate([flat[..., :2], turn[..., None], flat[..., 2:]], axis=-1)
 
 
-def squared_offsets(offsets: Array, covariances: Array) -> Array:
-    """Return dᵀ C⁻¹ d of offsets d, χ² of 2 degrees of freedom; ∞ where C is singular.
-
-    Parameters
-    ----------
-    offsets : ndarray, shape (..., 2)
-    covariances : ndarray, shape (..., 2, 2)
-
-    Returns
-    -------
-    ndarray, shape (...)
-
-    Examples
-    --------
-    >>> squared_offsets(np.ones((2, 2)), np.stack([np.eye(2), np.ones((2, 2))]))
-    array([ 2., inf])
-    """
-    x, y = offsets[..., 0], offsets[..., 1]
-    xx, yy = covariances[..., 0, 0], covariances[..., 1, 1]
-    xy = covariances[..., 0, 1]
-    determinant = xx * yy - xy * xy
-    squared = np.full(determinant.shape, np.inf)
-    product = yy * x * x - 2 * xy * x * y + xx * y * y
-    np.divide(product, determinant, out=squared, where=determinant > 0)
-    return squared
-
-
 def as_covariance(product: Array) -> Array:
     """Return (P + Pᵀ) / 2 with no variance below 0.
 

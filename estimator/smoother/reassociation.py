@@ -45,6 +45,7 @@ from ..association.constellations import TwoPlaces, largest_clique, tables
 from ..kernels.assignment_search import compare_pairs
 from ..kernels.scan_update import as_rules, variances
 from ..models.bearing_range import wrap_angle, wrap_angle_jit
+from ..models.relative_geometry import separation, squared_offsets
 from ..models.sensors import only_bearing_range
 from ..registry import make_estimator
 from .drive import Drive, DriveArrays, Sightings, landmark_order
@@ -353,7 +354,8 @@ class _Search:
     def joined(self, state: _State) -> _State | None:
         """Merge the landmarks that are likely to be the same, and not in one scan."""
         m = len(state.places)
-        squared, spread = _offsets(state.places, state.covariance)
+        every = np.arange(m)
+        squared, spread = _offsets(state.places, state.covariance, every, every)
         loss = squared / 2 + np.log(2 * np.pi * spread) - self.log_area
         loss[self.together(state.labels, m) | np.tri(m, dtype=np.bool_)] = np.inf
         rename, free = np.arange(m), np.full(m, True)
@@ -426,7 +428,7 @@ class _Search:
         entries = (2 * rows[:, None] + np.arange(2)).ravel()
         P = state.covariance[np.ix_(entries, entries)]
         places = TwoPlaces(state.places[late], state.places[early], P, LARGEST_TURN)
-        squared = _offsets(state.places[rows], P)[0][: len(late), len(late) :]
+        squared, _ = _offsets(state.places, state.covariance, late, early)
         together = self.together(state.labels, len(state.places))
         squared[together[np.ix_(late, early)]] = np.inf
         nearest = np.argsort(squared, axis=None)[: constellations.LARGEST_GRAPH]
@@ -536,12 +538,11 @@ def _renamed(labels: IntArray, rename: IntArray) -> IntArray:
     return np.where(labels == NONE, NONE, rename[labels])
 
 
-def _offsets(places: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return dᵀ C⁻¹ d and √det C of the offsets of n landmarks, both (n, n)."""
-    n = len(places)
-    P = covariance.reshape(n, 2, n, 2).transpose(0, 2, 1, 3)
-    own = P[np.arange(n), np.arange(n)]
-    C = own[:, None] + own[None] - P - P.transpose(1, 0, 2, 3) + 1e-12 * np.eye(2)
-    d = places[:, None] - places[None]
-    squared = np.einsum("ija,ijab,ijb->ij", d, np.linalg.inv(C), d)
-    return squared, np.sqrt(np.linalg.det(C))
+def _offsets(
+    places: Array, covariance: Array, some: IntArray, others: IntArray
+) -> tuple[Array, Array]:
+    """Return dᵀ D⁻¹ d and √det D of the offsets of landmarks, both (m, n)."""
+    i, j = 2 * some[:, None], 2 * others
+    d, D = separation(places.ravel(), covariance, i, j)
+    D += 1e-12 * np.eye(2)  # of a landmark and itself
+    return squared_offsets(d, D), np.sqrt(np.linalg.det(D))

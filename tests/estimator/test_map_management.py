@@ -13,11 +13,11 @@ from scipy.stats import chi2
 from town_drives import TOWN_MOTION_STD, map_all, wander
 
 from slamgym.estimator import check_estimator, list_estimators, make_estimator
-from slamgym.estimator.filters.pose_readings import separation
 from slamgym.estimator.map_management import policy as policies
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
 from slamgym.estimator.map_management.policy import FieldOfView, LandmarkPolicy
 from slamgym.estimator.models.motions import UNICYCLE, differential
+from slamgym.estimator.models.relative_geometry import largest_std, separation
 from slamgym.evaluation.nees import normalised_squared_error
 from slamgym.experiments.logs.ground_truth import true_landmarks_of
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
@@ -533,9 +533,10 @@ def test_two_neighbours_are_not_merged():
             ids = [6 * (step % 2), *IDS[1:]]
             assert not slam.update(readings[ids], ids).merged_ids
         belief = slam.belief()
-        slots = [belief.landmark_ids.index(i) for i in (0, 6)]
-        between = separation(belief.mean, belief.covariance, *slots)
-        worst.append(between.largest_std)
+        columns = [3 + 2 * belief.landmark_ids.index(i) for i in (0, 6)]
+        worst.append(
+            largest_std(separation(belief.mean, belief.covariance, *columns)[1])
+        )
         nees.append(state_nees(belief, steps_of_run[-1][2], landmarks))
     assert np.mean(np.array(worst) < policy.worst_separation_std) > 0.9  # were tested
     assert in_band(nees, 17)
