@@ -21,6 +21,7 @@ from ..estimator.map_management.policy import policy_of
 from ..evaluation.association_scores import score_association
 from ..restorable import Restorable
 from ..sim_configs import Scenario
+from ..sim_configs.scenario import refuse_unknown_keywords
 from .active_slam_kernels import Episodes, StepOutcome, advance
 from .belief_features import belief_space, empty_features
 from .information_reward import CRITERIA, check_criterion, landmark_prior_std
@@ -224,10 +225,20 @@ class ActiveSlamTask(Restorable):
         return {key: np.empty(*form) for key, form in self._forms.items()}
 
 
+#: Arguments of the environments besides these settings.
+KEYWORDS = (
+    *("scenario", "estimator", "estimator_options", "render_mode"),
+    *("num_envs", "max_episode_steps", "autoreset_mode"),
+)
+
+
 def split_settings(
     settings: Mapping[str, Any],
 ) -> tuple[RewardWeights, ObservationForm, dict[str, Any]]:
     """Split settings into weights, form of observation and changes of the scenario."""
+    own = [*fields(RewardWeights), *fields(ObservationForm)]
+    known = [field.name for field in own]
+    refuse_unknown_keywords(settings, [*known, *KEYWORDS], where="of the task")
     rest = dict(settings)
     weights = RewardWeights(**_taken(RewardWeights, rest))
     return weights, ObservationForm(**_taken(ObservationForm, rest)), rest

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from ..arrays import AnyArray, Array, ComplexArray, ImageArray, WordArray
 from ..restorable import Restorable, State, refuse_other_state
 from ..sim_configs import Scenario, load_scenario
+from ..sim_configs.scenario import refuse_unknown_keywords
 from .bearing_range import BearingRangeSensor, hide_identities
 from .drives import drive_of
 from .noise_streams import NoiseRows, PoseSensors, WorldNoise, row_of
@@ -28,6 +29,7 @@ from .spaces import action_space, clipped_action, observation_space
 
 Observation = dict[str, Any]
 
+OF_A_WORLD = "of a world"  # in messages
 _FPS = 30
 
 
@@ -115,6 +117,7 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         render_mode: str | None = None,
         **changes: object,
     ) -> None:
+        refuse_unknown_keywords(changes, ("scenario", "render_mode"), where=OF_A_WORLD)
         self.scenario = load_scenario(scenario).with_changes(**changes)
         self.action_space = action_space(self.scenario)
         self.observation_space = observation_space(self.scenario)
@@ -140,9 +143,7 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        if spec is not None and spec.max_episode_steps is None:
-            spec = replace(spec, max_episode_steps=self.scenario.steps)
-        self._spec = spec
+        self._spec = spec and plain_spec(spec, self.scenario.steps)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -324,6 +325,29 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
             clutter = None if ids is None else ids[mask] < 0
             self._renderer.add(body.pose, measurements[mask], collision, clutter)
         return {"landmarks": measurements, "mask": mask, "odometry": odometry}, info
+
+
+def plain_spec(spec: EnvSpec, steps: int) -> EnvSpec:
+    """Return a specification that JSON can hold, with the length of the episodes.
+
+    A scenario becomes its fields, a path its text, an array a list.
+    """
+    length = spec.max_episode_steps or steps
+    return replace(spec, kwargs=_plain(spec.kwargs), max_episode_steps=length)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Scenario):
+        value = value.model_dump()
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return value
 
 
 def refuse_other_world(own: Scenario, other: Scenario) -> None:

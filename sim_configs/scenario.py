@@ -7,7 +7,7 @@ uniform between two ends. The number of landmarks never changes.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -532,14 +532,7 @@ class Scenario(Part):
         """
         if not changes:
             return self
-        fields = type(self).model_fields
-        for key in changes:
-            if key not in fields:
-                raise UnknownKeywordError(
-                    f"unknown key '{key}' in the scenario"
-                    f"{closest(key, fields, else_all=True)} "
-                    f"(unexpected keyword argument '{key}')"
-                )
+        refuse_unknown_keywords(changes)
         return self.from_table(_merge(self.model_dump(), changes))
 
     def drawn_at(self, shares: Mapping[str, float], directions: Array) -> Self:
@@ -565,6 +558,26 @@ class Scenario(Part):
             return cls.model_validate(_plain(table))
         except ValidationError as error:
             raise ScenarioError("\n".join(error_lines(error))) from None
+
+
+def refuse_unknown_keywords(
+    given: Iterable[str], known: Sequence[str] = (), *, where: str = "in the scenario"
+) -> None:
+    """Refuse keywords that are neither known nor a field of a scenario.
+
+    Raises
+    ------
+    ScenarioError
+        Also a `TypeError`.
+    """
+    fields = Scenario.model_fields
+    for key in given:
+        if key not in fields and key not in known:
+            raise UnknownKeywordError(
+                f"unknown key '{key}' {where}"
+                f"{closest(key, [*known, *fields], else_all=True)} "
+                f"(unexpected keyword argument '{key}')"
+            )
 
 
 def largest_curvature(robot: Robot) -> float:

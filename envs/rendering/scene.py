@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -206,6 +207,12 @@ class PlainTextFigure(Figure):
         """Write the figure to a file."""
         with self.plain():
             super().savefig(*args, **kwargs)
+
+    def _repr_png_(self) -> bytes:
+        """Return the picture that a notebook shows."""
+        picture = BytesIO()
+        self.savefig(picture, format="png")
+        return picture.getvalue()
 
 
 class MovingArtists(NamedTuple):

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import logger
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -21,7 +22,13 @@ from numpy.typing import ArrayLike
 from ...arrays import AnyArray, Array, BoolArray, ImageArray
 from ...restorable import Restorable, State, copied, put_back, refuse_other_state
 from ...sim_configs import Scenario, load_scenario
-from ..landmark_world import LandmarkWorldEnv, refuse_other_world
+from ...sim_configs.scenario import refuse_unknown_keywords
+from ..landmark_world import (
+    OF_A_WORLD,
+    LandmarkWorldEnv,
+    plain_spec,
+    refuse_other_world,
+)
 from ..rendering.episode_renderer import EpisodeRenderer
 from ..rendering.render_state import BeliefLike
 from ..spaces import action_space, observation_space
@@ -29,6 +36,7 @@ from .world_batch import WorldBatch
 
 Observations = dict[str, Any]
 Infos = dict[str, Any]
+KEYWORDS = "num_envs", "scenario", "render_mode", "max_episode_steps", "autoreset_mode"
 
 
 class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyArray]):
@@ -68,6 +76,7 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
 
     changing: ClassVar[tuple[str, ...]] = ("_seeds", "_worlds", "_ended")
     _renderers: Sequence[EpisodeRenderer] = ()  # for close after a failed constructor
+    _spec: EnvSpec | None = None
 
     def __init__(
         self,
@@ -81,6 +90,7 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise ValueError(f"num_envs must be an integer >= 1, got {num_envs!r}")
+        refuse_unknown_keywords(changes, KEYWORDS, where=OF_A_WORLD)
         self.scenario = load_scenario(scenario).with_changes(**changes)
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -105,6 +115,15 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
         self._seeds: list[int] = [-1] * num_envs
         self._ended = np.zeros(num_envs, dtype=np.bool_)
         self._all = ~self._ended
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The specification it was made from, with the length of its episodes."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec and plain_spec(spec, int(self._steps))
 
     def reset(
         self,

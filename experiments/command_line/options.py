@@ -4,6 +4,7 @@ Each annotated type is one option with its help. The functions below them parse 
 and choose scenarios, logs and filters by the names that the user gives.
 """
 
+import contextlib
 import inspect
 import json
 import math
@@ -457,7 +458,7 @@ def changes(option: str, texts: Iterable[str] | None) -> dict[str, Any]:
 
     Examples
     --------
-    >>> changes("--set", ["sensor.max_range=4", "sensor.dropout=0.1", "steps=9"])
+    >>> changes("--set", ["sensor.max_range=4", "sensor.dropout=.1", "steps=9"])
     {'sensor': {'max_range': 4, 'dropout': 0.1}, 'steps': 9}
     """
     nested: dict[str, Any] = {}
@@ -473,11 +474,14 @@ def changes(option: str, texts: Iterable[str] | None) -> dict[str, Any]:
 
 
 def _toml_value(text: str) -> Any:
-    try:
-        table = tomllib.loads(f"value = {text}")
-    except (tomllib.TOMLDecodeError, RecursionError):
-        return text
-    return table["value"] if len(table) == 1 else text
+    for written in (text, _BARE_POINT.sub("0.", text)):  # TOML wants 0.1 for .1
+        with contextlib.suppress(tomllib.TOMLDecodeError, RecursionError):
+            table = tomllib.loads(f"value = {written}")
+            return table["value"] if len(table) == 1 else text
+    return text
+
+
+_BARE_POINT = re.compile(r"(?<![\w.])\.(?=\d)")
 
 
 # --------------------------------------------------------------------------------------

@@ -76,8 +76,10 @@ _MOST_BYTES, _BYTES_OF_READING = 2**28, 17
 
 def monte_carlo(
     scenario: Scenario | Mapping[str, object] | str | Path,
-    estimators: str | Iterable[str | registry.EstimatorFactory] | Mapping[str, Any],
-    runs: int,
+    estimators: str
+    | Iterable[str | registry.EstimatorFactory]
+    | Mapping[str, Any] = "ekf,invariant",
+    runs: int = 200,
     seed: int = 0,
     *,
     until: str | None = None,
@@ -103,7 +105,7 @@ def monte_carlo(
         Names separated by commas, such as ``"ekf,invariant[iterations=3]"`` or
         ``"mypackage.filters:MyFilter"``; or a list of names and classes; or a mapping
         from labels to a class or to a pair (name or class, options).
-    runs : int
+    runs : int, default 200
         Number of runs, at least 1; more than 20 are recommended.
     seed : int
         Seed of run 0; run i has ``seed + i``, so seeds closer than ``runs`` share

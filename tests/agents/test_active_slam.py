@@ -218,7 +218,8 @@ def test_settings_survive_a_spec_written_as_json():
         ({"step_cost": math.inf}, "step_cost must be a finite number >= 0, got inf"),
         ({"effort_cost": "x"}, "effort_cost must be a finite number >= 0, got 'x'"),
         ({"criterion": "B"}, "criterion must be one of D, A, E, got 'B'"),
-        ({"stesp": 3}, "unknown key 'stesp' in the scenario; did you mean 'steps'"),
+        ({"stesp": 3}, "unknown key 'stesp' of the task; did you mean 'steps'"),
+        ({"succes_reward": 3}, "of the task; did you mean 'success_reward'"),
         ({"estimator": "efk"}, "unknown estimator 'efk'; did you mean 'ekf'"),
     ],
 )

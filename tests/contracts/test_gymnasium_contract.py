@@ -1,15 +1,18 @@
 """Gymnasium's own checker and the traps that it does not see."""
 
+import functools
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from comparison import same
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from presets import PRESETS
 
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.sim_configs import action_sequence
+from slamgym.sim_configs import action_sequence, load_scenario, save_scenario
 
 ID = "slamgym/LandmarkWorld-v0"
 HIDDEN = {"scenario": "hidden_identities"}
@@ -53,6 +56,21 @@ def test_bounds_are_finite_and_hold_for_the_farthest_landmark():
 def test_an_id_with_the_package_in_front_makes_the_same_world():
     env, other = gym.make(ID), gym.make(f"slamgym:{ID}")
     same(env.reset(seed=0)[0], other.reset(seed=0)[0])
+
+
+@pytest.mark.parametrize(
+    "make", [gym.make, functools.partial(gym.make_vec, num_envs=2)]
+)
+@pytest.mark.parametrize("task", [ID, "slamgym/ActiveSlam-v0"])
+def test_a_world_is_made_again_from_its_spec_in_json(task, make, tmp_path):
+    path = tmp_path / "mine.toml"
+    save_scenario(load_scenario("active_easy"), path)
+    changes = {"steps": np.int64(9), "start": {"std": np.ones(3)}}
+    for scenario in (load_scenario("active_easy"), path):
+        world = make(task, scenario=scenario, **changes)
+        again = make(EnvSpec.from_json(world.spec.to_json()))
+        assert again.unwrapped.scenario == world.unwrapped.scenario
+        assert again.spec.max_episode_steps == 9
 
 
 def test_gymnasiums_time_limit_comes_on_top_of_the_worlds_own():

@@ -449,6 +449,7 @@ def test_what_is_handed_out_can_be_changed_without_harm():
     ("changes", "message"),
     [
         ({"sensr": {"max_range": 4.0}}, r"unknown key 'sensr'.*'sensor'"),
+        ({"scenari": "loop"}, "did you mean 'scenario'"),
         ({"sensor": {"max_rage": 4.0}}, r"'max_rage' in sensor.*'max_range'"),
         ({"render_mode": "ascii"}, r"render_mode must be .*, got 'ascii'"),
     ],

@@ -1,7 +1,6 @@
 """The native vector world, held against Gymnasium's own vector of single worlds."""
 
 import copy
-import json
 
 import gymnasium as gym
 import numpy as np
@@ -142,14 +141,6 @@ def test_it_is_what_make_vec_makes():
         assert getattr(vector, single) == getattr(other, single)
     for key in ("render_modes", "render_fps"):
         assert vector.metadata[key] == other.metadata[key]
-
-
-def test_its_spec_survives_json():
-    changes = {"scenario": "loop", "sensor": {"max_range": 4.0}}
-    vector = gym.make_vec(ID, 2, **changes)
-    spec = gym.envs.registration.EnvSpec.from_json(gym.spec(ID).to_json())
-    rebuilt = gym.make_vec(spec, 2, **json.loads(json.dumps(changes)))
-    same(vector.reset(seed=0), rebuilt.reset(seed=0))
 
 
 # --- seeds ---
