@@ -8,8 +8,9 @@ the pose per degree of freedom in the invariant and in the additive frame, and N
 degree; efficiency against the bound of any filter, of the position, the heading and the
 final map; path error and final map error [m], not aligned; CPU time of a step [µs]: of
 predict and update, and with the belief, mean and covariance of pose and whole map.
-Failed runs count in no other column.  Needs the extra ``peers``; estimators of missing
-libraries are left out and named.
+Failed runs count in no other column.  Needs the extras ``peers`` and ``benchmark``;
+estimators of missing libraries are left out and named.  filterpy and Stone Soup have no
+SLAM: `filterpy_kalman.py` and `stonesoup_kalman.py` here make filters of them.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Mapping
+from importlib.util import find_spec
 from statistics import mean
 from time import thread_time
 from typing import Any
 
 import numpy as np
 
-from slamgym.estimator import list_peers
+from slamgym.estimator import list_peers, register_estimator
 from slamgym.estimator.check_estimator import CHECKS, find_breaches
 from slamgym.estimator.interface import SlamEstimator
 from slamgym.estimator.registry import accepted_options, find_estimator
@@ -41,6 +43,12 @@ LONGEST = {"gtsam_batch": 100}
 """Steps above which an estimator is left out: its time of a step grows with them."""
 OURS = ("ekf", "unscented", "invariant", "invariant[iterations=1]")
 VARIANTS = ("gtsam_isam2[relinearize_threshold=0.001]", "gtsam_fixed_lag[lag=50]")
+KALMAN_PEERS = {
+    "filterpy_ekf": "filterpy_kalman:FilterpyEkfSlam",
+    "filterpy_ukf": "filterpy_kalman:FilterpyUkfSlam",
+    "stonesoup_ekf": "stonesoup_kalman:StoneSoupEkfSlam",
+    "stonesoup_ukf": "stonesoup_kalman:StoneSoupUkfSlam",
+}
 COLUMNS = (
     "estimator",
     "verdict",
@@ -58,13 +66,20 @@ COLUMNS = (
 )
 
 
-def estimators() -> tuple[str, ...]:
-    """Return ours and those of the installed libraries; name the others."""
-    peers = list_peers()
-    for peer in peers:
-        if not peer.installed:
-            print(f"left out: {peer.name}, {peer.library} missing", file=sys.stderr)
-    installed = {peer.name for peer in peers if peer.installed}
+def installed_peers() -> list[str]:
+    """Return those of the installed libraries, registered; name the others."""
+    libraries = {peer.name: peer.library for peer in list_peers()}
+    libraries |= {name: name.partition("_")[0] for name in KALMAN_PEERS}
+    missing = {name for name, library in libraries.items() if not find_spec(library)}
+    for name in sorted(missing):
+        print(f"left out: {name}, {libraries[name]} missing", file=sys.stderr)
+    for name in KALMAN_PEERS.keys() - missing:
+        register_estimator(name, find_estimator(KALMAN_PEERS[name]))
+    return sorted(libraries.keys() - missing)
+
+
+def estimators(installed: list[str]) -> tuple[str, ...]:
+    """Return ours, and those of other libraries with their variants."""
     variants = [name for name in VARIANTS if name.partition("[")[0] in installed]
     return (*OURS, *sorted([*installed, *variants]))
 
@@ -157,11 +172,13 @@ def made(choice: EstimatorChoice, world: Scenario, pose: Any) -> SlamEstimator:
     return choice._replace(options=options).settings(world).make(pose)
 
 
-def print_world(name: str, runs: int, seed: int) -> None:
+def print_world(name: str, peers: list[str], runs: int, seed: int) -> None:
     """Print the table of one world."""
     world = world_of(name)
     names = tuple(
-        each for each in estimators() if LONGEST.get(each, world.steps) >= world.steps
+        each
+        for each in estimators(peers)
+        if LONGEST.get(each, world.steps) >= world.steps
     )
     print(f"**{name}, {world.steps} steps, {runs} runs, seed {seed}**\n")
     print(f"| {' | '.join(COLUMNS)} |")
@@ -171,14 +188,13 @@ def print_world(name: str, runs: int, seed: int) -> None:
     print()
 
 
-def print_checks() -> None:
+def print_checks(peers: list[str]) -> None:
     """Print the results of `check_estimator`, one row for each estimator."""
     print(f"| estimator | findings of {sum(map(len, CHECKS.values()))} checks |")
     print("|---|---|")
-    for peer in list_peers():
-        if peer.installed:
-            findings = find_breaches(find_estimator(peer.name))
-            print(f"| `{peer.name}` | {'; '.join(map(str, findings)) or 'none'} |")
+    for name in peers:
+        findings = find_breaches(find_estimator(name))
+        print(f"| `{name}` | {'; '.join(map(str, findings)) or 'none'} |")
 
 
 def main() -> None:
@@ -188,11 +204,12 @@ def main() -> None:
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=WORLDS)
     parser.add_argument("--checks", action="store_true")
     arguments = parser.parse_args()
+    peers = installed_peers()
     if arguments.checks:
-        print_checks()
+        print_checks(peers)
         return
     for name in arguments.worlds:
-        print_world(name, arguments.runs, arguments.seed)
+        print_world(name, peers, arguments.runs, arguments.seed)
 
 
 if __name__ == "__main__":

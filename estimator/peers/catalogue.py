@@ -31,11 +31,6 @@ class Peer(NamedTuple):
             )
 
 
-_MODULES = {
-    "gtsam": "gtsam_graph",
-    "filterpy": "filterpy_kalman",
-    "stonesoup": "stonesoup_kalman",
-}
 _ADAPTERS = {
     "gtsam_isam2": ("GtsamIsam2Slam", "GTSAM's incremental smoother iSAM2."),
     "gtsam_fixed_lag": (
@@ -46,28 +41,10 @@ _ADAPTERS = {
         "GtsamBatchSlam",
         "GTSAM's Levenberg-Marquardt over the whole drive after every scan.",
     ),
-    "filterpy_ekf": (
-        "FilterpyEkfSlam",
-        "filterpy's extended Kalman filter over pose and map.",
-    ),
-    "filterpy_ukf": (
-        "FilterpyUkfSlam",
-        "filterpy's unscented Kalman filter over pose and map.",
-    ),
-    "stonesoup_ekf": (
-        "StoneSoupEkfSlam",
-        "Stone Soup's extended Kalman predictor and updater over pose and map.",
-    ),
-    "stonesoup_ukf": (
-        "StoneSoupUkfSlam",
-        "Stone Soup's unscented Kalman predictor and updater over pose and map.",
-    ),
 }
 PEERS = {
-    name: Peer(name, library, f"{__package__}.{module}:{adapter}", description)
-    for library, module in _MODULES.items()
+    name: Peer(name, "gtsam", f"{__package__}.gtsam_graph:{adapter}", description)
     for name, (adapter, description) in _ADAPTERS.items()
-    if name.startswith(library)
 }
 
 
@@ -76,7 +53,7 @@ def list_peers() -> tuple[Peer, ...]:
 
     Examples
     --------
-    >>> [peer.name for peer in list_peers() if peer.library == "gtsam"]
+    >>> [peer.name for peer in list_peers()]
     ['gtsam_isam2', 'gtsam_fixed_lag', 'gtsam_batch']
     """
     return tuple(PEERS.values())

@@ -1,6 +1,7 @@
 """Other libraries' estimators: the same numbers as ours where they must be the same."""
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,10 @@ from slamgym.estimator.smoother import RecordedSlam
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.sim_configs import load_scenario
 
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+
+from field import KALMAN_PEERS
+
 PEERS = {peer.name: peer for peer in list_peers()}
 NOISE = {"motion_std": (0.1, 0.05, 0.03), "measurement_std": (0.02, 0.1)}
 START = {"initial_pose": (1.0, 2.0, 0.7), "initial_pose_std": (0.1, 0.3, 0.2)}
@@ -29,9 +34,10 @@ LANDMARKS = np.array([[4.0, 1.0], [2.0, -3.0], [-1.0, 4.0], [6.0, 5.0], [3.0, 9.
 
 def peer(name, **settings):
     """Make an estimator of another library, or skip the test."""
-    library = PEERS[name].library
-    pytest.importorskip(library, reason=f"needs {library}, see extra peers")
-    return make_estimator(name, **{**NOISE, **START, **settings})
+    library = name.partition("_")[0]
+    pytest.importorskip(library, reason=f"needs {library}, see extras peers, interop")
+    found = KALMAN_PEERS.get(name, name)
+    return make_estimator(found, **{**NOISE, **START, **settings})
 
 
 def drive(*estimators, steps=12, scale=1.0, seed=3):
@@ -57,15 +63,15 @@ def assert_same(one, other, **tolerance):
     assert_allclose(one.covariance, other.covariance, **tolerance)
 
 
-def test_at_least_seven_are_listed_apart_from_ours():
-    assert len(PEERS) >= 7
+def test_gtsams_are_listed_apart_from_ours():
+    assert len(PEERS) >= 3
     assert not set(PEERS) & set(list_estimators())
 
 
-@pytest.mark.parametrize("name", PEERS)
+@pytest.mark.parametrize("name", [*PEERS, *KALMAN_PEERS])
 def test_a_peer_passes_the_checks_of_every_estimator(name):
     peer(name)
-    assert check_estimator(find_estimator(name)) == ()
+    assert check_estimator(find_estimator(KALMAN_PEERS.get(name, name))) == ()
 
 
 @pytest.mark.parametrize("name", PEERS)
@@ -135,10 +141,7 @@ def test_the_unscented_filters_agree_with_each_other():
     assert_allclose(one.covariance, other.covariance, rtol=0.05, atol=1e-3)
 
 
-GTSAM = [name for name in PEERS if name.startswith("gtsam")]
-
-
-@pytest.mark.parametrize("name", GTSAM)
+@pytest.mark.parametrize("name", PEERS)
 def test_a_graph_has_the_prior_and_the_motion_noise_of_our_frames(name):
     theirs, ours = peer(name), make_estimator("ekf", **NOISE, **START)
     for estimator in (theirs, ours):
@@ -147,7 +150,7 @@ def test_a_graph_has_the_prior_and_the_motion_noise_of_our_frames(name):
     assert_same(theirs.belief(), ours.belief(), rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("name", GTSAM)
+@pytest.mark.parametrize("name", PEERS)
 def test_the_innovations_of_a_graph_are_those_of_the_ekf_before_it_is_nonlinear(name):
     theirs, ours = peer(name), make_estimator("ekf", **NOISE, **START)
     for estimator in (theirs, ours):
@@ -194,7 +197,7 @@ def test_a_fixed_lag_longer_than_the_drive_changes_nothing():
     assert np.abs(short.mean - isam2.mean).max() > 1e-5
 
 
-@pytest.mark.parametrize("name", GTSAM)
+@pytest.mark.parametrize("name", PEERS)
 def test_without_innovations_a_graph_reports_none(name):
     plain, silent = peer(name), peer(name, innovations=False)
     drive(plain, silent)

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
+from kalman_peer import SIGMA_ALPHA, SIGMA_BETA, KalmanPeer, Moments
 from stonesoup.base import Property
 from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement
 from stonesoup.models.transition.nonlinear import GaussianTransitionModel
@@ -22,13 +23,9 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import ExtendedKalmanUpdater, UnscentedKalmanUpdater
 
-from ...arrays import Array, IntArray
-from .peer_slam import (
-    SIGMA_ALPHA,
-    SIGMA_BETA,
+from slamgym.arrays import Array, IntArray
+from slamgym.estimator.peers.peer_slam import (
     Innovation,
-    KalmanPeer,
-    Moments,
     Readings,
     expected_readings,
     motion_covariance,
@@ -112,7 +109,7 @@ class _StoneSoupSlam(KalmanPeer):
 class StoneSoupEkfSlam(_StoneSoupSlam):
     """Stone Soup's extended Kalman predictor and updater over pose and map.
 
-    Jacobians are given.  Parameters are those of :class:`.peer_slam.PeerSlam`.
+    Jacobians are given.  Parameters are those of `PeerSlam`.
     """
 
     _predictor, _updater = ExtendedKalmanPredictor, ExtendedKalmanUpdater
@@ -122,7 +119,7 @@ class StoneSoupUkfSlam(_StoneSoupSlam):
     """Stone Soup's unscented Kalman predictor and updater over pose and map.
 
     Its defaults: α = 1/2, β = 2, κ = 3 − n; the motion noise is additive, at the mean
-    heading.  Parameters are those of :class:`.peer_slam.PeerSlam`.
+    heading.  Parameters are those of `PeerSlam`.
     """
 
     _options: ClassVar = {"alpha": SIGMA_ALPHA, "beta": SIGMA_BETA}

@@ -8,15 +8,12 @@ from filterpy.kalman import (
     MerweScaledSigmaPoints,
     UnscentedKalmanFilter,
 )
+from kalman_peer import SIGMA_ALPHA, SIGMA_BETA, KalmanPeer, Moments
 
-from ...arrays import Array
-from ..models.bearing_range import wrap_angle
-from .peer_slam import (
-    SIGMA_ALPHA,
-    SIGMA_BETA,
+from slamgym.arrays import Array
+from slamgym.estimator.models.bearing_range import wrap_angle
+from slamgym.estimator.peers.peer_slam import (
     Innovation,
-    KalmanPeer,
-    Moments,
     Readings,
     expected_readings,
     motion_covariance,
@@ -30,7 +27,7 @@ class FilterpyEkfSlam(KalmanPeer):
 
     The motion moves the mean, as filterpy's class leaves it to its user; the readings
     of a scan are one vector.  filterpy corrects the covariance in Joseph's form.
-    Parameters are those of :class:`.peer_slam.PeerSlam`.
+    Parameters are those of `PeerSlam`.
     """
 
     def _predicted(self, state: Moments, odometry: Array, variance: Array) -> Moments:
@@ -57,7 +54,7 @@ class FilterpyUkfSlam(KalmanPeer):
 
     Van der Merwe's scaled points, α = 1/2, β = 2, κ = 3 − n; the motion noise is
     additive, at the mean heading.  Bearings are averaged about that of the central
-    point.  Parameters are those of :class:`.peer_slam.PeerSlam`.
+    point.  Parameters are those of `PeerSlam`.
     """
 
     def _predicted(self, state: Moments, odometry: Array, variance: Array) -> Moments:
