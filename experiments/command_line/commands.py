@@ -63,6 +63,7 @@ class OneLineErrors(TyperGroup):
         line = threading.Lock()
         if not stands_alone:
             return super().main(*args, **kwargs)
+        _open_closed_streams()
         _replace_unknown_characters()
         try:
             with rarely_collecting(), ending_in_time(line), terminable():
@@ -162,6 +163,27 @@ def _one_line(text: str) -> str:
 
 #: Messages of the blocks that can be interrupted, the innermost last.
 _remaining: list[str] = []
+
+
+class _ClosedOutput(io.TextIOBase):
+    """Standard output that the user has closed, as by ``>&-``."""
+
+    def write(self, text: str) -> int:
+        """Refuse the text, since it would be lost."""
+        raise OSError("standard output is closed: there is no place for the results")
+
+
+def _open_closed_streams() -> None:
+    """Keep files from the numbers of closed streams; refuse results for nobody."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+    if sys.stdout is None:
+        sys.stdout = _ClosedOutput()
+    if sys.stderr is None:
+        sys.stderr = io.StringIO()
 
 
 def _replace_unknown_characters() -> None:

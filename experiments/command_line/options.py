@@ -379,7 +379,9 @@ def takes(names: str, **defaults: Any) -> Callable[[_Function], Callable[..., An
 
         @wraps(function)
         def run(*arguments: Any, **values: Any) -> Any:
-            options = {name: values.pop(name) for name in taken if name in values}
+            options = {
+                name: _place(name, values.pop(name)) for name in taken if name in values
+            }
             return function(*arguments, given=kind(**defaults | options), **values)
 
         every = [
@@ -391,6 +393,18 @@ def takes(names: str, **defaults: Any) -> Callable[[_Function], Callable[..., An
         return run
 
     return expand
+
+
+def _place(option: str, value: Any) -> Any:
+    """Return the value of an option; of a path, with ~ as the home of the user."""
+    if not isinstance(value, Path):
+        return value
+    try:
+        str(value).encode()
+    except UnicodeEncodeError:
+        name = f"--{option.replace('_', '-')}"
+        raise BadInputError(f"{name} must be text in UTF-8, got {value!a}") from None
+    return value.expanduser()
 
 
 def _help_texts(kind: type) -> dict[str, str]:

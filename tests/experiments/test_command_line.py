@@ -665,6 +665,7 @@ WRONG_FILTERS = {
     "-e ekf[x": "an estimator must be like ekf or",
     "--every-steps": "No such option: --every-steps",
     "--out little.csv": "--out must be a folder, got the file",
+    "--out a\udcff": "--out must be text in UTF-8",
 }  # fmt: skip
 WRONG_WORLDS = {
     "six_landmark": "got 'six_landmark'; did you mean 'six_landmarks'?",
@@ -993,3 +994,30 @@ def test_landmarks_that_were_never_placed_are_named(here, without_pictures):
     waiting -= counts["associated"] + counts["added"]
     assert counts["waiting"] == waiting > 0
     assert f"{waiting} of ones not placed yet" in words
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "message"),
+    [
+        ("scenarios >&-", 1, "slamgym: standard output is closed: there is no place"),
+        ("scenarios --json >&-", 1, "slamgym: standard output is closed"),
+        ("run nonsense 2>&-", 2, ""),
+        ("scenarios <&-", 0, ""),
+    ],
+)
+def test_closed_streams_neither_lose_results_nor_change_the_exit_code(
+    line, code, message
+):
+    program = "from slamgym.experiments.command_line.app import main; main()"
+    shell = f"{shlex.quote(sys.executable)} -c {shlex.quote(program)} {line}"
+    done = subprocess.run(
+        shell, shell=True, check=False, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr[: len(message)]) == (code, message)
+    assert bool(done.stdout) == (code == 0)
+
+
+def test_a_tilde_after_an_equals_sign_is_the_home_of_the_user(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert slamgym("generate", "loop", "--episodes=1", "--out=~/drives").exit_code == 0
+    assert (tmp_path / "drives" / "manifest.json").exists()
