@@ -33,13 +33,16 @@ from ..kernels.assignment_search import compare_pairs, search_clique
 from ..models.relative_geometry import lever_of, offset_covariance, squared_offsets
 from ..models.rigid_motion import left_jacobian, rotation
 
-#: Most pairs of landmarks that are compared.
+# `benchmarks/loop_closure.py` counts what the limits without a formula decide: loops
+# that are closed, and different landmarks that are merged.
+
+#: Most pairs of landmarks that are compared; cost grows with its square.
 LARGEST_GRAPH = 800
 #: Squared difference of two distances over its variance; χ² of 1 degree, 99.9 %.
 DISTANCE_GATE = 10.83
-#: A second place with a larger share of the landmarks is a rival.
+#: A second place that matches a larger share of the landmarks is a rival.
 RIVAL_SHARE = 0.75
-#: How much farther apart a rival's pairs are than the worst pair of the match.
+#: Ratio: how much farther apart a rival's pairs are than the worst pair of the match.
 RIVAL_GAP = 3.0
 
 
@@ -200,11 +203,11 @@ def _blocks(covariance: Array) -> Array:
 #
 # so the heading is free in both: after long drift its covariance is the least reliable.
 
-#: Probability that the right match fails the test of its shape or displacement.
+#: Probability that the right match fails each test, of its shape or its displacement.
 TAIL = 1e-4
 #: Largest χ² of a further pair given the matched ones; 2 degrees, 99.9 %.
 PAIR_GATE = 13.8
-#: Least share of landmarks between the matched ones that must have a partner.
+#: Least share of the landmarks between the matched ones that must have a partner.
 PARTNERS = 0.6
 
 

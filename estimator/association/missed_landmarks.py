@@ -102,47 +102,53 @@ from ..models.bearing_range import (
 from ..models.relative_geometry import reading_covariance
 from .tentative_landmarks import MEMORY, RINGS, SECTORS, UnexplainedDensity
 
-#: Weights of a Gaussian at 0, +2 σ and −2 σ, which keep its variance.
+# What no formula gives is chosen.  `benchmarks/association.py` counts the bad runs of
+# hypotheses, whose costs HIDDEN and SUREST limit.  `benchmarks/association_alarm.py`
+# counts the lost runs that the alarm finds, and its false alarms, for all others.
+
+#: Weights of a Gaussian at 0, +2 σ and −2 σ: with 1/8 each, 2 · 2² σ² / 8 = σ².
 NODES = np.array([3 / 4, 1 / 8, 1 / 8])
 
-#: Probability that something hides a landmark until it is seen again.
+#: ε: probability that something hides a landmark until it is seen again.
 HIDDEN = 0.0003
 
-#: Largest P_D: something may stand before a landmark.
+#: Largest P_D, a probability: something may stand before a landmark.
 SUREST = 0.95
 
-#: A bearing whose two σ are wider than this says nothing [rad].
+#: A bearing whose two σ are wider than this angle says nothing [rad].
 WIDEST = np.pi / 4
 
-#: ρ: detection rate of a lost run, relative to that of its map.
+#: ρ: detection rate of a lost run, as a share of that of its map.
 FEWER = 0.5
 
 #: Landmarks hidden for each return; sightings without one that are assumed at first.
 HIDDEN_EACH, NO_RETURNS = 5, 100
 
-#: Subtracted from the root of the returns: up to nine of them prove nothing.
+#: Subtracted from √k of k returns.  A count has a standard deviation of about √k, so √k
+#: has one of ½, and this is six σ: up to nine returns prove nothing.
 LIMIT = 3.0
 
-#: A change of the evidence counts in full after about so many scans with evidence,
-#: each of them of this size.
+#: A change of the evidence counts in full after about this number of scans that change
+#: it by at least this, a logarithm of a ratio of likelihoods.
 SCANS, TELLING = 5, 0.3
 
-#: Half the width of what may hide a landmark, beyond two σ [rad].
+#: Half the angle of what may hide a landmark, beyond two σ [rad].
 SHADOW = 0.1
 
 #: P_D of a missed landmark is the least up to this many cells beyond two σ.
 MARGIN = 0.5
 
-#: c: most evidence of being lost from one scan.
-MOST_OF_SCAN = 3.0
-
-#: A heading is unknown if its variance has grown by this [rad²].
-UNKNOWN = 0.8
-
-#: A run whose evidence has exceeded this is probably lost.
+#: A run whose evidence, a logarithm of a ratio of likelihoods, has exceeded this is
+#: probably lost: 20 to 1, as e³ = 20.1.
 LOST_SCORE = 3.0
 
-#: A landmark that was shown in this many scans is not of clutter.
+#: c: most evidence of being lost from one scan; more than one must agree.
+MOST_OF_SCAN = LOST_SCORE
+
+#: A heading is unknown if its variance has grown by this, about (0.9 rad)² [rad²].
+UNKNOWN = 0.8
+
+#: A landmark that was shown in this number of scans is not of clutter.
 PROVEN = 2
 
 #: Bearing + π and range of a landmark, and two σ of both.

@@ -36,12 +36,15 @@ from ..models.bearing_range import (
 from ..models.relative_geometry import reading_covariance
 from ..models.sensors import DELAYED, bearing_range_std, only_bearing_range, sensor_in
 
-#: Assignments of a scan e^8 times less likely than the best one are not considered.
+#: Difference of −2 ln of likelihoods: an assignment of a scan that is e⁸ = 3000 times
+#: less likely than the best one is not considered.
 BRANCH_SPREAD = 16.0
 
+#: Least variance of a reading, so that S has an inverse.
 TINY = float(np.finfo(np.float64).tiny)
 
-#: Beliefs with the same landmarks are one if no coordinate changes by more σ.
+#: Beliefs with the same landmarks are one if no coordinate changes by more σ: where
+#: both are nearer, the next scans decide alike.
 SAME = 1.0
 
 
@@ -199,7 +202,8 @@ def missing_costs(density: Array) -> Array:
 
 ASSOCIATIONS = ("auto", "nearest", "joint", "compatibility", "hypotheses")
 
-MOST_SCANS = 63  # that fit one mask of a tentative landmark
+#: Scans that fit the bits of one mask of a tentative landmark, an int64 ≥ 0.
+MOST_SCANS = 63
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,12 @@ from .tentative_landmarks import (
 
 NO_LABEL = -1
 
-#: ln of the odds, 20 to 1, beyond which a tentative landmark may enter the map.
+#: ln of the odds beyond which a tentative landmark may enter the map: 20 to 1, a
+#: probability of 95 %.  `benchmarks/association.py` lists the size of the maps.
 ENTRY_ODDS = 3.0
 
-#: A label is the scan of the first sighting, shifted by these bits, plus its row.
+#: A label is the scan of the first sighting, shifted by these bits, plus its row: a
+#: scan has up to a million rows.
 LABEL_BITS = 20
 
 
