@@ -53,7 +53,7 @@ class Worlds(NamedTuple):
     features: tuple[Array, Array, Array, Array, Array]
 
 
-class Rules(NamedTuple):
+class TaskRules(NamedTuple):
     """Constants of the task: `RewardWeights`, and settings of the scenario."""
 
     criterion: int
@@ -89,8 +89,8 @@ def advance(
 
     Of the chosen worlds, those that move take a step. The progress of the others starts
     from nothing, and they have no outcome. Worlds not chosen stay. The arrays come as
-    plain tuples, the entries of `Worlds`, `Floor`, `Rules` and `Scratch`: numba takes
-    microseconds to recognise a NamedTuple.
+    plain tuples, the entries of `Worlds`, `Floor`, `TaskRules` and `Scratch`: numba
+    takes microseconds to recognise a NamedTuple.
     """
     beliefs, actions, collisions, episodes, outcome, counts, of_belief, more = worlds
     now, result = Episodes(*episodes), StepOutcome(*outcome)
@@ -102,13 +102,18 @@ def advance(
     for b in range(len(chosen)):
         if chosen[b]:
             advance_world(
-                b, moving[b], everything, floor, Rules(*rules), Scratch(*scratch)
+                b, moving[b], everything, floor, TaskRules(*rules), Scratch(*scratch)
             )
 
 
 @njit_internal
 def advance_world(
-    b: int, moved: bool, worlds: Worlds, floor: Floor, rules: Rules, scratch: Scratch
+    b: int,
+    moved: bool,
+    worlds: Worlds,
+    floor: Floor,
+    rules: TaskRules,
+    scratch: Scratch,
 ) -> None:
     """Take one world through a step, or begin its episode."""
     means, covariances, slots = worlds.beliefs
@@ -157,7 +162,7 @@ def judge_landmarks(
 
 @njit_allocating
 def map_uncertainty(
-    covariance: Array, mapped: int, landmarks: int, rules: Rules, scratch: Scratch
+    covariance: Array, mapped: int, landmarks: int, rules: TaskRules, scratch: Scratch
 ) -> float:
     """Compute the uncertainty of a map, see `information_reward.uncertainty`."""
     missing, size = landmarks - mapped, 2 * mapped
@@ -175,7 +180,7 @@ def map_uncertainty(
 
 
 @njit_internal
-def reward_step(b: int, gain: float, worlds: Worlds, rules: Rules) -> None:
+def reward_step(b: int, gain: float, worlds: Worlds, rules: TaskRules) -> None:
     """Compute the reward of a step, and whether it ends the episode."""
     crashed, steps = worlds.collisions[b], worlds.episodes.steps[b]
     success = not crashed and worlds.episodes.known[b].all()
@@ -195,7 +200,7 @@ def reward_step(b: int, gain: float, worlds: Worlds, rules: Rules) -> None:
 
 @njit_internal
 def write_shares(
-    b: int, unseen: int, mapped: int, worlds: Worlds, rules: Rules
+    b: int, unseen: int, mapped: int, worlds: Worlds, rules: TaskRules
 ) -> None:
     """Write the shares explored, mapped, known, and of time left, and the counts."""
     shares, episodes = worlds.features[1][b], worlds.episodes

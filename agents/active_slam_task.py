@@ -256,7 +256,7 @@ def _rules(
     scenario: Scenario, weights: RewardWeights, prior_std: tuple[float, float]
 ) -> tuple[Any, ...]:
     robot = scenario.robot
-    return (  # a `Rules`
+    return (  # a `TaskRules`
         list(CRITERIA).index(weights.criterion),
         *map(float, astuple(weights)[1:]),
         (robot.max_speed, robot.max_turn_rate),

@@ -17,7 +17,7 @@ from ..sim_configs import Robot
 from ..sim_configs.scenario import largest_curvature
 
 
-class Drive(Protocol):
+class RobotDrive(Protocol):
     """How a robot executes a command, and what its odometry reports."""
 
     def feasible(self, distance: Any, turn: Any) -> tuple[Any, Any]:
@@ -33,7 +33,7 @@ class Drive(Protocol):
         ...
 
 
-def drive_of(robot: Robot) -> Drive | None:
+def drive_of(robot: Robot) -> RobotDrive | None:
     """Return the drive of a robot, None for a unicycle."""
     match robot.drive:
         case "differential":

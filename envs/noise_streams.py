@@ -15,7 +15,7 @@ import numpy as np
 from ..arrays import Array, IntArray, WordArray
 from ..restorable import Restorable
 from ..sim_configs import Scenario
-from ..sim_configs.scenario import Sensor
+from ..sim_configs.scenario import SensorTable
 from . import random_numbers
 
 Row = TypeVar("Row")
@@ -101,7 +101,7 @@ class SensorSettings(NamedTuple):
     counts_below: Array  # P(at most k false readings), shape (K, C)
 
     @classmethod
-    def of(cls, sensor: Sensor) -> "SensorSettings":
+    def of(cls, sensor: SensorTable) -> "SensorSettings":
         """Return the settings of one world."""
         first, std = sensor.std
         if sensor.kind == "range":

@@ -37,7 +37,7 @@ from ..arrays import Array, BoolArray, ComplexArray, IndexArray, IntArray
 from ..jit import jit_in_place, njit_internal
 from ..restorable import Restorable, State
 from ..sim_configs import Scenario
-from .drives import Drive, drive_of
+from .drives import RobotDrive, drive_of
 
 _NO_SLIP = (0.0, 0.0, 0.0)
 
@@ -56,7 +56,7 @@ class UnicycleBody(Restorable):
         Of the body [m].
     walls : sequence of (x0, y0, x1, y1)
         Ends of straight walls [m].
-    drive : Drive, optional
+    drive : RobotDrive, optional
         How it moves (a unicycle).
 
     Attributes
@@ -74,7 +74,7 @@ class UnicycleBody(Restorable):
     """
 
     def __init__(
-        self, radius: float, walls: Sequence[Wall] = (), drive: Drive | None = None
+        self, radius: float, walls: Sequence[Wall] = (), drive: RobotDrive | None = None
     ) -> None:
         self._radius = radius
         self._walls = tuple(walls)
@@ -321,7 +321,7 @@ class UnicycleBodies(Restorable):
         Of every body [m].
     walls : sequence of (x0, y0, x1, y1)
         Ends of straight walls, the same in every world [m].
-    drive : Drive, optional
+    drive : RobotDrive, optional
         How they move (unicycles).
 
     Attributes
@@ -347,7 +347,7 @@ class UnicycleBodies(Restorable):
         count: int,
         radius: float,
         walls: Sequence[Wall] = (),
-        drive: Drive | None = None,
+        drive: RobotDrive | None = None,
     ) -> None:
         self._drive = drive
         self._contacts = WallContacts(radius, walls)

@@ -82,7 +82,7 @@ class _Gaussian(NamedTuple):
         return self._replace(covariance=P)
 
 
-class _Motion(NamedTuple):
+class _Prediction(NamedTuple):
     """A prediction: P' = G P Gᵀ + F R Fᵀ dt."""
 
     before: _Gaussian
@@ -94,7 +94,7 @@ class _Motion(NamedTuple):
     R: Array  # of the whole step
 
     @classmethod
-    def of(cls, before: _Gaussian, odometry: Array, dt: float) -> _Motion:
+    def of(cls, before: _Gaussian, odometry: Array, dt: float) -> _Prediction:
         R = np.diag(np.square(_MOTION_STD)) * dt
         moved = predict_pose(before.mean[:3], odometry)
         return cls(before, odometry, dt, *moved, R)
@@ -147,7 +147,7 @@ class _Motion(NamedTuple):
         yield from _covariance_changes(self.right(), got)
 
 
-class _Scan(NamedTuple):
+class _ScanUpdate(NamedTuple):
     """An update: readings of landmarks in the map, then of new ones."""
 
     before: _Gaussian
@@ -168,7 +168,7 @@ class _Scan(NamedTuple):
         slots: Sequence[int],
         new: Array,
         heading: float,
-    ) -> _Scan:
+    ) -> _ScanUpdate:
         landmarks = before.mean[3:].reshape(-1, 2)[list(slots)]
         expected, Hp, Hl = predict_measurement(before.mean[:3], landmarks)
         nu = _wrapped(known - expected)
@@ -235,7 +235,7 @@ class _Scan(NamedTuple):
             P = times(I_KH, P)
         return _Gaussian(P, self.before.mean + K @ self.nu.ravel())
 
-    def of_readings(self, rows: Sequence[int]) -> _Scan:
+    def of_readings(self, rows: Sequence[int]) -> _ScanUpdate:
         """Return the scan with some of its readings of known landmarks."""
         slots = tuple(self.slots[k] for k in rows)
         arrays = (self.known, self.nu, self.Hp, self.Hl)
@@ -350,7 +350,7 @@ _ELEMENTWISE = "is an elementwise product (*), which must be a matrix product (@
 _NOT_WRAPPED = "the innovation of the bearing is not wrapped to [-π, π)"
 _FIRST = "it turns before it moves, and must drive d along the old heading, then turn"
 
-_MOTION: Sequence[tuple[str, Callable[[_Motion], _Gaussian]]] = (
+_MOTION: Sequence[tuple[str, Callable[[_Prediction], _Gaussian]]] = (
     ("the call changes nothing", lambda q: q.before),
     ("the odometry is lost, as if d = α = 0", lambda q: q.driving((0.0, 0.0))),
     ("the mean does not move", lambda q: q.right()._replace(mean=q.before.mean)),
@@ -465,7 +465,7 @@ _MOTION: Sequence[tuple[str, Callable[[_Motion], _Gaussian]]] = (
     ),
 )
 
-_ADDITION: Sequence[tuple[str, Callable[[_Scan], _Gaussian]]] = (
+_ADDITION: Sequence[tuple[str, Callable[[_ScanUpdate], _Gaussian]]] = (
     (
         "the position of the robot is not added",
         lambda q: q.extended(q.corrected(), weight=(0, 0, 1)),
@@ -538,7 +538,7 @@ _ADDITION: Sequence[tuple[str, Callable[[_Scan], _Gaussian]]] = (
     ("every reading is used twice", lambda q: q.extended(q.corrected(), Q=q.Q / 2)),
 )
 
-_CORRECTION: Sequence[tuple[str, Callable[[_Scan], _Gaussian]]] = (
+_CORRECTION: Sequence[tuple[str, Callable[[_ScanUpdate], _Gaussian]]] = (
     ("the call changes nothing", lambda q: q.before),
     (
         "the covariance is not updated",
@@ -603,7 +603,7 @@ _CORRECTION: Sequence[tuple[str, Callable[[_Scan], _Gaussian]]] = (
     ),
     (
         "readings are assigned in the order of the map, and not by landmark_ids",
-        lambda q: _Scan.of(
+        lambda q: _ScanUpdate.of(
             q.before, q.known, sorted(q.slots), q.new, q.heading
         ).corrected(),
     ),
@@ -630,7 +630,7 @@ _CORRECTION: Sequence[tuple[str, Callable[[_Scan], _Gaussian]]] = (
             ("heading", slice(2, 3)),
             ("landmarks", slice(3, None)),
         )
-        for form in (_Scan.corrected, _Scan.downdated)
+        for form in (_ScanUpdate.corrected, _ScanUpdate.downdated)
     ),
     *(
         (
@@ -641,14 +641,14 @@ _CORRECTION: Sequence[tuple[str, Callable[[_Scan], _Gaussian]]] = (
                 * (q.jacobian.any(axis=0) | (np.arange(len(q.gain)) < 3))[:, None],
             ),
         )
-        for form in (_Scan.corrected, _Scan.downdated)
+        for form in (_ScanUpdate.corrected, _ScanUpdate.downdated)
     ),
     *(
         (
             "the gain lacks S⁻¹, K = P Hᵀ",
             lambda q, form=form: form(q, q.before.covariance @ q.jacobian.T),
         )
-        for form in (_Scan.corrected, _Scan.downdated)
+        for form in (_ScanUpdate.corrected, _ScanUpdate.downdated)
     ),
     *(
         (
@@ -658,7 +658,7 @@ _CORRECTION: Sequence[tuple[str, Callable[[_Scan], _Gaussian]]] = (
                 q.before.covariance @ q.jacobian.T / q.innovation_covariance.diagonal(),
             ),
         )
-        for form in (_Scan.corrected, _Scan.downdated)
+        for form in (_ScanUpdate.corrected, _ScanUpdate.downdated)
     ),
     *(
         (
@@ -670,7 +670,7 @@ _CORRECTION: Sequence[tuple[str, Callable[[_Scan], _Gaussian]]] = (
             ("twice the sensor noise", 2),
             ("no sensor noise", 0),
         )
-        for form in (_Scan.corrected, _Scan.downdated)
+        for form in (_ScanUpdate.corrected, _ScanUpdate.downdated)
     ),
     ("(I − K H) is multiplied twice", lambda q: q.downdated(n=2)),
     (
@@ -841,7 +841,7 @@ class _Made(NamedTuple):
     """A call of the drive, and the belief after it."""
 
     step: int
-    call: _Motion | _Scan
+    call: _Prediction | _ScanUpdate
     got: _Gaussian
     report: UpdateReport | None
     ids: tuple[int, ...]
@@ -850,7 +850,7 @@ class _Made(NamedTuple):
     def used(self) -> bool:
         """Whether the call is not an empty scan."""
         call = self.call
-        return isinstance(call, _Motion) or bool(call.slots or len(call.new))
+        return isinstance(call, _Prediction) or bool(call.slots or len(call.new))
 
     def wrong_part(self) -> str | None:
         """Return the wrong method, "" if none is, None if the call cannot be judged."""
@@ -862,7 +862,7 @@ class _Made(NamedTuple):
             return ""
         if not _is_proper(self.call.before):
             return None
-        if isinstance(self.call, _Motion):
+        if isinstance(self.call, _Prediction):
             return _PREDICT
         if self.call.nis > _PLAUSIBLE:
             return None
@@ -912,7 +912,7 @@ def _drive(make: Callable[[Mapping[str, Any]], Any]) -> Iterator[_Made]:
         got = _state(slam.belief(), seen)
         if got is None or before is None:
             return
-        yield _Made(step, _Motion.of(before, odometry, dt), got, None, tuple(seen))
+        yield _Made(step, _Prediction.of(before, odometry, dt), got, None, tuple(seen))
         landmarks = np.array([_LANDMARKS[i] for i in ids]).reshape(-1, 2)
         readings = predict_measurement(truth, landmarks).measurement + errors
         known, new = [i for i in ids if i in seen], [i for i in ids if i not in seen]
@@ -923,7 +923,7 @@ def _drive(make: Callable[[Mapping[str, Any]], Any]) -> Iterator[_Made]:
         before, after = _state(slam.belief(), seen), got
         if before is None:
             return
-        call = _Scan.of(after, rows[0], slots, rows[1], float(truth[2]))
+        call = _ScanUpdate.of(after, rows[0], slots, rows[1], float(truth[2]))
         yield _Made(step, call, before, report, tuple(seen))
 
 
@@ -1030,7 +1030,7 @@ def _wrong_nis(made: Sequence[_Made]) -> Iterator[Mistake]:
     for each in made:
         call, report = each.call, each.report
         if (
-            isinstance(call, _Motion)
+            isinstance(call, _Prediction)
             or report is None
             or not call.slots
             or len(call.new)

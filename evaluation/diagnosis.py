@@ -274,7 +274,7 @@ def _checked(nees: ArrayLike, heading_nees: ArrayLike) -> tuple[Array, Array]:
 _SLACK = 2.0
 
 
-def _explains(finding: noise_findings.Finding, errors: Errors) -> bool:
+def _explains(finding: noise_findings.NoiseFinding, errors: Errors) -> bool:
     """Whether a fault of the noise changes the errors in the observed direction."""
     if errors.p_value >= FILTER_RATE:
         return True
@@ -290,7 +290,7 @@ def _exceeds(pose: Array, heading: Array, most: float) -> bool:
     )
 
 
-def _before(findings: list[noise_findings.Finding], errors: Errors) -> str:
+def _before(findings: list[noise_findings.NoiseFinding], errors: Errors) -> str:
     """Write what is known about the noise, which does not explain the errors."""
     if not findings:
         return "the noise is as assumed, but "
@@ -303,8 +303,8 @@ def _before(findings: list[noise_findings.Finding], errors: Errors) -> str:
 
 
 def _of_the_noise(
-    agreeing: list[noise_findings.Finding],
-    guilty: list[noise_findings.Finding],
+    agreeing: list[noise_findings.NoiseFinding],
+    guilty: list[noise_findings.NoiseFinding],
     errors: Errors,
 ) -> Diagnosis:
     """Answer by the largest finding of those that explain the errors."""

@@ -40,7 +40,7 @@ _LEAST_GROWTH = 0.2
 _FEWEST = 30  # numbers, for the distribution of the kurtosis
 
 
-class Finding(NamedTuple):
+class NoiseFinding(NamedTuple):
     """The result of one test on one noise."""
 
     cause: str
@@ -58,7 +58,7 @@ class Finding(NamedTuple):
     at_most: float = np.inf
 
 
-def noise_findings(sums: Array) -> list[Finding]:
+def noise_findings(sums: Array) -> list[NoiseFinding]:
     """Test each noise that has numbers.
 
     ::
@@ -96,7 +96,7 @@ def noise_findings(sums: Array) -> list[Finding]:
     ]
 
 
-def significant_findings(sums: Array, error_rate: float) -> list[Finding]:
+def significant_findings(sums: Array, error_rate: float) -> list[NoiseFinding]:
     """Return what is wrong with the noise, the largest effect first.
 
     The p-values are adjusted for the number of tests.
@@ -108,7 +108,7 @@ def significant_findings(sums: Array, error_rate: float) -> list[Finding]:
     return sorted(guilty, key=lambda f: -f.impact)
 
 
-def _tests(channel: str, total: Array, runs: int) -> Iterator[Finding]:
+def _tests(channel: str, total: Array, runs: int) -> Iterator[NoiseFinding]:
     known = dict(zip(MOMENTS, total.tolist(), strict=False))
     found = dict.fromkeys(MOMENTS, 0.0) | known  # earlier results have no distances
     count = found["count"]
@@ -135,10 +135,10 @@ def _tests(channel: str, total: Array, runs: int) -> Iterator[Finding]:
 
 def _correlation(
     channel: str, found: dict[str, float], mean: float, variance: float
-) -> Finding:
+) -> NoiseFinding:
     pairs = found["pairs"]
     rho = (found["lagged"] / pairs - mean**2) / variance
-    return Finding(
+    return NoiseFinding(
         CORRELATED,
         float(2 * ndtr(-abs(rho) * np.sqrt(pairs))),
         abs(float(np.log((1 + min(rho, 0.99)) / (1 - min(rho, 0.99))))),
@@ -149,7 +149,9 @@ def _correlation(
     )
 
 
-def _growth(channel: str, found: dict[str, float], variance: float) -> Finding | None:
+def _growth(
+    channel: str, found: dict[str, float], variance: float
+) -> NoiseFinding | None:
     """Test whether the variance depends on the distance; None for motion."""
     count, mean = found["count"], found["distance"] / found["count"]
     spread = found["distance²"] / count - mean**2  # of distances
@@ -162,7 +164,7 @@ def _growth(channel: str, found: dict[str, float], variance: float) -> Finding |
     near, far = (max(variance + way * step, 0.0) for way in (-1, 1))
     which = "too small" if max(near, far) > 1 + _LEAST_VARIANCE else "too large"
     where = [f"{mean + way * np.sqrt(spread):.2g} m" for way in (-1, 1)]
-    return Finding(
+    return NoiseFinding(
         f"{channel} noise {which}",
         float(2 * ndtr(-abs(rho) * np.sqrt(count))),
         max(abs(float(np.log(max(x, 1e-12)))) for x in (near, far, variance)),
@@ -173,12 +175,12 @@ def _growth(channel: str, found: dict[str, float], variance: float) -> Finding |
     )
 
 
-def _size(channel: str, count: float, variance: float) -> Finding:
+def _size(channel: str, count: float, variance: float) -> NoiseFinding:
     below = chdtr(count - 1, (count - 1) * variance)
     above = chdtrc(count - 1, (count - 1) * variance)
     which = "too small" if variance > 1 else "too large"
     of = channel if channel in ("bearing", "range") else "motion"
-    return Finding(
+    return NoiseFinding(
         f"{of} noise {which}",
         float(min(1.0, 2 * min(below, above))),
         abs(float(np.log(max(variance, 1e-12)))),
@@ -189,11 +191,13 @@ def _size(channel: str, count: float, variance: float) -> Finding:
     )
 
 
-def _bias(channel: str, found: dict[str, float], variance: float, runs: int) -> Finding:
+def _bias(
+    channel: str, found: dict[str, float], variance: float, runs: int
+) -> NoiseFinding:
     bias = found["slope"] / found["leverage"]
     strength = bias**2 * found["leverage"] / max(variance, 1e-12)
     p_value = 2 * stdtr(found["count"] - 1, -np.sqrt(strength))
-    return Finding(
+    return NoiseFinding(
         _BIASES[channel],
         float(p_value),
         strength / runs / 3,
@@ -218,7 +222,7 @@ def _bias_text(channel: str, bias: float) -> str:
 
 def _size_beside_tails(
     channel: str, count: float, variance: float, kurtosis: float
-) -> Finding:
+) -> NoiseFinding:
     """Test whether tails leave a part of the variance unexplained.
 
     Noise that is large only at times also has tails, but its size counts.  Student
@@ -259,11 +263,13 @@ def _kurtosis(
     return fourth / second**2 / share
 
 
-def _tails(channel: str, count: float, variance: float, kurtosis: float) -> Finding:
+def _tails(
+    channel: str, count: float, variance: float, kurtosis: float
+) -> NoiseFinding:
     """Test the kurtosis; its effect is at most that of Student noise."""
     excess = kurtosis - 3
     most = _student_variance(kurtosis) if excess > 0 else 1.0
-    return Finding(
+    return NoiseFinding(
         HEAVY_TAILS,
         float(2 * ndtr(-abs(_kurtosis_score(kurtosis, count)))),
         max(float(np.log(min(max(variance, 1.0), most))), excess / 10),

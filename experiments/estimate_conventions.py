@@ -36,7 +36,7 @@ _SMALLER = 4.0  # by which errors fall in the right convention
 _TURN = np.diag([1.0, 1.0, np.pi / 180])  # of headings in degrees
 
 
-class Reading(NamedTuple):
+class PosesAsRead(NamedTuple):
     """Poses (B, K, 3) and covariances (B, K, 3, 3) as read in some convention."""
 
     #: What the file has; empty as it was declared.
@@ -50,7 +50,7 @@ class Reading(NamedTuple):
     truth: Array | None = None
 
 
-class _Fit(NamedTuple):
+class _Agreement(NamedTuple):
     """How well a reading agrees with the truth."""
 
     #: Divided by 3; nan for what is no covariance.
@@ -142,7 +142,7 @@ class _Errors(NamedTuple):
 
 def _all_readings(
     truth: Array, poses: Array, claims: Array, starts: Array, errors: _Errors
-) -> tuple[Array, list[list[Reading]]]:
+) -> tuple[Array, list[list[PosesAsRead]]]:
     """Return true poses at some steps, and the readings by those of the poses."""
     last = truth.shape[1] - 1
     reach = min(_SHIFT, (last - 1) // 2)
@@ -225,8 +225,8 @@ def stray_poses(ratios: Array, names: Sequence[object]) -> str:
 
 
 def _honest(
-    truth: Array, readings: Sequence[Reading], before: _Fit
-) -> tuple[Reading, _Fit] | None:
+    truth: Array, readings: Sequence[PosesAsRead], before: _Agreement
+) -> tuple[PosesAsRead, _Agreement] | None:
     """Return the honest reading of the largest likelihood; the first of equal ones."""
     fits = ((reading, _fit(truth, reading)) for reading in readings)
     least = before.likelihood + _GAIN
@@ -234,7 +234,7 @@ def _honest(
     return max(found, key=lambda it: round(it[1].likelihood, 6), default=None)
 
 
-def _gain(truth: Array, reading: Reading, before: _Fit) -> float:
+def _gain(truth: Array, reading: PosesAsRead, before: _Agreement) -> float:
     """Return by how much the errors of poses fall [nats]; 0 if it is not far."""
     fits = before, _fit(truth, reading)
     was, now = (np.log(np.maximum(fit.errors, 1e-9)).sum() for fit in fits)
@@ -242,7 +242,7 @@ def _gain(truth: Array, reading: Reading, before: _Fit) -> float:
     return gain if gain > np.log(_SMALLER) else 0.0
 
 
-def _nearer(truth: Array, readings: Sequence[Reading], before: _Fit) -> str:
+def _nearer(truth: Array, readings: Sequence[PosesAsRead], before: _Agreement) -> str:
     """Name the reading whose errors are far smaller, though not honest."""
     gains = [_gain(truth, reading, before) for reading in readings]
     reading = readings[int(np.argmax(gains))]
@@ -255,7 +255,7 @@ def _nearer(truth: Array, readings: Sequence[Reading], before: _Fit) -> str:
     )
 
 
-def _fit(truth: Array, reading: Reading) -> _Fit:
+def _fit(truth: Array, reading: PosesAsRead) -> _Agreement:
     """Compare a reading with the truth, by its own error of the pose."""
     truth = truth if reading.truth is None else reading.truth
     plain = rigid_motion.additive_error(truth, reading.poses)
@@ -277,12 +277,12 @@ def _fit(truth: Array, reading: Reading) -> _Fit:
     squares = (white**2).mean(axis=1)  # (B, 3): one number per run, and component
     mean = squares.mean(axis=0)
     if not np.isfinite(mean).all() or not mean.all():
-        return _Fit(np.nan, False, -np.inf, middle)
+        return _Agreement(np.nan, False, -np.inf, middle)
     likelihood = -0.5 * float(((white**2).sum(axis=-1) + log_det).mean())
     spread = squares.std(axis=0) / np.sqrt(len(squares)) / mean
     limit = np.minimum(np.log(_NEAR) + _ERRORS * spread, np.log(_FAR))
     is_honest = bool((np.abs(np.log(mean)) <= limit).all())
-    return _Fit(float(mean.mean()), is_honest, likelihood, middle)
+    return _Agreement(float(mean.mean()), is_honest, likelihood, middle)
 
 
 def _whitened(errors: Array, covariances: Array) -> tuple[Array, Array]:
@@ -414,7 +414,7 @@ def _between_steps(
     estimates: tuple[Array, Array],
     reach: int,
     of: _Errors,
-) -> list[list[Reading]]:
+) -> list[list[PosesAsRead]]:
     """Read the estimates at the times between steps that fit their positions best."""
     poses, claims = estimates
     offsets = np.arange(-10 * reach + 1, 10 * reach) / 10
@@ -499,7 +499,7 @@ def _rotations(angles: Array) -> Array:
 
 def _readings(
     name: str, poses: Array, claims: Array, jacobian: Array, of: _Errors
-) -> Iterator[Reading]:
+) -> Iterator[PosesAsRead]:
     """Yield poses with their covariances in all conventions.
 
     As declared first, and where the convention of the poses is another, then those that
@@ -507,10 +507,10 @@ def _readings(
     """
     poses = np.concatenate([poses[..., :2], wrap_angle(poses[..., 2:])], axis=-1)
 
-    def read(what: str, matrices: Array, kind: str = of.frame) -> Reading:
+    def read(what: str, matrices: Array, kind: str = of.frame) -> PosesAsRead:
         whole = f"{name}; {what}" if name and what else name or what
         claimed = additive_covariances(poses, matrices, kind)
-        return Reading(whole, poses, claimed, kind == of.decides == "additive")
+        return PosesAsRead(whole, poses, claimed, kind == of.decides == "additive")
 
     yield read("", claims)
     if name:

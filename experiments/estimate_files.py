@@ -23,7 +23,7 @@ from .trajectories.trajectory import BELIEFS, Trajectory, array_of
 T = TypeVar("T")
 
 
-class Estimate(NamedTuple):
+class DriveEstimate(NamedTuple):
     """The estimates of one drive, as in their file."""
 
     file: str
@@ -43,7 +43,7 @@ class Estimate(NamedTuple):
     #: those of a plane.
     is_spatial: bool = False
 
-    def at(self, rows: IntArray) -> "Estimate":
+    def at(self, rows: IntArray) -> "DriveEstimate":
         """Return the same file with some of its poses only."""
         times = None if self.times is None else self.times[rows]
         poses, covariances = self.poses[rows], self.covariances[rows]
@@ -116,7 +116,7 @@ _CLIMB = 0.05  # and tilt: beyond it, a path is not planar
 _POSE_SIZES, _TUM_SIZES = (6, 9), (6, 9, 21, 36)
 
 
-def read_estimates(paths: Sequence[Path]) -> dict[Any, Estimate]:
+def read_estimates(paths: Sequence[Path]) -> dict[Any, DriveEstimate]:
     """Read the files of an estimator; a folder stands for the files in it.
 
     Parameters
@@ -135,7 +135,7 @@ def read_estimates(paths: Sequence[Path]) -> dict[Any, Estimate]:
     ValueError
         If a file is malformed, or two belong to one drive.
     """
-    found: dict[Any, Estimate] = {}
+    found: dict[Any, DriveEstimate] = {}
     for path in paths:
         for name, estimate in _each_estimate(path):
             if name in found:
@@ -151,7 +151,7 @@ def read_estimates(paths: Sequence[Path]) -> dict[Any, Estimate]:
     return found
 
 
-def _each_estimate(path: Path) -> Iterator[tuple[Any, Estimate]]:
+def _each_estimate(path: Path) -> Iterator[tuple[Any, DriveEstimate]]:
     if (path / MANIFEST).is_file():
         for drive in load_trajectories(path):
             yield drive.seed, beliefs_of(drive, str(path))
@@ -239,7 +239,7 @@ def _keys(names: Sequence[Any]) -> list[tuple[str, ...]]:
     return [tuple(part for part in each if part not in common) for each in plain]
 
 
-def beliefs_of(drive: Trajectory, file: str) -> Estimate:
+def beliefs_of(drive: Trajectory, file: str) -> DriveEstimate:
     """Return the beliefs that are in a data set beside the truth."""
     if drive.belief_poses is None:
         raise ValueError(
@@ -252,7 +252,7 @@ def beliefs_of(drive: Trajectory, file: str) -> Estimate:
 
 def _of_arrays(
     file: str, arrays: Mapping[str, AnyArray], is_named: bool = True
-) -> Estimate:
+) -> DriveEstimate:
     """Return the estimates in arrays of one drive, with the names of a data set."""
     poses, claims = (np.asarray(arrays[name], np.float64) for name in BELIEFS[:2])
     if poses.ndim != 2 or claims.shape != (*poses.shape, 3) or poses.shape[1] != 3:
@@ -260,7 +260,7 @@ def _of_arrays(
             f"{file}: {BELIEFS[0]} must be (T, 3) and {BELIEFS[1]} (T, 3, 3) for each "
             f"drive, got {poses.shape} and {claims.shape}"
         )
-    estimate = Estimate(file, poses, claims)
+    estimate = DriveEstimate(file, poses, claims)
     if not is_named or not set(BELIEFS) <= set(arrays):
         return estimate
     places, their, ids = (np.asarray(arrays[name])[-1] for name in BELIEFS[2:])
@@ -272,7 +272,7 @@ def _of_arrays(
     )
 
 
-def _of_npz(file: Path) -> Iterator[tuple[Any, Estimate]]:
+def _of_npz(file: Path) -> Iterator[tuple[Any, DriveEstimate]]:
     """Yield the drives of an npz: one, or those of its array seed."""
     try:
         with file.open("rb") as stream, np.load(stream) as archive:
@@ -302,7 +302,7 @@ def content_lines(path: Path) -> list[LogLine]:
     return [line for line in read_lines(path) if not line.text.startswith("#")]
 
 
-def _of_csv(path: Path) -> Estimate:
+def _of_csv(path: Path) -> DriveEstimate:
     poses: list[list[float]] = []
     places: dict[int, list[float]] = {}
     for line in content_lines(path):
@@ -320,7 +320,7 @@ def _of_csv(path: Path) -> Estimate:
             raise line.error(_CSV, repr(kind))
     table = _even(path, poses, _CSV)
     of_map = _even(path, list(places.values()), _CSV) if places else np.zeros((0, 5))
-    return Estimate(
+    return DriveEstimate(
         str(path),
         table[:, 1:4],
         square(table[:, 4:], 3),
@@ -352,7 +352,7 @@ def tum_table(path: Path) -> tuple[Array, list[LogLine]]:
     return _even(path, rows, _TUM), lines
 
 
-def _of_tum(path: Path) -> Estimate:
+def _of_tum(path: Path) -> DriveEstimate:
     table, lines = tum_table(path)
     headings = planar_headings(table[:, 4:8], lines)
     entries = table[:, 8:]
@@ -369,7 +369,7 @@ def _of_tum(path: Path) -> Estimate:
         is_spatial &= _leaves_its_plane(table[:, 1:8])
         entries = whole[:, [0, 1, 5]][:, :, [0, 1, 5]].reshape(-1, 9)
     poses = np.column_stack([table[:, 1:3], headings])
-    return Estimate(
+    return DriveEstimate(
         str(path),
         poses,
         square(entries, 3),

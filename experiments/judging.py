@@ -29,7 +29,7 @@ from ..evaluation.trajectory_error import Alignment, align_positions, poses_at
 from ..sim_configs.scenario_files import scenario_text
 from . import estimate_conventions
 from .estimate_files import (
-    Estimate,
+    DriveEstimate,
     beliefs_of,
     files_in,
     growing_rows,
@@ -187,7 +187,7 @@ class _Chunk(NamedTuple):
 
     runs: SimulatedRuns
     #: By label; the reason where there is none.
-    estimates: dict[str, list[Estimate | str]]
+    estimates: dict[str, list[DriveEstimate | str]]
     bound: PosteriorBound
     noise: Array
     #: Seconds of a step.
@@ -242,7 +242,7 @@ def _drives(place: Place | None, sources: dict[str, list[Path]]) -> _Task:
         for shard in data.manifest.shards
         for k in range(shard.episodes)
     ]
-    found: dict[str, dict[Any, Estimate] | None] = {}
+    found: dict[str, dict[Any, DriveEstimate] | None] = {}
     for label, paths in sources.items():
         is_own = [path.resolve() for path in paths] == [folder.resolve()]
         found[label] = files = None if is_own else read_estimates(paths)
@@ -262,12 +262,12 @@ def _drives(place: Place | None, sources: dict[str, list[Path]]) -> _Task:
 
 
 def _chunks(
-    data: TrajectoryDataset, found: Mapping[str, Mapping[Any, Estimate] | None]
+    data: TrajectoryDataset, found: Mapping[str, Mapping[Any, DriveEstimate] | None]
 ) -> Iterator[_Chunk]:
     """Yield some drives at a time; None stands for the beliefs that are in the data."""
     drives = iter(data)
     while some := list(islice(drives, _AT_ONCE)):
-        files: dict[str, list[Estimate | str]] = {
+        files: dict[str, list[DriveEstimate | str]] = {
             label: [
                 beliefs_of(drive, str(data.folder))
                 if each is None
@@ -281,7 +281,9 @@ def _chunks(
         noise = np.concatenate([noise_of_runs(s, s, same) for s, same in alike])
         bound = _NO_BOUND
         given = (each for listed in files.values() for each in listed)
-        if any(isinstance(each, Estimate) and len(each.landmark_ids) for each in given):
+        if any(
+            isinstance(each, DriveEstimate) and len(each.landmark_ids) for each in given
+        ):
             bounds = [bound_runs(scenario, same)[:4] for scenario, same in alike]
             joined = (np.concatenate(each) for each in zip(*bounds, strict=True))
             position, heading, raw, of_map = joined
@@ -352,7 +354,7 @@ def _paths(truth: Place | Sequence[Place], sources: dict[str, list[Path]]) -> _T
 
     def chunks() -> Iterator[_Chunk]:
         for label in found:
-            files: list[Estimate | str] = []
+            files: list[DriveEstimate | str] = []
             poses = np.full((len(names), count, 3), np.nan)
             clocks = []
             for row, name in enumerate(names):
@@ -394,7 +396,7 @@ def _truth_at(
 class _Inside(NamedTuple):
     """The estimates of a file that have a truth, and the truth there."""
 
-    estimate: Estimate
+    estimate: DriveEstimate
     truth: Array
     #: Shape (T,) [s].
     times: Array
@@ -406,7 +408,7 @@ class _Inside(NamedTuple):
     is_coarse: bool = False
 
 
-def _within(estimate: Estimate, path: Array) -> _Inside:
+def _within(estimate: DriveEstimate, path: Array) -> _Inside:
     """Return the estimates at times of a true path (n, 4), and the truth there.
 
     A pose in a gap of the truth has none, because no interpolation is valid there.
@@ -508,7 +510,7 @@ def _notes(found: Iterable[_Inside]) -> tuple[str, ...]:
 
 
 def _measured(
-    chunk: _Chunk, files: Sequence[Estimate | str], frame: str, align: Any
+    chunk: _Chunk, files: Sequence[DriveEstimate | str], frame: str, align: Any
 ) -> _Part:
     """Measure the estimates of one estimator on the drives of a chunk."""
     truth = chunk.runs.true_poses
@@ -544,7 +546,7 @@ def _measured(
     return _Part(block, arrays, chunk.truth_at)
 
 
-def _unmatched(estimate: Estimate, steps: int, dt: float) -> str:
+def _unmatched(estimate: DriveEstimate, steps: int, dt: float) -> str:
     """Return why the poses of a file are not those of a drive; empty if they are."""
     count = len(estimate.poses)
     if estimate.times is None:
@@ -631,7 +633,7 @@ def _add_map(
     block: Block,
     run: int,
     runs: SimulatedRuns,
-    estimate: Estimate,
+    estimate: DriveEstimate,
     pose: Array,
     heading_variance: float,
 ) -> str:

@@ -69,7 +69,7 @@ _DEGREE = np.pi / 180
 _DURATIONS = (0.5, 0.25, 0.2, 0.1, 0.05, 0.04, 1 / 30, 0.02, 0.01)
 
 
-class Mistake(NamedTuple):
+class WrongConvention(NamedTuple):
     """A convention of a log other than the documented one, and its remedy."""
 
     #: What the log has, as a sentence without an end.
@@ -106,7 +106,7 @@ class Mistake(NamedTuple):
         )
 
 
-class Reading(NamedTuple):
+class LogAsRead(NamedTuple):
     """A part of a log, as read in some convention."""
 
     #: Rows (d, α, dt) of odometry, (K, 3), and the step of each, (K,).
@@ -128,7 +128,9 @@ class Reading(NamedTuple):
     moved: int = 0
 
 
-def mistake_in(log: slamlog.SlamLog, settings: FilterSettings) -> Mistake | None:
+def mistake_in(
+    log: slamlog.SlamLog, settings: FilterSettings
+) -> WrongConvention | None:
     """Return the convention that a log breaks, or None if it is not known.
 
     The log is compared by the likelihood of its readings, each with the best of several
@@ -180,7 +182,7 @@ def explaining(log: slamlog.SlamLog, settings: FilterSettings) -> Iterator[None]
         raise np.linalg.LinAlgError(f"{error}. {mistake}") from error
 
 
-def part_of(log: slamlog.SlamLog) -> Reading | None:
+def part_of(log: slamlog.SlamLog) -> LogAsRead | None:
     """Return the part of a log that is read in other conventions, as it is given.
 
     The part ends before the first scan that shows none of its landmarks. Landmarks
@@ -215,7 +217,7 @@ def part_of(log: slamlog.SlamLog) -> Reading | None:
         True
     )
     ids = np.concatenate([scan.landmark_ids for scan in scans])
-    return Reading(
+    return LogAsRead(
         np.array(rows, dtype=np.float64).reshape(-1, 3),
         np.array(row_steps, dtype=np.int64),
         np.concatenate([scan.measurements for scan in scans]),
@@ -229,14 +231,14 @@ def part_of(log: slamlog.SlamLog) -> Reading | None:
     )
 
 
-def unbroken(given: Reading) -> Reading:
+def unbroken(given: LogAsRead) -> LogAsRead:
     """Return a part of a log with its first readings, without gaps between them."""
     read = np.flatnonzero(given.landmarks != _UNREAD)[:_MANY]
     last = given.steps[read[-1]]
     return given._replace(is_read=np.arange(len(given.is_read)) <= last)
 
 
-def events_of(reading: Reading) -> DriveEvents:
+def events_of(reading: LogAsRead) -> DriveEvents:
     """Return the input of a filter for a part of a log."""
     d, alpha, dt = reading.rows.T
     zero = np.zeros_like(d)
@@ -256,7 +258,7 @@ def events_of(reading: Reading) -> DriveEvents:
     )
 
 
-def is_used(reading: Reading) -> BoolArray:
+def is_used(reading: LogAsRead) -> BoolArray:
     """Return which measurements are read, each landmark once in a scan, (M,)."""
     steps = reading.steps
     used = (steps >= 0) & (steps < len(reading.is_read))
@@ -272,7 +274,7 @@ def is_used(reading: Reading) -> BoolArray:
 # How well readings and odometry agree.
 
 
-class _Fit(NamedTuple):
+class _LogFit(NamedTuple):
     """How well a part of a log agrees with itself under several noises."""
 
     #: Mean log likelihood of a reading under each noise.
@@ -301,15 +303,15 @@ class _Comparison:
 
     log: slamlog.SlamLog
     settings: FilterSettings
-    given: Reading
+    given: LogAsRead
 
-    def mistake(self) -> Mistake | None:
+    def mistake(self) -> WrongConvention | None:
         """Return the mistake that explains the log, or None."""
         before = self.fit(self.given, _FACTORS)
         found = self.plain_mistake(before) if _is_far_off(before) else None
         return found or self.hidden_mistake(_FACTORS[before.best])
 
-    def plain_mistake(self, before: _Fit) -> Mistake | None:
+    def plain_mistake(self, before: _LogFit) -> WrongConvention | None:
         """Return the mistake that explains a log whose NIS is far off."""
         screened = [(self.fit(it.reading, _FEW).most, it) for it in others(self.given)]
         screened.sort(key=lambda pair: -pair[0])
@@ -325,7 +327,7 @@ class _Comparison:
             return None
         return _named(near, before, _FACTORS[k])
 
-    def hidden_mistake(self, factors: Array) -> Mistake | None:
+    def hidden_mistake(self, factors: Array) -> WrongConvention | None:
         """Return a mistake that the noise hides from NIS, but the log likelihood shows.
 
         Two conventions are compared on each piece of a longer part. Both use the noise
@@ -353,14 +355,14 @@ class _Comparison:
             return None
         return _named(near, before, factors)
 
-    def is_better(self, after: _Fit, before: _Fit) -> bool:
+    def is_better(self, after: _LogFit, before: _LogFit) -> bool:
         """Return whether the log likelihood rises far enough, and nearly everywhere."""
         errors, share = _rise(after, before)
         least = max(_RISE, _TOTAL / is_used(self.given).sum())
         is_far = after.most - before.most >= least and errors >= _ERRORS
         return is_far and share >= _MOST
 
-    def fit(self, reading: Reading, factors: Array) -> _Fit:
+    def fit(self, reading: LogAsRead, factors: Array) -> _LogFit:
         """Compare the readings with the odometry, under multiples of the noise."""
         events = events_of(reading)
         record = drive_likelihood(self.filter, events, self.noises(factors))
@@ -369,7 +371,7 @@ class _Comparison:
         lost = np.maximum(count - used, record.rejected)
         skipped = lost - record.rejected
         total = record.log_likelihoods.sum(axis=1) - _SKIPPED * skipped
-        return _Fit(
+        return _LogFit(
             np.where(np.isnan(total), -np.inf, total / count + reading.log_volume),
             (record.nis.sum(axis=1) + GATE * lost) / (2 * count),
             lost / count,
@@ -394,7 +396,9 @@ class _Comparison:
             factors, (search.BEARING, len(noise) - search.BEARING), axis=1
         )
 
-    def told_apart(self, near: list[tuple[_Fit, Other]]) -> list[tuple[_Fit, Other]]:
+    def told_apart(
+        self, near: list[tuple[_LogFit, Other]]
+    ) -> list[tuple[_LogFit, Other]]:
         """Return the mistakes that agree with the truth, where it is known.
 
         A log with clockwise bearings is the mirror image of one with clockwise turns.
@@ -409,7 +413,7 @@ class _Comparison:
             if not error > _NEARER * least
         ]
 
-    def error(self, reading: Reading, factors: Array) -> float:
+    def error(self, reading: LogAsRead, factors: Array) -> float:
         """Return the aligned error of landmarks, or path [m]; nan if not known."""
         events = events_of(reading)
         record = drive_likelihood(
@@ -436,11 +440,13 @@ class _Comparison:
         return position_accuracy(estimate[finite], true[finite]).aligned_rmse
 
 
-def _named(found: list[tuple[_Fit, Other]], before: _Fit, factors: Array) -> Mistake:
+def _named(
+    found: list[tuple[_LogFit, Other]], before: _LogFit, factors: Array
+) -> WrongConvention:
     """Combine mistakes that have the same effect into one."""
     after = found[0][0]
     k = after.best
-    return Mistake(
+    return WrongConvention(
         " or ".join(it.name for _, it in found),
         ", or ".join(it.remedy for _, it in found),
         after.most - before.most,
@@ -450,7 +456,7 @@ def _named(found: list[tuple[_Fit, Other]], before: _Fit, factors: Array) -> Mis
     )
 
 
-def _rise(after: _Fit, before: _Fit) -> tuple[float, float]:
+def _rise(after: _LogFit, before: _LogFit) -> tuple[float, float]:
     """Return the rise of the log likelihood over the pieces of a log.
 
     Returns
@@ -472,7 +478,7 @@ def _rise(after: _Fit, before: _Fit) -> tuple[float, float]:
     return float(rises.sum()) / error if error else 0.0, share
 
 
-def _is_far_off(fit: _Fit) -> bool:
+def _is_far_off(fit: _LogFit) -> bool:
     """Return whether a log as given disagrees with its noise."""
     at = int(np.flatnonzero((_FACTORS == 1).all(axis=1))[0])
     low, high = _USUAL
@@ -490,20 +496,20 @@ class Other(NamedTuple):
     #: What the log has, where this is the right one.
     name: str
     remedy: str
-    reading: Reading
+    reading: LogAsRead
 
 
-def others(given: Reading) -> Iterator[Other]:
+def others(given: LogAsRead) -> Iterator[Other]:
     """Yield a part of a log as read in the conventions that are often confused."""
     yield from _of_measurements(given)
     yield from _of_odometry(given)
     yield from _shifted(given)
 
 
-def _of_measurements(given: Reading) -> Iterator[Other]:
+def _of_measurements(given: LogAsRead) -> Iterator[Other]:
     bearing, distance = given.measurements.T
 
-    def read(b: Array, r: Array = distance, volume: float = 1.0) -> Reading:
+    def read(b: Array, r: Array = distance, volume: float = 1.0) -> LogAsRead:
         measured = np.column_stack([wrap_angle(b), r])
         return given._replace(measurements=measured, log_volume=float(np.log(volume)))
 
@@ -558,7 +564,7 @@ def _of_measurements(given: Reading) -> Iterator[Other]:
         yield Other(f"the distances driven are in {unit}", remedy, driven)
 
 
-def _headings(given: Reading) -> Array:
+def _headings(given: LogAsRead) -> Array:
     """Return the heading after each step, by the odometry alone."""
     turned = np.concatenate([[0.0], np.cumsum(given.rows[:, 1])])
     ends = np.searchsorted(given.row_steps, np.arange(len(given.is_read)), "right")
@@ -575,10 +581,10 @@ _MOTIONS = {
 }
 
 
-def _of_odometry(given: Reading) -> Iterator[Other]:
+def _of_odometry(given: LogAsRead) -> Iterator[Other]:
     d, alpha, dt = given.rows.T
 
-    def read(distance: Array = d, turn: Array = alpha) -> Reading:
+    def read(distance: Array = d, turn: Array = alpha) -> LogAsRead:
         return given._replace(rows=np.column_stack([distance, turn, dt]))
 
     name = "the turns of the odometry are clockwise"
@@ -610,7 +616,7 @@ def _of_odometry(given: Reading) -> Iterator[Other]:
     yield Other(name, "exchange the two rows", given._replace(rows=swapped))
 
 
-def _of_motion(given: Reading) -> Iterator[Other]:
+def _of_motion(given: LogAsRead) -> Iterator[Other]:
     """Yield a part of a log with turns at other places of its rows.
 
     Rows that turn alone state the order of turn and drive themselves.
@@ -623,7 +629,7 @@ def _of_motion(given: Reading) -> Iterator[Other]:
             yield Other(name, remedy, given._replace(motion=motion))
 
 
-def _shifted(given: Reading) -> Iterator[Other]:
+def _shifted(given: LogAsRead) -> Iterator[Other]:
     """Yield a part of a log with the ids, or the scans, of the rows beside them."""
     early, late = slice(None, -1), slice(1, None)
     for word, back, of, to in (
@@ -640,7 +646,7 @@ def _shifted(given: Reading) -> Iterator[Other]:
     yield from _moved(given)
 
 
-def _moved(given: Reading) -> Iterator[Other]:
+def _moved(given: LogAsRead) -> Iterator[Other]:
     """Yield a part of a log, with its scans one row of odometry earlier or later."""
     for word, back, by in (("late", "up", -1), ("early", "down", 1)):
         moved = given._replace(
@@ -650,7 +656,7 @@ def _moved(given: Reading) -> Iterator[Other]:
         yield Other(name, f"move the scans one row of odometry {back}", moved)
 
 
-def hidden(given: Reading) -> Iterator[Other]:
+def hidden(given: LogAsRead) -> Iterator[Other]:
     """Yield a part of a log in the conventions that large noise hides."""
     yield from _of_motion(given)
     yield from _moved(given)

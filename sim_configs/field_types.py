@@ -28,7 +28,7 @@ from ..arrays import LARGEST, SMALLEST
 from ..suggestions import closest
 
 
-class Part(BaseModel):
+class ScenarioTable(BaseModel):
     """A frozen table of a scenario that refuses unknown keys with a suggestion."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -61,7 +61,7 @@ class Part(BaseModel):
         """Name the first setting that differs in another table, with both values."""
         for name, value in self:
             if (found := getattr(other, name, None)) != value:
-                if isinstance(found, Part) and type(value) is type(found):
+                if isinstance(found, ScenarioTable) and type(value) is type(found):
                     return f"{name}.{value.difference(found)}"
                 return f"{name} must be {short_repr(value)}, got {short_repr(found)}"
         return ""

@@ -17,10 +17,10 @@ from .field_types import (
     Command,
     Count,
     NotNegative,
-    Part,
     Point,
     Positive,
     ScenarioError,
+    ScenarioTable,
     Seed,
     broken_rule,
     setting,
@@ -30,7 +30,7 @@ TRIES_PER_LANDMARK = 2000
 _LONGEST_CYCLE = 1_000_000  # steps; a typing error must not fill the memory
 
 
-class _Layout(Part):
+class _Layout(ScenarioTable):
     @property
     def is_redrawn(self) -> bool:
         """Whether every episode draws new positions."""
@@ -263,7 +263,7 @@ def possible_positions(layout: LandmarkLayout) -> Array:
 # one row per step, shape (K, 2).
 
 
-class CommandSequence(Part):
+class CommandSequence(ScenarioTable):
     """A list of commands, each repeated a number of times."""
 
     sequence: Literal["commands"] = "commands"
@@ -278,7 +278,7 @@ class CommandSequence(Part):
         return np.repeat([command[:2] for command in self.commands], times, axis=0)
 
 
-class SquareSequence(Part):
+class SquareSequence(ScenarioTable):
     """A counter-clockwise square: four sides, each followed by a quarter turn."""
 
     sequence: Literal["square"] = "square"
@@ -302,7 +302,7 @@ class SquareSequence(Part):
         return np.tile(np.concatenate([straight, turn]), (4, 1))
 
 
-class CircleSequence(Part):
+class CircleSequence(ScenarioTable):
     """A counter-clockwise circle, approximated by an inscribed regular polygon."""
 
     sequence: Literal["circle"] = "circle"
@@ -314,7 +314,7 @@ class CircleSequence(Part):
         return _circle(self.radius, self.speed * dt)
 
 
-class FigureEightSequence(Part):
+class FigureEightSequence(ScenarioTable):
     """Two circles that touch at the start: counter-clockwise, then clockwise."""
 
     sequence: Literal["figure_eight"] = "figure_eight"
@@ -327,7 +327,7 @@ class FigureEightSequence(Part):
         return np.concatenate([left, left * (1.0, -1.0)])
 
 
-class SpiralSequence(Part):
+class SpiralSequence(ScenarioTable):
     """A counter-clockwise spiral; its radius grows linearly with the angle turned."""
 
     sequence: Literal["spiral"] = "spiral"
@@ -355,7 +355,7 @@ class SpiralSequence(Part):
         return np.column_stack([np.full(len(turns), distance), turns])
 
 
-class BlocksSequence(Part):
+class BlocksSequence(ScenarioTable):
     """A drive around every block of a city, row by row, alternately east and west.
 
     The robot follows the four sides of a block back to their start, then drives to

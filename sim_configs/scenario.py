@@ -1,6 +1,6 @@
 """The complete description of a simulated world, as one immutable value: `Scenario`.
 
-Its tables stand above it: `Faults`, `Motion`, `Sensor`, `Start`, `Robot`, and
+Its tables stand above it: `Faults`, `MotionTable`, `SensorTable`, `Start`, `Robot`, and
 `Randomise`, the ranges from which every episode may draw a world of its own. Noise is
 multiplied by factors that are uniform in their logarithm. All other settings are
 uniform between two ends. The number of landmarks never changes.
@@ -28,7 +28,6 @@ from .field_types import (
     Name,
     NotNegative,
     Number,
-    Part,
     Point,
     Pose,
     PoseStd,
@@ -36,6 +35,7 @@ from .field_types import (
     PositiveOrInfinite,
     Probability,
     ScenarioError,
+    ScenarioTable,
     Text,
     UnknownKeywordError,
     Wall,
@@ -58,7 +58,7 @@ _Degrees = Annotated[
 ]
 
 
-class Faults(Part):
+class Faults(ScenarioTable):
     """Deviations of the world from its other tables; no filter knows of them.
 
     A scenario without this table has no faults. No other setting changes, so filters
@@ -91,7 +91,7 @@ _NO_FAULTS = Faults()
 _Steps = Annotated[Integer, Field(ge=2), expect("an integer >= 2")]
 
 
-class Motion(Part):
+class MotionTable(ScenarioTable):
     """The noise of the motion.
 
     With ``noise_in = "motion"`` the robot slips and the odometry reports the command.
@@ -131,7 +131,7 @@ _RangeGrowth = Annotated[
 ]
 
 
-class Sensor(Part):
+class SensorTable(ScenarioTable):
     """The sensor: what it reads, its noise, its field of view and its failures.
 
     A sensor of one number has (σ, 0) as its `std`, and 0 as the second number of its
@@ -203,21 +203,21 @@ class Sensor(Part):
 _Every = Annotated[Integer, Field(ge=1), expect("an integer >= 1")]
 
 
-class Compass(Part):
+class Compass(ScenarioTable):
     """A sensor of the heading, beside that of the landmarks."""
 
     std: Positive = Field(description="σθ of one reading [rad]")
     every: _Every = setting(1, "steps from one reading to the next, from step 0 on")
 
 
-class Gps(Part):
+class Gps(ScenarioTable):
     """A sensor of the position, beside that of the landmarks."""
 
     std: Positive = Field(description="σ of one reading, along x and along y [m]")
     every: _Every = setting(1, "steps from one reading to the next, from step 0 on")
 
 
-class Start(Part):
+class Start(ScenarioTable):
     """The start pose of the robot and its uncertainty.
 
     With ``drawn = "truth"`` the true start is drawn around `pose` and a filter starts
@@ -234,7 +234,7 @@ class Start(Part):
     )
 
 
-class Randomise(Part):
+class Randomise(ScenarioTable):
     """The settings that differ from episode to episode, and their ranges.
 
     A setting without a range keeps its value. `drawn_scenario` draws the scenario of
@@ -315,7 +315,7 @@ _OF_DRIVE = {
 }
 
 
-class Robot(Part):
+class Robot(ScenarioTable):
     """The body of the robot and the limits of its actions."""
 
     radius: Positive = setting(0.2, "radius of the round body [m]")
@@ -349,7 +349,7 @@ class Robot(Part):
                 yield f"{name} must not be given with drive = '{self.drive}'"
 
 
-class Scenario(Part):
+class Scenario(ScenarioTable):
     """A robot, its sensor, the landmarks and walls around it, and its controls.
 
     A scenario is a value: frozen, comparable and hashable. `load_scenario` reads one,
@@ -369,8 +369,8 @@ class Scenario(Part):
     steps: _Steps = setting(500, "steps of an episode")
     start: Start = setting(Start(), "start pose of the robot")
     robot: Robot = setting(Robot(), "body and limits of the robot")
-    motion: Motion = Field(description="noise of the motion")
-    sensor: Sensor = Field(description="sensor of the landmarks")
+    motion: MotionTable = Field(description="noise of the motion")
+    sensor: SensorTable = Field(description="sensor of the landmarks")
     compass: Compass | None = setting(None, "sensor of the heading")
     gps: Gps | None = setting(None, "sensor of the position")
     landmarks: LandmarkLayout = Field(description="positions of the landmarks")
@@ -633,7 +633,7 @@ def _is_foreign(change: Mapping[str, object], old: Mapping[str, object]) -> bool
 
 def _plain(value: Any) -> Any:
     """Replace arrays, models and other mappings by lists and dicts."""
-    if isinstance(value, Part):
+    if isinstance(value, ScenarioTable):
         return value.model_dump()
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
@@ -671,7 +671,7 @@ def _scaled(points: Array, factor: float) -> Array:
     return scaled
 
 
-def _sensor_changes(sensor: Sensor, drawn: dict[str, float]) -> dict[str, Any]:
+def _sensor_changes(sensor: SensorTable, drawn: dict[str, float]) -> dict[str, Any]:
     names = ("dropout", "clutter", "max_range", "field_of_view")
     changes: dict[str, Any] = {name: drawn[name] for name in names if name in drawn}
     factor = drawn.get("measurement_std", 1.0)

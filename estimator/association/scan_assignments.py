@@ -319,7 +319,7 @@ def with_readings(view: MapView, readings: Array, noise: Noise) -> MapView:
     return MapView(mean, P, range(len(view.ids) + m))
 
 
-class Sensor(NamedTuple):
+class AssociationSensor(NamedTuple):
     """The properties of the sensor that association uses."""
 
     noise: Noise
@@ -327,7 +327,9 @@ class Sensor(NamedTuple):
     min_range: float
 
     @classmethod
-    def checked(cls, measurement_std: ArrayLike, options: Mapping[str, Any]) -> Sensor:
+    def checked(
+        cls, measurement_std: ArrayLike, options: Mapping[str, Any]
+    ) -> AssociationSensor:
         """Read a sensor from the arguments of a filter, which has checked them."""
         sensor = sensor_in(options)
         if options.get("landmark_init") == DELAYED:

@@ -21,8 +21,8 @@ from .scan_assignments import (
     AMBIGUOUS,
     NEW,
     AssociationPolicy,
+    AssociationSensor,
     Noise,
-    Sensor,
     assign_scan,
     innovation_distances,
 )
@@ -267,7 +267,7 @@ def associate(
     candidates: Candidates,
     readings: Array,
     view: MapView,
-    sensor: Sensor,
+    sensor: AssociationSensor,
     ceiling: float = np.inf,
 ) -> list[Option]:
     """Associate readings (m, 2) that have no identity, in every way to consider.

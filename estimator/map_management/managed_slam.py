@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ..association.missed_landmarks import LOST_SCORE
-from ..association.scan_assignments import Sensor
+from ..association.scan_assignments import AssociationSensor
 from ..association.scan_association import (
     Candidates,
     Option,
@@ -168,7 +168,7 @@ class ManagedSlam(ManagedFilter):
         self._policy = as_policy(management)
         noise = {"motion_std": motion_std, "measurement_std": measurement_std}
         self._filter = estimator(**noise, **options)
-        self._sensor = Sensor.checked(measurement_std, options)
+        self._sensor = AssociationSensor.checked(measurement_std, options)
         motion = options.get("motion", UNICYCLE)
         at_rest = options.get("noise_at_rest", True)
         self._motion_noise = MotionNoise.checked(motion_std, at_rest, motion)

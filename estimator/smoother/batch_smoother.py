@@ -27,8 +27,8 @@ from .elimination import conditionals
 from .optimiser import (
     KINDS,
     Estimate,
-    Noise,
     Optimiser,
+    ReadingNoise,
     Solution,
     factorised,
     filter_drive,
@@ -127,7 +127,7 @@ def smooth(
     if not drive.sensor.places:
         drive, start, given = _placed(drive, start, given)
     arrays, order = drive.arrays()
-    optimiser = Optimiser(arrays, Noise(drive.sensor, drive.rules, *kernel))
+    optimiser = Optimiser(arrays, ReadingNoise(drive.sensor, drive.rules, *kernel))
     starts = _starts(drive, start, _places(given, order), order)
     found = _best(optimiser, starts, tolerance, iterations)
     return SmoothedDrive(optimiser, found, order.tolist(), drive, origin)

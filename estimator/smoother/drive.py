@@ -19,13 +19,12 @@ from ..filters.pose_readings import PoseReading
 from ..guards import argument_checks
 from ..kernels.kalman_gain import AT_ESTIMATE
 from ..models.bearing_range import wrap_angle
-from ..models.motions import UNICYCLE, MotionNoise
-from ..models.motions import Motion as DriveMotion
+from ..models.motions import UNICYCLE, Motion, MotionNoise
 from ..models.rigid_motion import pose_rotation, predict
 from ..models.sensors import Sensor, find_sensor
 
 
-class Motion(NamedTuple):
+class OdometryBetween(NamedTuple):
     """The odometry between two poses."""
 
     # (d, α, dt) of each reading [m, rad, -].
@@ -74,7 +73,7 @@ class Drive:
         Mean and standard deviation of the first pose [m, m, rad].
     sensor, noise_at_rest, min_range
         As in :class:`~slamgym.estimator.EkfSlam`.
-    motion : str or DriveMotion
+    motion : str or Motion
         The drive.
 
     Raises
@@ -103,7 +102,7 @@ class Drive:
         initial_pose_std: ArrayLike = (0.0, 0.0, 0.0),
         noise_at_rest: bool = True,
         min_range: float = 1e-3,
-        motion: str | DriveMotion = UNICYCLE,
+        motion: str | Motion = UNICYCLE,
     ) -> None:
         self.motion_noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
         self.sensor = find_sensor(sensor)
@@ -116,7 +115,9 @@ class Drive:
                 f"measurement_std must be > 0 to smooth, got ({std[0]:g}, {std[1]:g})"
             )
         self.start_at(initial_pose, initial_pose_std)
-        self._motions: list[Motion] = [Motion((), np.zeros(3), np.zeros((3, 3)))]
+        self._motions: list[OdometryBetween] = [
+            OdometryBetween((), np.zeros(3), np.zeros((3, 3)))
+        ]
         self._sightings: list[list[Sightings]] = [[]]
         self._pending: list[tuple[float, float, float]] = []
         self._observed: dict[int, list[PoseReading]] = {}  # by the pose
@@ -148,7 +149,7 @@ class Drive:
         return [scan for scans in self._sightings for scan in scans]
 
     @property
-    def motions(self) -> Sequence[Motion]:
+    def motions(self) -> Sequence[OdometryBetween]:
         """The motion to each pose; that to the first one is empty."""
         return self._motions
 
@@ -318,10 +319,10 @@ class Drive:
         firsts = np.searchsorted(owners, np.arange(self.poses + 1))
         return PoseArrays(firsts.astype(np.int64), values, matrices, roots)
 
-    def _composed(self, steps: Sequence[tuple[float, float, float]]) -> Motion:
+    def _composed(self, steps: Sequence[tuple[float, float, float]]) -> OdometryBetween:
         """Compose readings of odometry as a filter predicts from a certain pose 0."""
         *_, (pose, covariance) = _along(steps, self.motion_noise)
-        return Motion(tuple(steps), pose, covariance)
+        return OdometryBetween(tuple(steps), pose, covariance)
 
     def __repr__(self) -> str:
         readings = f"{self.readings} readings of {len(self.landmark_ids)} landmarks"
@@ -427,7 +428,9 @@ def landmark_order(ids: IntArray, firsts: IntArray) -> tuple[IntArray, IntArray]
     return found[by_last], 2 * met
 
 
-def path_between(poses: Array, motions: Sequence[Motion], noise: MotionNoise) -> Array:
+def path_between(
+    poses: Array, motions: Sequence[OdometryBetween], noise: MotionNoise
+) -> Array:
     """Return the pose after each reading of odometry, given the poses at the scans.
 
     The readings between two poses lead from the first one to the second except for
@@ -442,7 +445,7 @@ def path_between(poses: Array, motions: Sequence[Motion], noise: MotionNoise) ->
     ----------
     poses : ndarray, shape (N, 3)
         At the scans [m, m, rad].
-    motions : sequence of Motion
+    motions : sequence of OdometryBetween
         Those of the drive, the first one empty.
     noise : MotionNoise
         Of the odometry.
@@ -456,8 +459,8 @@ def path_between(poses: Array, motions: Sequence[Motion], noise: MotionNoise) ->
     --------
     >>> steps = ((1.0, 0.0, 1.0), (1.0, 0.0, 3.0))
     >>> spread = np.diag([4.0, 0.0, 0.0])
-    >>> still = Motion((), np.zeros(3), np.zeros((3, 3)))
-    >>> motions = [still, Motion(steps, np.array([2.0, 0, 0]), spread)]
+    >>> still = OdometryBetween((), np.zeros(3), np.zeros((3, 3)))
+    >>> motions = [still, OdometryBetween(steps, np.array([2.0, 0, 0]), spread)]
     >>> noise = MotionNoise.checked((1.0, 0, 0), noise_at_rest=True)
     >>> path_between(np.array([[0.0, 0, 0], [2.4, 0, 0]]), motions, noise)[:, 0]
     array([0. , 1.1, 2.4])
@@ -470,7 +473,9 @@ def path_between(poses: Array, motions: Sequence[Motion], noise: MotionNoise) ->
     return found
 
 
-def _between(first: Array, last: Array, motion: Motion, noise: MotionNoise) -> Array:
+def _between(
+    first: Array, last: Array, motion: OdometryBetween, noise: MotionNoise
+) -> Array:
     """Return the poses after the readings of one motion, shape (P, 3)."""
     if len(motion.steps) == 1:
         return last[None]

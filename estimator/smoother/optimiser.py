@@ -44,7 +44,7 @@ RELOCATED = 5  # iterations from one to the next
 FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e10
 
 
-class Noise(NamedTuple):
+class ReadingNoise(NamedTuple):
     """The noise of the sensor, and how much an outlier counts."""
 
     sensor: Sensor
@@ -78,7 +78,7 @@ class Minimum(NamedTuple):
     information: Array  # of the landmarks, shape (2n, 2n)
 
 
-class _State:
+class _Iterate:
     """An estimate on its way to the solution."""
 
     def __init__(self, estimate: Estimate, stds: Array) -> None:
@@ -108,7 +108,7 @@ class Optimiser:
     iteration, as in a filter's update.
     """
 
-    def __init__(self, drive: DriveArrays, noise: Noise) -> None:
+    def __init__(self, drive: DriveArrays, noise: ReadingNoise) -> None:
         self._drive, self._sensor = drive, noise.sensor
         poses, landmarks = len(drive.increments), int(drive.widths[0]) // 2
         self._room = elimination.new_elimination(poses, landmarks)
@@ -148,7 +148,7 @@ class Optimiser:
         numpy.linalg.LinAlgError
             If that takes more iterations, or no step lowers the cost.
         """
-        state = _State(start, self.reading_stds(start))
+        state = _Iterate(start, self.reading_stds(start))
         state.cost = first_cost = self.cost(start, state.stds)
         # A start that contradicts a motion without noise is no bound of the cost.
         if not self._drive.factors[1:].any(axis=1).all():
@@ -169,11 +169,13 @@ class Optimiser:
             "robust kernel may help"
         )
 
-    def _solution(self, state: _State, first_cost: float, iterations: int) -> Solution:
+    def _solution(
+        self, state: _Iterate, first_cost: float, iterations: int
+    ) -> Solution:
         cost = self.cost(state.estimate, self.reading_stds(state.estimate))
         return Solution(state.estimate, cost, first_cost, iterations, state.is_damped)
 
-    def _is_found(self, state: _State, tolerance: float, iteration: int) -> bool:
+    def _is_found(self, state: _Iterate, tolerance: float, iteration: int) -> bool:
         """Whether the last step was small, and no landmark belongs elsewhere."""
         is_found = state.error <= tolerance and state.damping <= FIRST_DAMPING
         if state.searches and (is_found or iteration % RELOCATED == 0):
@@ -209,7 +211,7 @@ class Optimiser:
         information.reshape(n, 2, n, 2)[at, :, at, :] += room.blocks
         return information
 
-    def _descend(self, state: _State) -> None:
+    def _descend(self, state: _Iterate) -> None:
         """Take one step that does not raise the cost."""
         while state.damping <= MOST_DAMPING:
             moved = self._step(state.estimate, state.stds, state.damping)
@@ -221,7 +223,7 @@ class Optimiser:
             f"smoothing diverged: no step lowers the cost of {state.cost:.4g}"
         )
 
-    def _relocate(self, state: _State) -> int:
+    def _relocate(self, state: _Iterate) -> int:
         """Move landmarks out of local minima, in place; return how many."""
         if not self._sensor.places:
             return 0
@@ -237,7 +239,7 @@ class Optimiser:
             self._reweight(state)
         return moved
 
-    def _reweight(self, state: _State) -> None:
+    def _reweight(self, state: _Iterate) -> None:
         """Update the noise of the readings for the present estimate."""
         state.stds = self.reading_stds(state.estimate)
         state.cost = self.cost(state.estimate, state.stds)

@@ -49,7 +49,14 @@ from ..models.relative_geometry import separation, squared_offsets
 from ..models.sensors import only_bearing_range
 from ..registry import make_estimator
 from .drive import Drive, DriveArrays, Sightings, landmark_order
-from .optimiser import Estimate, Noise, Optimiser, filter_options, moved_along, start_of
+from .optimiser import (
+    Estimate,
+    Optimiser,
+    ReadingNoise,
+    filter_options,
+    moved_along,
+    start_of,
+)
 
 NONE = -1  # the landmark of a reading that has none
 #: c: a reading costs no more; half of χ² with two degrees of freedom, 99.75 %.
@@ -144,7 +151,7 @@ def reassociate(
     return search.result(best if changed else first, first.score, changed)
 
 
-class _State(NamedTuple):
+class _Association(NamedTuple):
     """An association, smoothed."""
 
     labels: IntArray  # row of `places` of each reading or NONE, shape (M,)
@@ -159,7 +166,7 @@ class _State(NamedTuple):
         """How many readings are given to landmarks."""
         return int((self.labels != NONE).sum())
 
-    def advantage_of(self, other: _State) -> float:
+    def advantage_of(self, other: _Association) -> float:
         """Return by how much another state is better with equally many readings.
 
         The cost of the state that explains more readings is scaled to the number of the
@@ -177,7 +184,7 @@ class _Search:
 
     def __init__(self, drive: Drive) -> None:
         self.drive, (self.data, self.order) = drive, drive.arrays()
-        self.noise = Noise(drive.sensor, drive.rules, 0.0, 1.0)
+        self.noise = ReadingNoise(drive.sensor, drive.rules, 0.0, 1.0)
         counts = np.diff(self.data.firsts)
         self.count = len(counts)
         self.empty = counts == 0
@@ -190,7 +197,7 @@ class _Search:
         self.width = np.quantile(np.abs(wrap_angle(bearings)), 0.95)
         self.log_area = 0.0
 
-    def first(self, poses: Array) -> _State:
+    def first(self, poses: Array) -> _Association:
         """Smooth the drive as it is given."""
         ids = self.order[self.data.columns // 2]
         found, labels, counts = np.unique(ids, return_inverse=True, return_counts=True)
@@ -210,7 +217,7 @@ class _Search:
             )
         return min(states, key=lambda state: state.score)
 
-    def followed(self) -> _State | None:
+    def followed(self) -> _Association | None:
         """Smooth with the associations of the default filter; None if that fails."""
         options = filter_options(self.drive)
         slam: Any = make_estimator("invariant", management=True, **options)
@@ -222,7 +229,7 @@ class _Search:
         found = [i for scan in slam.decisions for i in scan.row_ids]
         return self.begun(np.array([NONE if i is None else i for i in found]))
 
-    def begun(self, labels: IntArray) -> _State | None:
+    def begun(self, labels: IntArray) -> _Association | None:
         """Smooth with associations that are far from those before; None if it fails."""
         try:
             poses, found = start_of(self.relabelled(labels))
@@ -232,7 +239,9 @@ class _Search:
         places[list(found)] = list(found.values())
         return self.smoothed(labels, poses, places)
 
-    def smoothed(self, labels: IntArray, poses: Array, places: Array) -> _State | None:
+    def smoothed(
+        self, labels: IntArray, poses: Array, places: Array
+    ) -> _Association | None:
         """Smooth with associations; None if that fails."""
         used = labels != NONE
         if not used.any():
@@ -266,9 +275,9 @@ class _Search:
         score += float(np.linalg.slogdet(information)[1]) / 2
         covariance = inverse[np.ix_(entries, entries)]
         poses = found.estimate.poses
-        return _State(labels, poses, places, score, found.cost, covariance)
+        return _Association(labels, poses, places, score, found.cost, covariance)
 
-    def settled(self, state: _State) -> _State:
+    def settled(self, state: _Association) -> _Association:
         """Make small changes until none lowers the score."""
         for _ in range(ROUNDS):
             trials = (move(state) for move in (self.joined, self.rearranged))
@@ -279,7 +288,7 @@ class _Search:
             state = new
         return state
 
-    def rearranged(self, state: _State) -> _State | None:
+    def rearranged(self, state: _Association) -> _Association | None:
         """Add and remove landmarks, and give readings to those that they fit."""
         places, costs = state.places, self.costs(state.poses, state.places)
         m = len(places)
@@ -351,7 +360,7 @@ class _Search:
         worst = int(losses.argmin())
         return worst if losses[worst] < price else None
 
-    def joined(self, state: _State) -> _State | None:
+    def joined(self, state: _Association) -> _Association | None:
         """Merge the landmarks that are likely to be the same, and not in one scan."""
         m = len(state.places)
         every = np.arange(m)
@@ -377,8 +386,8 @@ class _Search:
         return np.asarray(shown.T @ shown > 0)
 
     def rebuilt(
-        self, state: _State, progress: Callable[[int], object]
-    ) -> _State | None:
+        self, state: _Association, progress: Callable[[int], object]
+    ) -> _Association | None:
         """Take all landmarks apart where they are seen again, and match them anew.
 
         The drive is taken in successive parts.  The landmarks that a part shows first
@@ -419,7 +428,7 @@ class _Search:
         return found
 
     def matches(
-        self, state: _State, late: IntArray, early: IntArray
+        self, state: _Association, late: IntArray, early: IntArray
     ) -> Iterator[IntArray]:
         """Yield pairs of landmarks that one rigid motion brings together."""
         if min(len(late), len(early)) < SMALLEST_CLIQUE:
@@ -479,7 +488,7 @@ class _Search:
         fill_costs(poses, self.owners, self.data.readings, places, values, found)
         return found
 
-    def result(self, state: _State, first: float, changed: bool) -> Reassociation:
+    def result(self, state: _Association, first: float, changed: bool) -> Reassociation:
         """Return the drive with the associations of a state."""
         drive = self.relabelled(state.labels)
         ids = self.by_scan(state.labels)

@@ -137,7 +137,7 @@ class Results(NamedTuple):
     shown: Sequence[Any]
 
 
-class Study(NamedTuple):
+class PreparedStudy(NamedTuple):
     """A noise study to run and to write."""
 
     #: Of its folder, by default; the first is the name of the study.
@@ -152,7 +152,7 @@ def one_run_study(
     estimator: str,
     settings: "FilterSettings",
     study: "Callable[..., list[NoiseRun]]",
-) -> Study:
+) -> PreparedStudy:
     """Prepare the study of a log or of one run of a scenario."""
     from ..run_and_replay.summary import settings_table
 
@@ -170,10 +170,10 @@ def one_run_study(
         return Results(rows, titles, drawn, 130, (title, runs_table(runs)))
 
     about = {"estimator": estimator, "settings": settings_table(settings)}
-    return Study((name, estimator), about, run)
+    return PreparedStudy((name, estimator), about, run)
 
 
-def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
+def effects_study(world: Scenario, given: NoiseStudyOptions) -> PreparedStudy:
     """Prepare the study of a scenario over many runs."""
     from ...estimator.registry import split_labels
     from ..noise_study import CHANGED, noise_effects, noise_effects_figure
@@ -194,10 +194,12 @@ def effects_study(world: Scenario, given: NoiseStudyOptions) -> Study:
         shown = [effects_table(world.name, runs, effects)]
         return Results(effects, (), noise_effects_figure(effects), 150, shown)
 
-    return Study((world.name, f"{runs}-runs"), {"runs": runs, "seed": seed}, run)
+    return PreparedStudy(
+        (world.name, f"{runs}-runs"), {"runs": runs, "seed": seed}, run
+    )
 
 
-def write_study(study: Study, out: Path | None, reporter: Reporter) -> None:
+def write_study(study: PreparedStudy, out: Path | None, reporter: Reporter) -> None:
     """Run a study, write its figure, table and summary, and print its results."""
     from ... import __version__
     from ..figures.style import sign

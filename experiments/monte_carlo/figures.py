@@ -38,7 +38,7 @@ class EstimatorLook(NamedTuple):
 Shown = list[tuple[EstimatorScores, EstimatorLook]]
 
 
-class Study(NamedTuple):
+class ShownStudy(NamedTuple):
     """What the figures of a study show, and how wide they are."""
 
     shown: Shown
@@ -47,9 +47,9 @@ class Study(NamedTuple):
     title: str
 
     @classmethod
-    def of(cls, results: "xr.Dataset | Study", width_mm: float) -> "Study":
+    def of(cls, results: "xr.Dataset | ShownStudy", width_mm: float) -> "ShownStudy":
         """Measure results, unless that is done; the title names the world."""
-        if isinstance(results, Study):
+        if isinstance(results, ShownStudy):
             return results
         summary = summarise_monte_carlo(results)
         if not (shown := _shown(results, summary)):
@@ -89,7 +89,7 @@ def report_figures(
         successful runs; empty if there is none. ``nis`` shows those with innovations,
         which a smoother has not.
     """
-    study = Study(_shown(dataset, summary), summary, _WIDTH, "")
+    study = ShownStudy(_shown(dataset, summary), summary, _WIDTH, "")
     if not study.shown:
         return {}
     if width_mm is not None:
@@ -122,7 +122,7 @@ def _innovative(shown: Shown) -> Shown:
     return [pair for pair in shown if pair[0].nis_per_degree is not None]
 
 
-def nees_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
+def nees_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Figure:
     """Draw ANEES / 3 over time, with the 95 % bands of one step and of the grid.
 
     Parameters
@@ -142,7 +142,7 @@ def nees_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
     ValueError
         If no estimator has a successful run.
     """
-    study = Study.of(results, width_mm)
+    study = ShownStudy.of(results, width_mm)
     shown, summary, frame = study.shown, study.summary, study.summary["frame"]
     figure = new_figure(study.width, 2.9)
     axes = figure.subplots()
@@ -193,12 +193,12 @@ def scale_ratios(axes: Axes, ratios: Array) -> None:
         log_ticks(axes, "y")
 
 
-def runs_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
+def runs_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Figure:
     """Draw the time average of each run's NEES / 3, a row of dots per estimator.
 
     Parameters, result and errors are those of :func:`nees_figure`.
     """
-    study = Study.of(results, width_mm)
+    study = ShownStudy.of(results, width_mm)
     shown, frame = study.shown, study.summary["frame"]
     figure = new_figure(study.width, 0.8 + 1.0 * len(shown))
     axes = figure.subplots()
@@ -236,12 +236,12 @@ def runs_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
     return figure
 
 
-def heading_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
+def heading_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Figure:
     """Draw claimed and true deviation of the heading, a panel per estimator [°].
 
     Parameters, result and errors are those of :func:`nees_figure`.
     """
-    study = Study.of(results, width_mm)
+    study = ShownStudy.of(results, width_mm)
     shown, knowable = study.shown, study.summary["knowable_heading_std"]
     figure = new_figure(study.width, 0.75 + 1.3 * len(shown))
     panels = figure.subplots(len(shown), 1, sharex=True, sharey=True, squeeze=False)
@@ -270,12 +270,12 @@ def heading_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figur
     return figure
 
 
-def rmse_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
+def rmse_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Figure:
     """Draw the root mean square of the position's raw error over time.
 
     Parameters, result and errors are those of :func:`nees_figure`.
     """
-    study = Study.of(results, width_mm)
+    study = ShownStudy.of(results, width_mm)
     shown = study.shown
     figure = new_figure(study.width, 2.5)
     axes = figure.subplots()
@@ -461,7 +461,7 @@ _TAIL = 0.025
 _LEAST = 0.02  # smallest range of correlations on the axis
 
 
-def nis_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
+def nis_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Figure:
     """Draw NIS by its degrees of freedom over time, and its autocorrelation.
 
     Innovations are white, so the NIS of neighbouring steps may be pooled: each point
@@ -469,7 +469,7 @@ def nis_figure(results: xr.Dataset | Study, width_mm: float = 85.0) -> Figure:
 
     Parameters, result and errors are those of :func:`nees_figure`.
     """
-    study = Study.of(results, width_mm)
+    study = ShownStudy.of(results, width_mm)
     shown = _innovative(study.shown)
     if not shown:
         raise ValueError("results must hold an estimator that reports innovations")

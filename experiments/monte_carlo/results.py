@@ -49,7 +49,7 @@ _FROM_TRUTH = "for a consistent filter, NEES and NIS are χ² with the stated de
 
 
 def dataset_of(
-    job: Job,
+    job: MonteCarloJob,
     blocks: Blocks,
     runs: range,
     command: str = "",
@@ -59,7 +59,7 @@ def dataset_of(
 
     Parameters
     ----------
-    job : Job
+    job : MonteCarloJob
         The job.
     blocks : iterable
         All its blocks, in any order.
@@ -93,7 +93,7 @@ def dataset_of(
 
 def write_results(
     path: Path,
-    job: Job,
+    job: MonteCarloJob,
     blocks: Blocks,
     runs: range,
     command: str = "",
@@ -181,7 +181,9 @@ def load_results(path: str | Path) -> xr.Dataset:
     return results
 
 
-def _write(path: Path, job: Job, blocks: Blocks, runs: range, command: str) -> None:
+def _write(
+    path: Path, job: MonteCarloJob, blocks: Blocks, runs: range, command: str
+) -> None:
     import netCDF4  # noqa: PLC0415
 
     with netCDF4.Dataset(path, "w") as file:
@@ -198,7 +200,7 @@ def _write(path: Path, job: Job, blocks: Blocks, runs: range, command: str) -> N
         file.setncatts(attributes(job, runs, command))
 
 
-def attributes(job: Job, runs: range, command: str) -> dict[str, Any]:
+def attributes(job: MonteCarloJob, runs: range, command: str) -> dict[str, Any]:
     """Return the origin of results: all that is needed to reproduce them."""
     identity = job.identity()
     return {
@@ -224,7 +226,9 @@ def provenance(command: str) -> dict[str, str]:
     return {"versions": json.dumps(found), "command": command, "comment": _FROM_TRUTH}
 
 
-def _fill(arrays: Mapping[str, Any], job: Job, blocks: Blocks, runs: range) -> None:
+def _fill(
+    arrays: Mapping[str, Any], job: MonteCarloJob, blocks: Blocks, runs: range
+) -> None:
     variables = job.variables
     for span, parts in blocks:
         rows = slice(span.start - runs.start, span.stop - runs.start)
@@ -244,7 +248,7 @@ def _dims(variable: run_measures.Variable) -> tuple[str, ...]:
     return ("estimator", *variable.dims)
 
 
-def _sizes(job: Job, runs: range) -> dict[str, int]:
+def _sizes(job: MonteCarloJob, runs: range) -> dict[str, int]:
     return {
         "estimator": len(job.estimators),
         "run": len(runs),
@@ -254,7 +258,7 @@ def _sizes(job: Job, runs: range) -> dict[str, int]:
     }
 
 
-def _coordinates(job: Job, runs: range) -> dict[str, np.ndarray[Any, Any]]:
+def _coordinates(job: MonteCarloJob, runs: range) -> dict[str, np.ndarray[Any, Any]]:
     return {dim: np.arange(size) for dim, size in _sizes(job, runs).items()} | {
         "estimator": np.array([choice.label for choice in job.estimators]),
         "run": np.arange(runs.start, runs.stop),
@@ -311,7 +315,7 @@ class BlockFolder(NamedTuple):
             if shorter != file:
                 shorter.unlink()
 
-    def read(self, blocks: Iterable[range], job: Job) -> Blocks:
+    def read(self, blocks: Iterable[range], job: MonteCarloJob) -> Blocks:
         """Yield blocks with their runs, one at a time."""
         for runs in blocks:
             file = self._files_from(runs.start)[-1]  # the longest
@@ -521,7 +525,7 @@ def _described(key: str, value: Any) -> str:
     return f"{key} {0.0 if value is None else value}"
 
 
-class Job(NamedTuple):
+class MonteCarloJob(NamedTuple):
     """What is computed, except for the number of runs."""
 
     scenario: Scenario

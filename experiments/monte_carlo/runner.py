@@ -41,7 +41,7 @@ from .results import (
     RESULTS,
     BlockFolder,
     Blocks,
-    Job,
+    MonteCarloJob,
     add_to_results,
     dataset_of,
     load_results,
@@ -182,7 +182,7 @@ def monte_carlo(
         raise ValueError(f"resolution must be a number >= 0, got {resolution!r}")
     if until is not None:
         one_of("until", until, (DECIDED,))
-    job = Job(world, assumed_world, choices, seed, size, float(resolution))
+    job = MonteCarloJob(world, assumed_world, choices, seed, size, float(resolution))
     workers = engage_workers(jobs, backend)
     work = _Work(
         job,
@@ -210,7 +210,7 @@ def monte_carlo(
 class _Study(NamedTuple):
     """A job with its runs, computed at once or until it is decided."""
 
-    job: Job
+    job: MonteCarloJob
     blocks: list[range]
     #: `resume` of the work.
     compute: Callable[..., None]
@@ -314,7 +314,7 @@ def _runs_of(blocks: Sequence[range]) -> range:
 
 
 def _repeated(
-    job: Job,
+    job: MonteCarloJob,
     factors: Sequence[float],
     asked: range,
     seconds: float,
@@ -389,7 +389,7 @@ def with_less_noise(scenario: Scenario, factor: float) -> Scenario:
 class _Work:
     """All that a worker needs to compute a block."""
 
-    job: Job
+    job: MonteCarloJob
     settings: tuple[FilterSettings, ...]
     factories: Mapping[str, registry.EstimatorFactory]
     threads: int | None

@@ -57,7 +57,7 @@ class FittedNoise(NamedTuple):
     verdict: Verdict
 
 
-class _Fit(NamedTuple):
+class _NoiseFit(NamedTuple):
     """A noise during the search."""
 
     #: Shape (7,).
@@ -129,7 +129,7 @@ def most_likely_noise(likelihood: LogLikelihood, before: Array) -> Found:
 
 def _in_turns(
     likelihood: LogLikelihood, start: Array, chosen: BoolArray
-) -> tuple[LogLikelihood, _Fit]:
+) -> tuple[LogLikelihood, _NoiseFit]:
     """Alternate between rejecting readings and fitting, until nothing changes."""
     found = _coarse_start(likelihood, start, chosen)
     rejected = likelihood.rejected(found.noise)
@@ -145,7 +145,7 @@ def _in_turns(
     return smooth, _fit(smooth, found)
 
 
-def _in_metres(smooth: LogLikelihood, found: _Fit) -> _Fit:
+def _in_metres(smooth: LogLikelihood, found: _NoiseFit) -> _NoiseFit:
     """Fit again with half of σβ as a part in metres, as of a sensor of positions."""
     noise, free = found.noise.copy(), found.free.copy()
     noise[IN_METRES] = 0.5 * max(noise[BEARING], EXACT) * _typical_range(smooth)
@@ -154,7 +154,9 @@ def _in_metres(smooth: LogLikelihood, found: _Fit) -> _Fit:
     return _fit(smooth, found._replace(noise=noise, free=free))
 
 
-def _coarse_start(likelihood: LogLikelihood, start: Array, chosen: BoolArray) -> _Fit:
+def _coarse_start(
+    likelihood: LogLikelihood, start: Array, chosen: BoolArray
+) -> _NoiseFit:
     """Return the most likely of some multiples of motion and of sensor noise."""
     factors = np.array(list(product(FACTORS, FACTORS)))
     tried = start * np.repeat(factors, (3, len(start) - 3), axis=1)
@@ -162,14 +164,16 @@ def _coarse_start(likelihood: LogLikelihood, start: Array, chosen: BoolArray) ->
     if not np.isfinite(values).any():
         raise np.linalg.LinAlgError("the fit diverges: no noise explains the readings")
     best = int(np.argmax(values))
-    return _Fit(tried[best], chosen, float(values[best]), False, len(tried))
+    return _NoiseFit(tried[best], chosen, float(values[best]), False, len(tried))
 
 
 def _typical_range(likelihood: LogLikelihood) -> float:
     return max(float(np.median(np.abs(likelihood.events.readings[:, 1]))), 1e-3)
 
 
-def _fit(smooth: LogLikelihood, found: _Fit, *, most: int | None = None) -> _Fit:
+def _fit(
+    smooth: LogLikelihood, found: _NoiseFit, *, most: int | None = None
+) -> _NoiseFit:
     """Fit the free entries, starting from their present values."""
     free = np.flatnonzero(found.free)
     along = scoring.restricted(smooth.of, found.noise, free)
@@ -177,16 +181,16 @@ def _fit(smooth: LogLikelihood, found: _Fit, *, most: int | None = None) -> _Fit
     noise = found.noise.copy()
     noise[free] = fit.parameters
     passes = found.passes + fit.passes
-    return _Fit(noise, found.free, fit.log_likelihood, fit.converged, passes)
+    return _NoiseFit(noise, found.free, fit.log_likelihood, fit.converged, passes)
 
 
-def _fixed_at_zero(found: _Fit, entry: int) -> _Fit:
+def _fixed_at_zero(found: _NoiseFit, entry: int) -> _NoiseFit:
     noise, free = found.noise.copy(), found.free.copy()
     noise[entry], free[entry] = 0.0, False
     return found._replace(noise=noise, free=free)
 
 
-def _without_needless(smooth: LogLikelihood, found: _Fit) -> _Fit:
+def _without_needless(smooth: LogLikelihood, found: _NoiseFit) -> _NoiseFit:
     """Fit again without the part of σr per metre, or of σβ in metres, if possible."""
     for entry, instead in NEEDLESS:
         if not (found.free[entry] and (found.noise[[entry, instead]] > 0).all()):
@@ -205,7 +209,7 @@ def _without_needless(smooth: LogLikelihood, found: _Fit) -> _Fit:
     return found
 
 
-def _is_plain(smooth: LogLikelihood, found: _Fit, entry: int) -> bool:
+def _is_plain(smooth: LogLikelihood, found: _NoiseFit, entry: int) -> bool:
     """Return whether an entry is significantly above zero."""
     free = np.flatnonzero(found.free)
     along = scoring.restricted(smooth.of, found.noise, free)
@@ -215,7 +219,7 @@ def _is_plain(smooth: LogLikelihood, found: _Fit, entry: int) -> bool:
     return bool(covariance[at, at] < PLAIN**2)
 
 
-def _without_zeros(smooth: LogLikelihood, found: _Fit) -> _Fit:
+def _without_zeros(smooth: LogLikelihood, found: _NoiseFit) -> _NoiseFit:
     """Set entries to zero, one by one, if the readings do not become less likely."""
     for _ in range(int(np.count_nonzero(found.free)) - 1):
         free = np.flatnonzero(found.free)
@@ -237,7 +241,7 @@ def _refuse_most(rejected: BoolArray) -> None:
         )
 
 
-def _refuse_diverged(found: _Fit) -> None:
+def _refuse_diverged(found: _NoiseFit) -> None:
     if not found.converged or found.noise.max() > 0.5 * scoring.GREATEST:
         values = ", ".join(
             f"{name} {value:.3g}"

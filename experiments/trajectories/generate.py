@@ -34,7 +34,7 @@ from ..run_and_replay.filter_settings import integer
 from .formats import TrajectoryFormat, trajectory_format
 from .manifest import (
     MANIFEST,
-    Job,
+    DatasetJob,
     Manifest,
     ShardEntry,
     digest,
@@ -127,7 +127,9 @@ def generate_trajectories(
     layout.check(world)
     smallest = checked_smallest_std(format, layout, smallest_std)
     check_estimator(world, format, layout, estimator)
-    job = Job(world, controller, seed, episodes, size, format, smallest, estimator)
+    job = DatasetJob(
+        world, controller, seed, episodes, size, format, smallest, estimator
+    )
     versions = versions_of(job)
     serial = jobs is None and backend is None
     workers = None if serial else engage_workers(jobs, backend)
@@ -152,7 +154,7 @@ def generate_trajectories(
 
 
 def _begun(
-    job: Job, folder: Path, versions: dict[str, str], anything: str | None
+    job: DatasetJob, folder: Path, versions: dict[str, str], anything: str | None
 ) -> Manifest:
     """Return the manifest of a job that was begun, or begin it."""
     there = (folder / MANIFEST).exists()
@@ -245,7 +247,7 @@ class ShardWork:
 
     Attributes
     ----------
-    job : Job
+    job : DatasetJob
         The data set.
     versions : dict of str to str
         Versions in its manifest; a worker with other ones refuses to work.
@@ -254,7 +256,7 @@ class ShardWork:
         without it sends the files instead.
     """
 
-    job: Job
+    job: DatasetJob
     versions: dict[str, str]
     staging: Path
 
@@ -325,7 +327,7 @@ def fetched(made: MadeShard, staging: Path) -> Path:
     return path
 
 
-def versions_of(job: Job) -> dict[str, str]:
+def versions_of(job: DatasetJob) -> dict[str, str]:
     """Return the versions that determine the bits of a job on this machine."""
     kernels = () if job.estimator is None else ("numba",)
     packages = ("numpy", *trajectory_format(job.format).LIBRARIES, *kernels)

@@ -28,7 +28,7 @@ _KIND = "slamgym trajectories 1"
 
 
 @dataclass(frozen=True)
-class Job:
+class DatasetJob:
     """The description of a data set.
 
     Attributes
@@ -92,7 +92,7 @@ class Manifest:
 
     Attributes
     ----------
-    job : Job
+    job : DatasetJob
         The job.
     versions : dict of str to str
         Versions of all that can change a bit: packages, Python, processor type.
@@ -100,7 +100,7 @@ class Manifest:
         The shards in the order of their episodes; workers may leave gaps on the way.
     """
 
-    job: Job
+    job: DatasetJob
     versions: dict[str, str]
     shards: tuple[ShardEntry, ...] = ()
 
@@ -157,7 +157,7 @@ def _manifest(table: dict[str, Any]) -> Manifest:
     job = _checked(job, texts, seed=0, episodes=1, episodes_per_shard=1)
     shards = [_checked(one, ["sha256"], first_episode=0, episodes=0) for one in shards]
     return Manifest(
-        job=Job(**{**job, "scenario": scenario_from_text(job["scenario"])}),
+        job=DatasetJob(**{**job, "scenario": scenario_from_text(job["scenario"])}),
         versions=dict(table["versions"]),
         shards=tuple(ShardEntry(**one) for one in shards),
     )

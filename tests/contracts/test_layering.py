@@ -1,6 +1,8 @@
 """The floors of the repository, enforced: imports go down, never up or in a circle."""
 
+import ast
 import sys
+from collections import Counter
 from graphlib import TopologicalSorter
 
 import pytest
@@ -202,6 +204,13 @@ def test_a_small_module_with_one_importer_is_part_of_it():
         and code_lines(module) < 60
     }
     assert crumbs == {}
+
+
+def test_a_class_name_is_defined_once():
+    files = [*FILES.values(), *(ROOT / "src" / "slamgym").glob("*.py")]
+    nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text()))]
+    names = Counter(node.name for node in nodes if isinstance(node, ast.ClassDef))
+    assert {name: count for name, count in names.items() if count > 1} == {}
 
 
 def test_the_links_of_the_package_reach_every_folder():

@@ -461,7 +461,7 @@ def lacking(kind: str, tables: Sequence[Table], source: Path) -> slamlog.LogErro
     )
 
 
-class _Motion(NamedTuple):
+class _TimedOdometry(NamedTuple):
     """The odometry between two times; the second one is that of a row."""
 
     line: log_lines.LogLine
@@ -479,7 +479,7 @@ def _motions(
     rows: Sequence[Cells],
     stamps: Array,
     seen: Array,
-) -> list[_Motion]:
+) -> list[_TimedOdometry]:
     """Return the motions of an odometry table in order of time.
 
     The first increment begins at the last reading before its end, and lasts as long as
@@ -493,7 +493,7 @@ def _motions(
         if len(rows) < 2:
             raise rows[0].line.error("at least two rows of v and omega", "one")
         return [
-            _Motion(
+            _TimedOdometry(
                 row.line,
                 float(start),
                 float(start + dt),
@@ -515,7 +515,7 @@ def _motions(
         aside = table.number(row, "dy") if "dy" in form else 0.0
         increment = ahead, aside, table.number(row, "alpha")
         dt = table.number(row, "dt") if "dt" in table.columns else length
-        motions.append(_Motion(row.line, start, end, increment, dt))
+        motions.append(_TimedOdometry(row.line, start, end, increment, dt))
     return motions
 
 
@@ -537,7 +537,7 @@ def _readings(table: Table, on_clock: Callable[[Array], Array]) -> _TimedReading
     return timed
 
 
-def _true_start(first: _Motion, truth: Array) -> Array:
+def _true_start(first: _TimedOdometry, truth: Array) -> Array:
     """Return the true pose before the first motion, nan where unknown.
 
     The truth may begin within the first half of the motion, because stamps are rounded,
@@ -560,7 +560,7 @@ def _id_in(table: Table, row: Cells) -> int | None:
 
 
 def _events(
-    motions: Sequence[_Motion], timed: _TimedReadings
+    motions: Sequence[_TimedOdometry], timed: _TimedReadings
 ) -> tuple[slamlog.Event, ...]:
     """Record motions and readings, and divide motions at readings within them."""
     recorder = slamlog.EventRecorder()
@@ -587,7 +587,7 @@ def _events(
 
 
 def _add_part(
-    recorder: slamlog.EventRecorder, motion: _Motion, start: float, end: float
+    recorder: slamlog.EventRecorder, motion: _TimedOdometry, start: float, end: float
 ) -> None:
     """Record the part of a motion between two times."""
     share = 1.0
