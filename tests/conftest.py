@@ -154,6 +154,13 @@ def _one_worker_compiles(request, tmp_path_factory):
 
 
 @pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Run a test in an empty folder, and return it."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
 def own_registry():
     """Forget at the end of a test the estimators that it registers."""
     from slamgym.estimator import registry

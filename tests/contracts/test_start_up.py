@@ -9,14 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drives import MEASUREMENT_STD, MOTION_STD
 from numba import njit
 
 from slamgym import jit
 from slamgym.jit import fma
 
 ROOT = Path(__file__).parents[2]
-NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
 
 
 def run_python(code, *arguments, **environment):

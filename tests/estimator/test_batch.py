@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from comparison import assert_same_bits
-from drives import MEASUREMENT_STD, MOTION_STD, drive
+from drives import MEASUREMENT_STD, MOTION_STD, NOISE, drive
 from numpy_belief_features import marginals_of
 
 from slamgym.estimator import (
@@ -16,7 +16,6 @@ from slamgym.estimator import (
 from slamgym.estimator.kernels.batch import drive_runs
 
 RUNS, STEPS, LANDMARKS = 5, 40, 13
-NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
 CASES = {
     "ekf": ("ekf", {}),
     "gated": ("ekf", {"gate_probability": 0.9, "range_std_per_metre": 0.02}),

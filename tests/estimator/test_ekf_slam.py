@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from comparison import assert_close_beliefs, assert_same_bits
 from dense_ekf import DenseEkf
-from drives import MEASUREMENT_STD, MOTION_STD, drive
+from drives import MEASUREMENT_STD, MOTION_STD, NOISE, drive
 from numba import config
 from numeric_jacobian import numeric_jacobian
 from scipy.stats import chi2
@@ -302,9 +302,8 @@ def test_bad_input_is_refused_by_name_and_changes_nothing(call, message):
     ],
 )
 def test_bad_settings_are_refused_by_name(options, message):
-    settings = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
     with pytest.raises(ValueError, match=message):
-        EkfSlam(**{**settings, **options})
+        EkfSlam(**{**NOISE, **options})
 
 
 @pytest.mark.parametrize(
@@ -366,7 +365,7 @@ def test_read_only_readings_are_taken_without_compiling_anew():
 
 @pytest.mark.parametrize("name", list_estimators())
 def test_the_largest_readings_leave_the_belief_finite(name):
-    slam = make_estimator(name, motion_std=MOTION_STD, measurement_std=MEASUREMENT_STD)
+    slam = make_estimator(name, **NOISE)
     slam.predict((1.0, 0.1))
     slam.update([(0.3, 1e12), (0.1, 5.0)], [0, 1])
     slam.predict((1.0, 0.1))
@@ -382,7 +381,7 @@ def test_a_report_keeps_the_innovation_covariance_of_its_own_prior(name, seen):
     """For a few readings in a large map, and for all; also after later updates."""
     rng = np.random.default_rng(0)
     landmarks = rng.uniform(-15, 15, (40, 2))
-    slam = make_estimator(name, motion_std=MOTION_STD, measurement_std=MEASUREMENT_STD)
+    slam = make_estimator(name, **NOISE)
     steps = list(drive(0, 5, landmarks=landmarks))
     for odometry, readings, _ in steps[:-1]:
         slam.predict(odometry)

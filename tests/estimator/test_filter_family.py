@@ -8,7 +8,7 @@ from comparison import assert_close_beliefs, assert_same_bits
 from dense_ekf import DenseEkf
 from dense_family import TWINS, DenseAdaptiveInvariant, belief_of
 from dense_family import tell_truth as tell
-from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
+from drives import MEASUREMENT_STD, MOTION_STD, NOISE, SIX, drive
 from far_origins import far_origins, rounding, shifted
 
 from slamgym.estimator import EkfSlam, list_estimators, make_batch, make_estimator
@@ -38,9 +38,8 @@ BLIND_TO_A_TURN = [
 
 
 def make(case, **changes):
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
     bound = {"active_bound": None} if case == "sparse_information" else {}
-    return make_estimator(case, **{**noise, **bound, **changes})
+    return make_estimator(case, **{**NOISE, **bound, **changes})
 
 
 def tell_truth(slam, pose, landmarks=TRUE_MAP):
@@ -517,13 +516,12 @@ def test_beliefs_name_the_frame_of_their_error():
     ],
 )
 def test_an_update_makes_no_copy_of_the_covariance(name, policy):
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
     options = {"submap_size": 400} if name == "submaps" else {}
     if name == "smoother":
-        inside = make_estimator("ekf", **noise, management=policy)
-        slam = RecordedSlam(inside, **noise)
+        inside = make_estimator("ekf", **NOISE, management=policy)
+        slam = RecordedSlam(inside, **NOISE)
     else:
-        slam = make_estimator(name, **noise, management=policy, **options)
+        slam = make_estimator(name, **NOISE, management=policy, **options)
     around = np.linspace(-3, 3, 200)
     scans = [[(b, 4.0 + 0.1 * k) for k, b in enumerate(around)], range(200)]
     for _ in range(4):

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from comparison import assert_close_beliefs, assert_same_bits, part_of
-from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
+from drives import MEASUREMENT_STD, MOTION_STD, NOISE, SIX, drive
 from scipy.linalg import expm
 from scipy.optimize import root
 
@@ -48,8 +48,7 @@ def random_map(seed, landmarks=4):
 
 
 def make(name, **changes):
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
-    return make_estimator(name, **{**noise, "initial_pose_std": START_STD, **changes})
+    return make_estimator(name, **{**NOISE, "initial_pose_std": START_STD, **changes})
 
 
 def driven(name, steps=25, seed=3, landmarks=SIX):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from comparison import assert_same_bits, digest
-from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
+from drives import MEASUREMENT_STD, MOTION_STD, NOISE, SIX, drive
 from scipy.stats import chi2
 from town_drives import TOWN_MOTION_STD, map_all, wander
 
@@ -46,8 +46,7 @@ TIDY = {
 def make(name="ekf", management=True, **changes):
     if isinstance(management, dict):
         management = {**NEAREST, **management}
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
-    return make_estimator(name, management=management, **{**noise, **changes})
+    return make_estimator(name, management=management, **{**NOISE, **changes})
 
 
 def polar(points, pose=(0, 0, 0)):
@@ -690,8 +689,7 @@ def hidden_log(steps=30):
 
 
 def hidden_settings(**options):
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
-    return settings_for(hidden_log(1), estimator="ekf", **noise, options=options)
+    return settings_for(hidden_log(1), estimator="ekf", **NOISE, options=options)
 
 
 def test_a_log_without_identities_is_associated():
@@ -818,12 +816,11 @@ def test_the_capacity_of_submaps_counts_the_landmarks_far_away_too():
 
 def test_a_replay_of_submaps_tells_what_they_could_say_at_once():
     log = hidden_log(58)
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
     runs = [
         replay(
             log,
             settings_for(
-                log, estimator=name, **noise, options={**options, "management": NEAREST}
+                log, estimator=name, **NOISE, options={**options, "management": NEAREST}
             ).make((0, 0, 0)),
         )
         for name, options in (("invariant", {}), ("submaps", SMALL))

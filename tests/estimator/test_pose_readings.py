@@ -5,7 +5,7 @@ import pytest
 from comparison import assert_close_beliefs, assert_same_bits, digest
 from dense_family import TWINS, DenseAdaptiveInvariant, DenseInvariant, belief_of
 from dense_family import tell_truth as tell
-from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
+from drives import MEASUREMENT_STD, MOTION_STD, NOISE, SIX, drive
 from interrupts import assert_all_or_nothing, is_interrupted, lines_of
 
 from slamgym.estimator import make_batch, make_estimator
@@ -14,7 +14,6 @@ from slamgym.estimator.filters.pose_readings import PoseReading, gate_of
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
 from slamgym.estimator.smoother import Drive
 
-NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
 START_STD = (0.3, 0.3, 0.4)
 COMPASS = np.array([[0.0, 0.0, 1.0]])
 GPS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -300,8 +299,7 @@ def test_observe_conditions_on_any_first_components():
 
 
 def test_a_batch_refuses_readings_of_another_number_of_runs():
-    noise = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
-    batch = make_batch("ekf", runs=3, landmarks=2, **noise)
+    batch = make_batch("ekf", runs=3, landmarks=2, **NOISE)
     with pytest.raises(ValueError, match="a row for each of 3 runs"):
         batch.observe_pose(np.zeros((2, 1)), [0, 0, 1], 1.0)
 

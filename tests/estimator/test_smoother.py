@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from dense_smoother import DenseSmoother
-from drives import MEASUREMENT_STD, MOTION_STD, SIX, drive
+from drives import MEASUREMENT_STD, MOTION_STD, NOISE, SIX, drive
 from far_origins import far_origins, rounding, shifted
 
 from slamgym.estimator import make_estimator
@@ -21,7 +21,6 @@ from slamgym.estimator.models.sensors import (
 from slamgym.estimator.smoother import Drive, SmoothingSlam, reassociate, smooth
 from slamgym.estimator.smoother.optimiser import start_of
 
-NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
 START_STD = (0.1, 0.2, 0.05)
 RANGE = 7.0  # of the sensor [m]
 IDS = list(range(len(SIX)))

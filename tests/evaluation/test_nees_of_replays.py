@@ -7,14 +7,12 @@ degrees of freedom.
 
 import numpy as np
 import pytest
+from recordings import recorded
 from scipy.stats import chi2
 
-from slamgym.envs.controllers import OpenLoop
-from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.run_and_replay.filter_settings import settings_for
 from slamgym.experiments.run_and_replay.log_replay import replay
 from slamgym.experiments.run_and_replay.summary import pose_nees
-from slamgym.sim_configs import action_sequence, load_scenario
 
 RUNS = 200
 ACCEPTED = chi2.ppf([0.005, 0.995], 3 * RUNS)
@@ -22,9 +20,8 @@ ACCEPTED = chi2.ppf([0.005, 0.995], 3 * RUNS)
 
 @pytest.fixture(scope="module")
 def drives():
-    world = load_scenario("six_landmarks").with_changes(start={"std": [0, 0, 0]})
-    driver = OpenLoop(action_sequence(world), world.robot)
-    return [record_episode(world, driver, seed) for seed in range(RUNS)]
+    start = {"std": [0, 0, 0]}
+    return [recorded("six_landmarks", seed, start=start) for seed in range(RUNS)]
 
 
 def replays(drives, doubt=1.0):

@@ -31,6 +31,7 @@ from slamgym.experiments.run_and_replay.log_replay import replay
 from slamgym.jit import jit
 from slamgym.sim_configs import list_presets, load_scenario
 
+pytestmark = pytest.mark.usefixtures("here")
 COMMANDS = "run replay smooth fit-noise generate judge monte-carlo noise-study render"
 COMMANDS = (*COMMANDS.split(), "scenarios", "estimators")
 LOG = """# format: slamlog 1
@@ -43,12 +44,6 @@ odometry,1,1,0,1
 measurement,1,7,-0.01,4.1
 measurement,1,9,1.0,3.0
 """
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import slamgym
+from recordings import recorded
 
-from slamgym.envs.controllers import OpenLoop
 from slamgym.estimator.models.bearing_range import wrap_angle
 from slamgym.experiments.log_conventions import mistake_in
 from slamgym.experiments.logs import (
@@ -17,14 +17,13 @@ from slamgym.experiments.logs import (
     SlamLog,
     read_log,
     read_slamlog,
-    record_episode,
     write_slamlog,
 )
 from slamgym.experiments.run_and_replay.filter_settings import (
     noise_or_assumed,
     settings_for,
 )
-from slamgym.sim_configs import action_sequence, load_scenario
+from slamgym.sim_configs import load_scenario
 
 DATA = os.environ.get("SLAMGYM_DATA")
 PUBLIC = ("cmu16833", "utias_d6_r3")
@@ -33,10 +32,7 @@ NOISE = {"motion_std": (0.05, 0.02, 0.03), "measurement_std": (0.02, 0.1)}
 
 
 def simulated(name, seed, steps=200, **changes):
-    world = load_scenario(name)
-    world = world.with_changes(steps=min(steps, world.steps), **changes)
-    driver = OpenLoop(action_sequence(world), world.robot)
-    return record_episode(world, driver, seed=seed)
+    return recorded(name, seed, steps=min(steps, load_scenario(name).steps), **changes)
 
 
 @pytest.fixture(scope="module")

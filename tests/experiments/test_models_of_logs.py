@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from recordings import recorded
 
 from slamgym.agents import ActiveSlamEnv, BeliefObservation
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.envs.controllers import OpenLoop
 from slamgym.estimator.registry import register_estimator
-from slamgym.experiments import record_episode, replay, settings_for
+from slamgym.experiments import replay, settings_for
 from slamgym.experiments.logs import read_slamlog, write_slamlog
 from slamgym.experiments.logs.slamlog import LogError
 from slamgym.experiments.monte_carlo.filtered_runs import (
@@ -28,14 +28,9 @@ def short(name, steps=40):
     return load_scenario(name).with_changes(steps=steps)
 
 
-def recorded(name):
-    scenario = short(name)
-    return record_episode(scenario, OpenLoop.for_scenario(scenario), seed=3)
-
-
 @pytest.mark.parametrize("name", [*NAMES, "bearing", "range"])
 def test_a_log_keeps_its_models_and_its_replay_those_of_the_runs(name, tmp_path):
-    log = recorded(name)
+    log = recorded(short(name))
     write_slamlog(log, tmp_path / "log.csv")
     again = read_slamlog(tmp_path / "log.csv")
     assert (again.motion, again.header) == (log.motion, log.header)
@@ -48,13 +43,13 @@ def test_a_log_keeps_its_models_and_its_replay_those_of_the_runs(name, tmp_path)
 
 
 def test_a_log_names_the_columns_of_its_models():
-    assert recorded("position").header["measurement_columns"] == "x,y"
-    assert recorded("bicycle").header["odometry_columns"] == "d,steering"
-    assert "measurement_columns" not in recorded("bicycle").header
+    assert recorded(short("position")).header["measurement_columns"] == "x,y"
+    assert recorded(short("bicycle")).header["odometry_columns"] == "d,steering"
+    assert "measurement_columns" not in recorded(short("bicycle")).header
 
 
 def test_a_log_of_an_unknown_drive_is_refused(tmp_path):
-    log = recorded("differential")
+    log = recorded(short("differential"))
     write_slamlog(log, tmp_path / "log.csv")
     text = (tmp_path / "log.csv").read_text().replace("differential[", "tracked[")
     (tmp_path / "log.csv").write_text(text)

@@ -18,13 +18,12 @@ import psutil
 import pytest
 import xarray as xr
 from comparison import tree
+from recordings import recorded
 
-from slamgym.envs.controllers import make_controller
 from slamgym.estimator import Belief, EkfSlam, make_estimator
 from slamgym.evaluation import AssociationScores, Gospa, oracle_errors
 from slamgym.evaluation.nees import pose_nees, state_nees
 from slamgym.experiments.command_line.monte_carlo import connected
-from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.monte_carlo import monte_carlo, runner, summarise_monte_carlo
 from slamgym.experiments.monte_carlo.filtered_runs import (
     bound_runs,
@@ -130,8 +129,7 @@ def test_a_filter_that_cannot_batch_gives_the_same_numbers(whole):
 
 def test_figures_are_those_of_a_replay_of_the_same_drive(whole):
     run = 3
-    driver = make_controller("open_loop", WORLD, np.random.default_rng())
-    log = record_episode(WORLD, driver, run)
+    log = recorded(WORLD, run)
     done = replay(log, settings_for(log, estimator="invariant").make(log.start))
     row = whole.sel(estimator="invariant", run=run)
     trace = done.trace

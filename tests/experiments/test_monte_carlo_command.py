@@ -13,6 +13,7 @@ from commands import slamgym
 from slamgym.experiments.monte_carlo import monte_carlo
 from slamgym.experiments.monte_carlo.results import load_results
 
+pytestmark = pytest.mark.usefixtures("here")
 FRAGILE = '''
 from slamgym.estimator import EkfSlam
 
@@ -26,12 +27,6 @@ class Fragile(EkfSlam):
             raise RuntimeError("<b>a wheel</b> came off")
         return report
 '''
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 def refused(*arguments):

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import slamgym
+from recordings import recorded
 from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from slamgym.envs.controllers import OpenLoop
 from slamgym.experiments.command_line.tables import advice
 from slamgym.experiments.job_folders import files_below
 from slamgym.experiments.logs import (
@@ -18,7 +18,6 @@ from slamgym.experiments.logs import (
     Scan,
     SlamLog,
     read_slamlog,
-    record_episode,
     write_slamlog,
 )
 from slamgym.experiments.logs.ground_truth import without_identities
@@ -42,7 +41,6 @@ from slamgym.experiments.noise_fitting.scoring import (
 from slamgym.experiments.noise_fitting.search import LogLikelihood, noise_of
 from slamgym.experiments.noise_fitting.summary import options_line
 from slamgym.experiments.run_and_replay import replay, settings_for, summarise
-from slamgym.sim_configs import action_sequence, load_scenario
 
 MOTION, SENSOR = (0.05, 0.03, 0.02), (0.02, 0.08)
 
@@ -52,9 +50,7 @@ def a_log(seed=3, *, steps=150, world="six_landmarks", **changes):
         "motion": changes.pop("motion", {"std": MOTION}),
         "sensor": {"std": SENSOR, **changes.pop("sensor", {})},
     }
-    scenario = load_scenario(world).with_changes(steps=steps, **noise, **changes)
-    driver = OpenLoop(action_sequence(scenario), scenario.robot)
-    return record_episode(scenario, driver, seed)
+    return recorded(world, seed, steps=steps, **noise, **changes)
 
 
 def fitted(log, *, start=(0.2, 0.2, 0.2, 0.1, 0.3), **settings):
@@ -102,9 +98,7 @@ FAR = (0.01, 0.004, 0.3, 0.002, 0.9)
 
 @pytest.mark.slow
 def test_the_intervals_of_a_very_short_log_hold_the_fitted_noise():
-    world = load_scenario("six_landmarks").with_changes(steps=3)
-    driver = OpenLoop(action_sequence(world), world.robot)
-    log = record_episode(world, driver, 0)
+    log = recorded("six_landmarks", 0, steps=3)
     for noise in fit_noise(log, settings_for(log)).noise:
         assert noise.low <= noise.value <= noise.high
 

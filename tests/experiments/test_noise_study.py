@@ -6,11 +6,10 @@ from io import StringIO
 
 import numpy as np
 import pytest
+from recordings import recorded
 from rich.console import Console
 
-from slamgym.envs.controllers import OpenLoop
 from slamgym.experiments.command_line.tables import runs_table
-from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.logs.slamlog import Scan
 from slamgym.experiments.noise_study import scaled_scenario, study_log, study_scenario
 from slamgym.experiments.run_and_replay.filter_settings import (
@@ -18,19 +17,14 @@ from slamgym.experiments.run_and_replay.filter_settings import (
     FilterSettings,
     settings_for,
 )
-from slamgym.sim_configs import action_sequence, load_scenario
+from slamgym.sim_configs import load_scenario
 
 WORLD = load_scenario("six_landmarks").with_changes(steps=12)
 
 
-def record(scenario):
-    driver = OpenLoop(action_sequence(scenario), scenario.robot)
-    return record_episode(scenario, driver, seed=1)
-
-
 @pytest.fixture(scope="module")
 def log():
-    return record(WORLD)
+    return recorded(WORLD, 1)
 
 
 @pytest.fixture(scope="module")
@@ -110,8 +104,8 @@ def scans(log):
 
 def test_the_study_of_a_world_keeps_the_random_numbers(log):
     """Ten times σβ: the same path, the same ranges, ten times the bearing errors."""
-    exact = record(WORLD.with_changes(sensor={"std": [0.0, 0.08]}))
-    louder = record(scaled_scenario(WORLD, "σβ", 10.0))
+    exact = recorded(WORLD, 1, sensor={"std": [0.0, 0.08]})
+    louder = recorded(scaled_scenario(WORLD, "σβ", 10.0), 1)
     np.testing.assert_array_equal(louder.ground_truth, log.ground_truth)
     np.testing.assert_array_equal(scans(louder)[..., 1], scans(log)[..., 1])
     errors, louder_errors = (
@@ -126,12 +120,12 @@ def test_in_the_study_of_a_world_the_filter_knows_the_changed_noise():
 
     def listen(scenario):
         driven.append(scenario)
-        return record(scenario)
+        return recorded(scenario, 1)
 
     runs = study_scenario(WORLD, listen)
     assert [scenario.motion.std[0] for scenario in driven[:3]] == [0.25, 2.5, 0.025]
     assert driven[-2].sensor.std == pytest.approx((0.01, 0.8))
-    louder = record(driven[-2])
+    louder = recorded(driven[-2], 1)
     alone = study_log(louder, settings_for(louder))[0]
     assert runs[-2].row.pose_area == alone.row.pose_area
     assert runs[-2].row.std == pytest.approx(0.8)

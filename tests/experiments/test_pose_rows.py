@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from recordings import recorded
 
-from slamgym.envs.controllers import OpenLoop
-from slamgym.experiments.logs.recording import record_episode, steps_of
+from slamgym.experiments.logs.recording import steps_of
 from slamgym.experiments.logs.slamlog import (
     LogError,
     OdometryRow,
@@ -19,7 +19,7 @@ from slamgym.experiments.run_and_replay.filter_settings import settings_for
 from slamgym.experiments.run_and_replay.log_replay import replay
 from slamgym.experiments.run_and_replay.log_smoothing import smooth_log
 from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
-from slamgym.sim_configs import action_sequence, load_scenario
+from slamgym.sim_configs import load_scenario
 
 NAN = float("nan")
 
@@ -33,8 +33,7 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def log(scenario):
-    driver = OpenLoop(action_sequence(scenario), scenario.robot)
-    return record_episode(scenario, driver, seed=4)
+    return recorded(scenario, 4)
 
 
 def test_a_recorded_log_reads_back_bit_by_bit(log, tmp_path):

@@ -2,9 +2,10 @@ import gymnasium
 import numpy as np
 import pytest
 from comparison import assert_same_bits
+from recordings import recorded
 
 import slamgym  # noqa: F401 (registers the environment)
-from slamgym.envs.controllers import OpenLoop, Waypoints, make_controller
+from slamgym.envs.controllers import Waypoints, make_controller
 from slamgym.estimator import make_estimator
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.logs.slamlog import (
@@ -16,11 +17,6 @@ from slamgym.experiments.logs.slamlog import (
 from slamgym.experiments.run_and_replay.filter_settings import settings_for
 from slamgym.experiments.run_and_replay.log_replay import replay
 from slamgym.sim_configs import action_sequence, load_scenario
-
-
-def recorded(scenario, seed=3, **changes):
-    world = load_scenario(scenario).with_changes(**changes)
-    return record_episode(world, OpenLoop(action_sequence(world), world.robot), seed)
 
 
 def in_the_loop(scenario, seed):

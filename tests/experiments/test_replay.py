@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from far_origins import far_origins, rounding, shifted
+from recordings import recorded
 from rich.console import Console
 
 from slamgym import smooth
-from slamgym.envs.controllers import make_controller
 from slamgym.estimator import Belief, Drive, EkfSlam, UpdateReport, make_estimator
 from slamgym.experiments.command_line.tables import key_figures, landmark_table
 from slamgym.experiments.logs.ground_truth import (
@@ -18,7 +18,7 @@ from slamgym.experiments.logs.ground_truth import (
     without_identities,
 )
 from slamgym.experiments.logs.importers import read_log
-from slamgym.experiments.logs.recording import record_episode, steps_of
+from slamgym.experiments.logs.recording import steps_of
 from slamgym.experiments.logs.slamlog import (
     LogError,
     OdometryRow,
@@ -34,7 +34,6 @@ from slamgym.experiments.run_and_replay.filter_settings import (
 from slamgym.experiments.run_and_replay.log_replay import MapHistory, replay
 from slamgym.experiments.run_and_replay.log_smoothing import smooth_log
 from slamgym.experiments.run_and_replay.summary import LOST, pose_nees, summarise
-from slamgym.sim_configs import load_scenario
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.02, 0.1)}
 
@@ -75,25 +74,15 @@ def told_of(log):
     return listener.calls
 
 
-def recorded(steps, seed=1, **options):
-    """Record a drive of six_landmarks."""
-    world = load_scenario("six_landmarks").with_changes(steps=steps, **options)
-    driver = make_controller("open_loop", world, np.random.default_rng(0))
-    return record_episode(world, driver, seed=seed)
-
-
 def summary_of(log, **options):
     """Return the summary of a log by its own settings."""
     settings = settings_for(log, **options)
     return summarise(replay(log, settings.make(log.start)))
 
 
-def circles(clutter=0.5, steps=80):
+def circles():
     """Record a drive whose readings have no identity."""
-    changes = {"sensor": {"clutter": clutter}, "steps": steps}
-    world = load_scenario("hidden_identities").with_changes(**changes)
-    driver = make_controller("open_loop", world, np.random.default_rng(0))
-    return record_episode(world, driver, seed=2)
+    return recorded("hidden_identities", 2, steps=80, sensor={"clutter": 0.5})
 
 
 @pytest.mark.parametrize("method", ["nearest", "hypotheses"])
@@ -118,7 +107,7 @@ def test_the_summary_scores_readings_without_identity(method):
 
 
 def test_a_known_log_whose_identities_are_hidden_is_scored():
-    log = recorded(steps=20)
+    log = recorded("six_landmarks", 1, steps=20)
     assert summary_of(log)["association"] is None
     hidden = without_identities(log)
     assert settings_for(hidden).options == {"management": True}
@@ -156,7 +145,7 @@ def test_a_lost_run_is_announced_without_the_truth():
 
 
 def test_with_known_identities_nothing_is_said_about_being_lost():
-    summary = summary_of(recorded(steps=5))
+    summary = summary_of(recorded("six_landmarks", 1, steps=5))
     assert summary["probably_lost"] is None
     assert LOST not in summary["warnings"]
 
@@ -415,7 +404,7 @@ def test_poses_whose_covariance_is_singular_are_counted():
 def test_a_log_far_from_the_origin_has_the_same_summary(name, far):
     summaries = []
     for origin in ((0.0, 0.0), far):
-        log = recorded(20)
+        log = recorded("six_landmarks", 1, steps=20)
         moved = replace(
             log,
             start=shifted(log.start, origin),
@@ -692,7 +681,7 @@ def turned_away(log):
 
 
 def test_without_a_true_start_the_distances_are_aligned_ones():
-    log = recorded(30)
+    log = recorded("six_landmarks", 1, steps=30)
     right = summary_of(log)
     assert right["aligned_landmarks"] is None
     summary = summary_of(turned_away(log))

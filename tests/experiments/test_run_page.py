@@ -8,12 +8,11 @@ import zlib
 
 import numpy as np
 import pytest
+from recordings import recorded
 
-from slamgym.envs.controllers import make_controller
 from slamgym.estimator import EkfSlam, make_estimator
 from slamgym.estimator.interface import MapView, UpdateReport
 from slamgym.experiments.logs import OdometryRow, Scan, SlamLog
-from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.run_and_replay import replay
 from slamgym.experiments.run_and_replay.summary import pose_nees
 from slamgym.experiments.viewers import RunFrames, ViewedRun, write_run_page
@@ -26,16 +25,9 @@ from slamgym.experiments.viewers.run_page import (
     position_codes,
     row_outcomes,
 )
-from slamgym.sim_configs import load_scenario
 
 HOSTILE = "</script></title><script>document.title = 'taken'</script> & '\"$x$"
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.05, 0.1)}
-
-
-def drive(preset, steps):
-    world = load_scenario(preset).with_changes(steps=steps)
-    controller = make_controller("open_loop", world, np.random.default_rng(0))
-    return record_episode(world, controller, 0)
 
 
 def followed(log, name="ekf", **options):
@@ -85,7 +77,7 @@ def arrays_of(page):
 
 @pytest.fixture(scope="module")
 def loop():
-    return drive("loop", 60)
+    return recorded("loop", 0, steps=60)
 
 
 @pytest.fixture(scope="module")
@@ -238,7 +230,7 @@ def test_outcomes_of_readings_without_identity():
 
 
 def test_clutter_is_marked():
-    log = drive("hidden_identities", 12)
+    log = recorded("hidden_identities", 0, steps=12)
     frames = followed(log, "ekf", management=True).frames
     assert len(frames.maps) == 13
     codes = np.concatenate([frame.outcomes for frame in frames.maps.values()])
@@ -339,7 +331,7 @@ def test_a_log_without_truth_or_landmarks_has_a_page(tmp_path):
 
 @pytest.mark.slow
 def test_a_thousand_steps_of_twenty_landmarks_are_small_and_written_fast(tmp_path):
-    log = drive("loop", 1005)
+    log = recorded("loop", 0, steps=1005)
     started = time.process_time()
     alone = replay(log, make_estimator("ekf", **NOISE, initial_pose=log.start))
     without = time.process_time() - started

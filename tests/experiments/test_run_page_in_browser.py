@@ -5,10 +5,9 @@ import re
 import numpy as np
 import pytest
 from PIL import Image
+from recordings import recorded
 
-from slamgym.envs.controllers import make_controller
 from slamgym.estimator import make_estimator
-from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.run_and_replay import replay
 from slamgym.experiments.viewers import RunFrames, ViewedRun, write_run_page
 from slamgym.sim_configs import load_scenario
@@ -19,9 +18,8 @@ HOSTILE = "<script>document.title = 'taken'</script><img src='http://127.0.0.1:9
 
 
 def written_page(path, preset="loop", filters=("ekf", "invariant"), **options):
-    world = load_scenario(preset).with_changes(steps=STEPS)
-    controller = make_controller("open_loop", world, np.random.default_rng(0))
-    log, runs = record_episode(world, controller, 0), []
+    world, runs = load_scenario(preset), []
+    log = recorded(world, 0, steps=STEPS)
     for name in filters:
         frames = RunFrames(log)
         label = "invariant" if name == HOSTILE else name

@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recordings import recorded
 
-from slamgym.envs.controllers import make_controller
 from slamgym.estimator import make_estimator
 from slamgym.experiments.logs.importers import read_log
-from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
 from slamgym.experiments.run_and_replay.filter_settings import (
     SMOOTHER,
@@ -27,7 +26,6 @@ from slamgym.experiments.run_and_replay.summary import (
     run_warnings,
     summarise,
 )
-from slamgym.sim_configs import load_scenario
 
 NOISE = {"motion_std": (0.02, 0.02, 0.01), "measurement_std": (0.02, 0.1)}
 PLACES = np.array([(4.0, 1.0), (5.0, -1.0), (3.0, -2.0)])
@@ -138,13 +136,6 @@ def test_association_failed_by_the_alarm_or_the_truth(
     assert bool(association_failure(summary | {"association": None})) is bool(is_lost)
 
 
-def recorded(name="loop", steps=60):
-    """Record a drive whose readings have identities."""
-    world = load_scenario(name).with_changes(steps=steps)
-    driver = make_controller("open_loop", world, np.random.default_rng(0))
-    return record_episode(world, driver, seed=5)
-
-
 def exchanged(log, *ids):
     """Give each of some landmarks the true position of the one before it."""
     rows = [log.landmark_ids.tolist().index(i) for i in ids]
@@ -165,7 +156,7 @@ def exchange_warnings_of(log, **noise):
 
 @pytest.fixture(scope="module")
 def drive():
-    return recorded()
+    return recorded("loop", 5, steps=60)
 
 
 def test_landmarks_that_fit_each_others_truth_are_named(drive):
@@ -195,7 +186,7 @@ def test_a_cycle_of_three_is_named_with_the_ids_that_its_rows_need(drive):
 
 @pytest.mark.parametrize("name", ["loop", "six_landmarks", "corridor"])
 def test_no_landmark_of_a_right_log_is_named(name):
-    assert exchange_warnings_of(recorded(name)) == [[], []]
+    assert exchange_warnings_of(recorded(name, 5, steps=60)) == [[], []]
 
 
 @pytest.mark.parametrize(

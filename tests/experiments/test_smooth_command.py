@@ -236,11 +236,10 @@ def test_a_filter_that_does_not_smooth_is_refused():
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write_slamlog(a_log(), tmp_path / "little.csv")
-    write_slamlog(a_log(scans=False), tmp_path / "blind.csv")
-    return tmp_path
+def here(here):
+    write_slamlog(a_log(), here / "little.csv")
+    write_slamlog(a_log(scans=False), here / "blind.csv")
+    return here
 
 
 def test_the_command_writes_a_picture_and_the_numbers(here):

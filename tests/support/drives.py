@@ -7,6 +7,7 @@ from slamgym.estimator.models.motions import predict_pose
 
 MOTION_STD = np.array([0.05, 0.02, 0.02])
 MEASUREMENT_STD = np.array([0.02, 0.08])
+NOISE = {"motion_std": MOTION_STD, "measurement_std": MEASUREMENT_STD}
 SIX = np.array([[3, 6], [3, 12], [7, 8], [7, 14], [11, 6], [11, 12.0]])
 
 
