@@ -939,12 +939,12 @@ def test_an_error_without_text_has_a_message():
 def test_a_run_whose_association_failed_names_the_command_that_repairs_it(
     here, without_pictures
 ):
-    hidden = ("--steps", 400, "--set", "sensor.identities=false")
+    hidden = ("run", "loop", "--set", "sensor.identities=false", "--steps")
     clutter = ("--set", "sensor.clutter=1", "--set", "sensor.max_clutter=5")
     wrong = ("-e", 'invariant[management={association="nearest"}]', "--seed", 71006)
-    shown = slamgym("run", "loop", *hidden, "--out", "good").stdout
+    shown = slamgym(*hidden, 40, "--out", "good").stdout
     assert "--associate" not in shown
-    shown = slamgym("run", "loop", *hidden, *clutter, *wrong, "--out", "a b").stdout
+    shown = slamgym(*hidden, 400, *clutter, *wrong, "--out", "a b").stdout
     assert "slamgym smooth 'a b/log.csv' --associate\n" in shown
     words = " ".join(shown.split())
     assert "a filter that knew pose and map would assign 0.3% wrongly" in words
