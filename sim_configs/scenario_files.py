@@ -103,9 +103,9 @@ def scenario_text(scenario: Scenario) -> str:
     """
     table = scenario.model_dump(exclude_none=True)
     parts = {key: value for key, value in table.items() if isinstance(value, dict)}
-    lines = [_assignment(key, table[key]) for key in table if key not in parts]
+    lines = [assignment(key, table[key]) for key in table if key not in parts]
     for name, part in parts.items():
-        lines += ["", f"[{name}]", *(_assignment(*item) for item in part.items())]
+        lines += ["", f"[{name}]", *(assignment(*item) for item in part.items())]
     return "\n".join([*lines, ""])
 
 
@@ -159,7 +159,8 @@ def _syntax_message(path: Path, message: str) -> str:
     return f"{path}, {where}: {reason}"
 
 
-def _assignment(key: str, value: object) -> str:
+def assignment(key: str, value: object) -> str:
+    """Format a value as a line of TOML."""
     return f"{key} = {_toml(value)}"
 
 

@@ -6,11 +6,15 @@ it imports what is heavy when it runs, so that help answers at once.
 
 import inspect
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
 
 from ...leaves import leaf
-from .commands import Reporter, command, main
-from .options import Options, takes
+from .commands import BadInputError, Reporter, command, main
+from .options import Options, declared, takes
 
 __all__ = ["main"]
 __dir__ = __all__.copy
@@ -25,20 +29,57 @@ for _name in COMMANDS:
     leaf(f"experiments.command_line.{_name}")
 
 
-@command
-@takes("as_json")
-def scenarios(*, given: Options) -> None:
-    """List the scenarios.
+@dataclass(frozen=True, kw_only=True)
+class ScenariosOptions(Options):
+    """The options of ``slamgym scenarios``.
 
-    List the scenarios that come with slamgym. Use their names in other commands.
+    Attributes
+    ----------
+    new
+        Write the scenario to a new file, to change it. Other commands take this file in
+        place of a name.
+    """
+
+    new: Path | None = declared(None, "FILE.toml", "print it")
+
+
+@command
+@takes("new as_json")
+def scenarios(
+    name: Annotated[
+        str, typer.Argument(metavar="SCENARIO", help="A preset or a .toml file.")
+    ] = "",
+    *,
+    given: ScenariosOptions,
+) -> None:
+    """List the scenarios, or explain one.
+
+    List the scenarios that come with slamgym. Use their names in other commands. With
+    a name, print every field of this scenario with its meaning, unit and default.
 
     Examples
     --------
     slamgym scenarios
-    slamgym scenarios --json
+    slamgym scenarios loop
+    slamgym scenarios loop --new mine.toml
     """
     from ...sim_configs import list_presets, load_scenario
 
+    if name or given.new:
+        from .explained_scenario import explained
+
+        text = explained(given.scenario(name or "loop"))
+        if given.new is None:
+            given.reporter().show_verbatim(text.rstrip("\n"))
+        elif given.new.suffix != ".toml" or given.new.exists():
+            raise BadInputError(
+                f"--new must be a new .toml file, got {given.new}"
+                f"{', which exists' * given.new.exists()}"
+            )
+        else:
+            given.new.write_text(text, encoding="utf-8")
+        given.reporter().finish({"scenario": text})
+        return
     each = [(name, load_scenario(name)) for name in list_presets()]
     rows = [(name, x.landmarks.count, x.steps, x.description) for name, x in each]
     _show("scenarios", "name landmarks steps description", rows, given.reporter())

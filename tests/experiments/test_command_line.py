@@ -30,6 +30,7 @@ from slamgym.experiments.run_and_replay.filter_settings import (
 from slamgym.experiments.run_and_replay.log_replay import replay
 from slamgym.jit import jit
 from slamgym.sim_configs import list_presets, load_scenario
+from slamgym.sim_configs.scenario import Gps, Randomise, Sensor
 
 pytestmark = pytest.mark.usefixtures("here")
 COMMANDS = "run replay smooth fit-noise generate judge monte-carlo noise-study render"
@@ -802,6 +803,19 @@ def test_every_scenario_and_estimator_is_listed():
 def test_without_a_command_the_help_is_shown():
     assert printed() == printed("--help")
     assert all(command in printed() for command in COMMANDS)
+
+
+@pytest.mark.parametrize("name", ["loop", "bicycle", "active_hard"])
+def test_a_scenario_is_explained_as_a_file_that_gives_the_same_world(name, tmp_path):
+    path = tmp_path / "mine.toml"
+    assert slamgym("scenarios", name, "--new", path).exit_code == 0
+    assert load_scenario(path) == load_scenario(name)
+    assert printed("scenarios", name) == path.read_text()
+    for part in (Sensor, Gps, Randomise):  # set or not
+        for key, field in part.model_fields.items():
+            assert re.search(rf"^(# )?{key} =", path.read_text(), re.MULTILINE)
+            assert field.description in path.read_text()
+    assert "which exists" in slamgym("scenarios", name, "--new", path).output
 
 
 @pytest.mark.slow
