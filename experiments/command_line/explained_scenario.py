@@ -21,7 +21,7 @@ def explained(scenario: Scenario) -> str:
     --------
     >>> from slamgym.sim_configs import load_scenario
     >>> text = explained(load_scenario("loop"))
-    >>> print(text[text.index("dt =") : text.index("# (x0")].rstrip())
+    >>> print(text[text.index("dt =") : text.index("walls =")].rstrip())
     dt = 1.0  # duration of one step [s]; default 0.2
     steps = 1005  # steps of an episode; default 500
     """
