@@ -13,7 +13,7 @@ import numpy as np
 
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.kernels.imagine import View, is_hidden, is_in_view
-from ..estimator.kernels.kalman_gain import half_log_det, largest_variance
+from ..estimator.kernels.sizes_of_covariances import half_log_det, largest_variance
 from ..jit import fma, jit, jit_in_place, njit_allocating, njit_internal, njit_reordered
 from .belief_features import Bounds, FeatureArrays, write_belief_features
 

@@ -25,7 +25,7 @@ from ..arrays import AnyArray, Array, BoolArray, IntArray
 from ..envs.controllers import planned_path
 from ..estimator.filters.batch import BatchStorage
 from ..estimator.filters.ekf import EkfSlam
-from ..estimator.kernels.kalman_gain import largest_variance
+from ..estimator.kernels.sizes_of_covariances import largest_variance
 from ..estimator.models.bearing_range import wrap_angle_jit
 from ..jit import jit_in_place, njit_internal
 from ..sim_configs import Scenario

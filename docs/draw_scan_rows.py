@@ -1,7 +1,7 @@
 """Draw the arrays of one scan, coloured by the function that writes each part.
 
 ``python docs/draw_scan_rows.py`` writes docs/images/scan_rows.png from the layout in
-``estimator/kernels/kalman_gain.py``.
+``estimator/kernels/scan_update.py``.
 """
 
 from pathlib import Path
@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
-from slamgym.estimator.kernels import kalman_gain as layout
+from slamgym.estimator.kernels import scan_update as layout
 
 PICTURE = Path(__file__).parent / "images" / "scan_rows.png"
 

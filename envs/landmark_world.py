@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from operator import getitem
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -22,10 +22,12 @@ from .bearing_range import BearingRangeSensor, hide_identities
 from .drives import drive_of
 from .noise_streams import NoiseRows, PoseSensors, WorldNoise, row_of
 from .random_numbers import EpisodeStarts, drawn_scenarios, episode_keys
-from .rendering.episode_renderer import EpisodeRenderer
-from .rendering.render_state import RENDER_MODES, BeliefLike
 from .robot import OdometrySensor, UnicycleBody
 from .spaces import action_space, clipped_action, observation_space
+
+if TYPE_CHECKING:
+    from .rendering.episode_renderer import EpisodeRenderer
+    from .rendering.render_state import BeliefLike
 
 Observation = dict[str, Any]
 
@@ -100,7 +102,10 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
     array([3., 0.])
     """  # noqa: E501 (tables)
 
-    metadata = {"render_modes": list(RENDER_MODES), "render_fps": _FPS}  # noqa: RUF012
+    metadata = {  # noqa: RUF012 (Gymnasium's form)
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": _FPS,
+    }
     changing: ClassVar[tuple[str, ...]] = (
         *("_np_random", "_body", "_motion_noise", "_sensor_noise", "_renderer"),
     )
@@ -122,8 +127,10 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         self.action_space = action_space(self.scenario)
         self.observation_space = observation_space(self.scenario)
         self.render_mode = render_mode
-        self._renderer = None
+        self._renderer: EpisodeRenderer | None = None
         if render_mode is not None:
+            from .rendering.episode_renderer import EpisodeRenderer  # noqa: PLC0415
+
             self._renderer = EpisodeRenderer(self.scenario, render_mode, fps=_FPS)
         robot, self._dt = self.scenario.robot, self.scenario.dt
         self._limits = robot.max_speed, robot.max_turn_rate

@@ -9,23 +9,23 @@ import inspect
 import re
 import tomllib
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from numpy.typing import ArrayLike
 
-from ..leaves import is_here, leaf
+from ..leaves import leaf
+from ..public_names import is_here
 from ..suggestions import closest, imported
 from .filters import ekf
-from .filters.batch import BatchSlam
-from .filters.ideal import IdealEkfSlam
-from .interface import SlamEstimator
 from .models.sensors import NUMBERS, sensor_in
 
 if TYPE_CHECKING:
+    from .filters.batch import BatchSlam
+    from .interface import SlamEstimator
     from .map_management.policy import LandmarkPolicy
 
 
-EstimatorFactory = Callable[..., SlamEstimator]
+EstimatorFactory: TypeAlias = "Callable[..., SlamEstimator]"
 _NOISE = ("motion_std", "measurement_std", "initial_pose", "initial_pose_std")
 _REFUSED = re.compile(r"(?:unexpected keyword argument|no option) '(\w+)'")
 
@@ -233,6 +233,8 @@ def make_batch(
     estimator = make_estimator(
         name, motion_std=motion_std, measurement_std=measurement_std, **options
     )
+    from .filters.batch import BatchSlam  # noqa: PLC0415 (one filter does without)
+
     if not isinstance(estimator, ekf.EkfSlam):
         managed = " with landmark management" if "management" in options else ""
         raise ValueError(f"{name}{managed} cannot run in batches")
@@ -317,7 +319,7 @@ _shipped: dict[str, EstimatorFactory | str] = {
     "iterated": ekf.IteratedEkfSlam,
     "unscented": f"{__package__}.filters.unscented:UnscentedSlam",
     "robocentric": f"{__package__}.filters.robocentric:RobocentricEkfSlam",
-    "ideal": IdealEkfSlam,
+    "ideal": f"{__package__}.filters.ideal:IdealEkfSlam",
     "compressed": f"{_LARGE}.compressed.compressed_slam:CompressedEkfSlam",
     "sparse_information": (
         f"{_LARGE}.sparse_information.sparse_information_slam:SparseInformationSlam"

@@ -55,12 +55,13 @@ TESTS = {
     "estimator/models/relative_geometry": "relative_geometry",
     "estimator/models/rigid_motion": "error_frames submaps joining ekf_slam",
     "estimator/models/motions": "motions ekf_slam",
-    "estimator/models/sensors": "sensors",
+    "estimator/models/model_checks": "sensors motions",
+    "estimator/models/sensor": "sensors",
     "estimator/kernels/assignment_search": "joint_assignment constellations",
     "estimator/kernels/batch": "batch",
     "estimator/filters/drive_likelihood": "drive_likelihood",
     "estimator/kernels/imagine": "imagine association map_management",
-    "estimator/kernels/kalman_gain": f"{FILTERS} imagine",
+    "estimator/kernels/sizes_of_covariances": "imagine",
     "estimator/kernels/scan_update": (
         f"{FILTERS} association joint_assignment map_management"
     ),

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST, AnyArray, Array, BoolArray, IntArray
 from ...restorable import Restorable, State
+from ..beliefs import Belief, columns_of
 from ..guards import argument_checks, saved_states
 from ..guards.argument_checks import aligned_zeros, shaped, usable_cores
-from ..interface import Belief, columns_of
 from ..kernels.batch import (
     NEVER,
     RunArrays,
@@ -26,12 +26,13 @@ from ..kernels.batch import (
     drive_runs,
     share_out,
 )
-from ..kernels.kalman_gain import Workspace, workspace_for
+from ..kernels.scan_update import FRAMES, Workspace, workspace_for
 from ..models.bearing_range import wrap_angle
-from ..models.sensors import for_sensor, only_placing
+from ..models.sensor_kernels import for_sensor
+from ..models.sensors import only_placing
 from .ekf import EkfSlam
 from .gaussian_map import GaussianMap
-from .pose_readings import FRAMES, ObservedMap, PoseReading, gate_of
+from .pose_readings import ObservedMap, PoseReading, gate_of
 
 
 class BatchSlam(Restorable):

@@ -2,8 +2,8 @@
 
 A bearing or a range alone does not determine where a landmark is.  Its readings wait,
 and the poses from which they were made stay in the state beside the landmarks, with all
-their correlations [1]_.  Once the readings determine the landmark, `collect` adds it to
-the map, and they correct the belief, each of them once, as one measurement together.
+their correlations [1]_.  Once the readings determine the landmark, `WaitingMap` adds it
+to the map, and they correct the belief, each of them once, as one measurement together.
 
 A past pose is two points of the map, its position p and q = p + (cos θ, sin θ).  The
 error of q is e_q = e_p + J (q − p) e_θ.  Therefore every filter of the family keeps a
@@ -38,19 +38,28 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...arrays import LARGEST, Array, BoolArray, IntArray
+from ..beliefs import Belief, MapView, UpdateReport
 from ..guards import saved_states
-from ..guards.argument_checks import LOWEST_ID, RESERVED_IDS
+from ..guards.argument_checks import LOWEST_ID, RESERVED_IDS, refuse_reserved
 from ..guards.saved_states import NUMBERS, WHOLE, Table, with_prefix, without_prefix
-from ..kernels.kalman_gain import AT_ESTIMATE, INVARIANT, BeliefArrays, Rules
-from ..models.rigid_motion import seen_from
+from ..kernels.scan_update import (
+    AT_ESTIMATE,
+    DONE,
+    INVARIANT,
+    OUTCOME,
+    WAITING,
+    BeliefArrays,
+    Rules,
+)
+from ..models.rigid_motion import ErrorFrame, seen_from
 from ..models.sensors import Sensor
-from .gaussian_map import GaussianMap
+from .gaussian_map import MOTION, GaussianMap, UpdateKernel
 from .pose_readings import moves_of, retracted
 
 #: Largest number of past poses. Beyond it, the pose nearest to its predecessor is
@@ -83,6 +92,123 @@ class Waiting(NamedTuple):
 WAITING_STATE: Table = {"ids": (WHOLE, "w", 2), "readings": (NUMBERS, "w", 2)}
 
 
+class WaitingMap(GaussianMap):
+    """A map with the readings that wait, and the past poses that they need.
+
+    Parameters
+    ----------
+    values : sequence of float
+        As in :class:`.GaussianMap`.
+    sensor : Sensor
+        The sensor of the readings.
+    """
+
+    waiting: Waiting
+    _report: UpdateReport | None  # of the last scan, unless the memory holds it
+
+    def __init__(self, values: Sequence[float], sensor: Sensor) -> None:
+        super().__init__(values)
+        self._sensor, self.waiting, self._report = sensor, Waiting(), None
+
+    @property
+    def rules(self) -> Rules:
+        """The rules of the filter."""
+        return Rules(*self.parts.values[:MOTION].tolist())
+
+    @property
+    def landmark_slots(self) -> dict[int, int]:
+        """Place of each landmark in the state, without the points of past poses."""
+        return {i: slot for i, slot in self.slots.items() if is_landmark(i)}
+
+    def reset(self, pose: Array, pose_covariance: Array) -> None:
+        """Start with an empty map at a pose (3,), and no readings."""
+        super().reset(pose, pose_covariance)
+        self.waiting = Waiting()
+
+    def hold(self, *belief: Any, **others: Any) -> None:
+        """Continue with another belief; the readings that wait stay."""
+        super().hold(*belief, **others)
+        self._report = None
+
+    def take_in(self, update: UpdateKernel, readings: Array, ids: IntArray) -> int:
+        """Update with readings of mapped landmarks; let those of others wait."""
+        refuse_reserved(ids.tolist())
+        undo = self.bookmark()
+        self.hold(self.used, self.slots)  # what follows changes a copy
+        try:
+            status = super().take_in(update, readings, ids)
+            if status == DONE:
+                report = super().report()
+                left = self.parts.ledger[OUTCOME, : len(ids)] == WAITING
+                new = Waiting(np.column_stack([ids, ids])[left], readings[left])
+                placed = self._collect(new)
+                self._report = report.replace(added_ids=placed)
+        except BaseException:
+            undo()
+            raise
+        return status
+
+    def report(self) -> UpdateReport:
+        """Return the report of the last scan, with the landmarks placed after it."""
+        return self._report or super().report()
+
+    def last_report(self) -> UpdateReport:
+        """Return the report of the last scan or reading of the pose once more."""
+        return self._report or super().last_report()
+
+    def _collect(self, new: Waiting) -> tuple[int, ...]:
+        """Take in readings of landmarks that are not mapped, and place those it can.
+
+        The poses of these readings are not read.  Returns the landmarks that have
+        entered the map.
+        """
+        placed, waiting, sensor = [], self.waiting, self._sensor
+        if len(new.ids):
+            pose = _add_pose(self, self.rules)
+            ids = np.column_stack([new.ids[:, 0], np.full(len(new.ids), pose)])
+            waiting = Waiting(
+                np.concatenate([waiting.ids, ids]),
+                np.concatenate([waiting.readings, new.readings]),
+            )
+            for landmark in ids[:, 0].tolist():
+                mine = waiting.ids[:, 0] == landmark
+                count = int(mine.sum())
+                is_due = count <= 6 or pose % 3 == 0  # each trial costs a millisecond
+                if count * sensor.size < 3 or not is_due:
+                    continue
+                if _place(self, sensor, self.rules, waiting.where(mine), landmark):
+                    placed.append(landmark)
+                    waiting = waiting.where(~mine)
+        self.waiting = _forget_poses(self, waiting)
+        return tuple(placed)
+
+    def view(self) -> MapView:
+        """Return a copy of pose and landmarks."""
+        belief = self.belief()
+        return MapView(belief.mean, belief.covariance, belief.landmark_ids)
+
+    def belief(
+        self, frame: ErrorFrame = "additive", ids: Sequence[int] | None = None
+    ) -> Belief:
+        """Return a snapshot of pose and landmarks, or of some landmarks."""
+        return super().belief(frame, tuple(self.landmark_slots) if ids is None else ids)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of the belief and of the readings that wait."""
+        own = with_prefix("waiting", self.waiting._asdict(), "_")
+        return super().state_dict() | own
+
+    def checked(self, state: Mapping[str, Any], **of: str) -> dict[str, Any]:
+        """Return a saved state, or refuse it."""
+        checked = super().checked(state, **of)
+        return checked | read_waiting(state, checked["landmark_ids"])
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned, without checks."""
+        super().restore(state)
+        self.waiting = Waiting(state["waiting_ids"], state["waiting_readings"])
+
+
 def is_landmark(landmark_id: int) -> bool:
     """Return whether an identity in the map is a landmark, not part of a pose."""
     return landmark_id >= LOWEST_ID + RESERVED_IDS
@@ -106,45 +232,6 @@ def read_waiting(state: Mapping[str, Any], mapped: Collection[int]) -> dict[str,
                 f"state['waiting_ids'] must name poses in the map, got {pose}"
             )
     return with_prefix("waiting", checked, "_")
-
-
-def collect(
-    gaussian: GaussianMap, sensor: Sensor, rules: Rules, waiting: Waiting, new: Waiting
-) -> tuple[Waiting, tuple[int, ...]]:
-    """Take in readings of landmarks that are not mapped, and place those it can.
-
-    Parameters
-    ----------
-    gaussian : GaussianMap
-        The map after the update by the scan; it is changed.
-    waiting, new : Waiting
-        Readings of former scans, and of this one; the poses of these are not read.
-
-    Returns
-    -------
-    waiting : Waiting
-        The readings that wait from now on.
-    placed : tuple of int
-        Landmarks that have entered the map.
-    """
-    placed = []
-    if len(new.ids):
-        pose = _add_pose(gaussian, rules)
-        ids = np.column_stack([new.ids[:, 0], np.full(len(new.ids), pose)])
-        waiting = Waiting(
-            np.concatenate([waiting.ids, ids]),
-            np.concatenate([waiting.readings, new.readings]),
-        )
-        for landmark in ids[:, 0].tolist():
-            mine = waiting.ids[:, 0] == landmark
-            count = int(mine.sum())
-            is_due = count <= 6 or pose % 3 == 0  # each trial costs a millisecond
-            if count * sensor.size < 3 or not is_due:
-                continue
-            if _place(gaussian, sensor, rules, waiting.where(mine), landmark):
-                placed.append(landmark)
-                waiting = waiting.where(~mine)
-    return _forget_poses(gaussian, waiting), tuple(placed)
 
 
 def _names(pose: int) -> tuple[int, int]:

@@ -17,11 +17,13 @@ from ...arrays import LARGEST, Array, IntArray
 from ...jit import jit, njit_internal
 from ..guards import argument_checks
 from ..guards.argument_checks import aligned_zeros, usable_cores
-from ..kernels import kalman_gain as gain
+from ..kernels import scan_update as scan
 from ..kernels.batch import share_out
-from ..kernels.kalman_gain import BeliefArrays, Rules, Workspace
 from ..kernels.scan_update import (
     DONE,
+    BeliefArrays,
+    Rules,
+    Workspace,
     as_rules,
     linearise,
     own_covariance,
@@ -201,7 +203,7 @@ def _new_record(count: int, events: DriveEvents, keep_beliefs: bool) -> DriveRec
         np.full((count, kept, 3), np.nan),
         np.full((count, kept, 3, 3), np.nan),
         np.full((count, readings, 2), np.nan),
-        np.full((count, readings), gain.SKIPPED, dtype=np.int64),
+        np.full((count, readings), scan.SKIPPED, dtype=np.int64),
     )
 
 
@@ -231,7 +233,7 @@ def _follow(
         # From (0, 0): far away, rounding would blur the likelihoods of a search.
         (first.mean[:3] * (0.0, 0.0, 1.0), first.covariance[:3, :3].copy()),
         belief,
-        tuple(gain.workspace_for(rules, most, capacity)),
+        tuple(scan.workspace_for(rules, most, capacity)),
         np.empty(landmarks, dtype=np.int64),
         tuple(array[part] for array in record),
     )
@@ -269,8 +271,8 @@ def follow_drive(
     start
         Mean (3,) and covariance (3, 3) of the first pose.
     belief_arrays, workspace_arrays
-        Room: the entries of :class:`.kalman_gain.BeliefArrays` and
-        :class:`.kalman_gain.Workspace`.
+        Room: the entries of :class:`.scan_update.BeliefArrays` and
+        :class:`.scan_update.Workspace`.
     slots : ndarray, shape (n,)
         Room for the places of the landmarks in the map.
     record_arrays
@@ -280,13 +282,13 @@ def follow_drive(
     drive, record = DriveEvents(*events), DriveRecord(*record_arrays)
     belief, workspace = BeliefArrays(*belief_arrays), Workspace(*workspace_arrays)
     most = len(workspace.rows)
-    ledger = np.zeros((gain.LEDGER_HEIGHT, most), np.int64)
+    ledger = np.zeros((scan.LEDGER_HEIGHT, most), np.int64)
     readings, own = np.empty((most, 2)), np.empty((most, 3))
     variance = np.empty(3)
     for b in range(len(noises)):
         begin(belief, slots, start)
         for i in range(NOISE_WIDTH - SENSOR):
-            rule_values[gain.FIRST_STD + i] = noises[b, SENSOR + i]
+            rule_values[scan.FIRST_STD + i] = noises[b, SENSOR + i]
         rules = as_rules(rule_values)
         size = len(start[0])  # a literal would compile all kernels anew
         for s in range(len(drive.first_motions) - 1):
@@ -316,7 +318,7 @@ def follow_drive(
             for k in range(count):
                 readings[k, 0] = drive.readings[first + k, 0]
                 readings[k, 1] = drive.readings[first + k, 1]
-                ledger[gain.SLOT, k] = slots[drive.landmarks[first + k]]
+                ledger[scan.SLOT, k] = slots[drive.landmarks[first + k]]
             examine(belief, readings, count, ledger, rules, workspace.rows, own)
             status, used, nis = update_belief(
                 belief, size, readings, count, ledger, workspace, rule_values
@@ -346,17 +348,17 @@ def settle(
     """Count rejected readings as at the gate; return the size with new landmarks."""
     first = drive.first_readings[s]
     for k in range(drive.first_readings[s + 1] - first):
-        if ledger[gain.OUTCOME, k] == gain.ADDED:
+        if ledger[scan.OUTCOME, k] == scan.ADDED:
             slots[drive.landmarks[first + k]] = (size - 3) // 2
             size += 2
-        elif ledger[gain.OUTCOME, k] == gain.GATED:
+        elif ledger[scan.OUTCOME, k] == scan.GATED:
             record.rejected[b] += 1
             least = 0.5 * (gate + own[k, 2]) + LOG_TURN
             record.log_likelihoods[b, s] -= least if math.isfinite(least) else math.inf
         if record.innovations.shape[1] > 0:
             record.innovations[b, first + k, 0] = own[k, 0]
             record.innovations[b, first + k, 1] = own[k, 1]
-            record.outcomes[b, first + k] = ledger[gain.OUTCOME, k]
+            record.outcomes[b, first + k] = ledger[scan.OUTCOME, k]
     return size
 
 
@@ -385,8 +387,8 @@ def begin(belief: BeliefArrays, slots: IntArray, start: tuple[Array, Array]) -> 
 def log_density(rows: Array, used: int, nis: float) -> float:
     """Return log N(ν; 0, S) of the readings of a scan that were used."""
     half_log_det = 0.0
-    for row in range(gain.FIRST, gain.FIRST + 2 * used, 2):
-        half_log_det += math.log(rows[row, gain.ROOT] * rows[row + 1, gain.ROOT + 1])
+    for row in range(scan.FIRST, scan.FIRST + 2 * used, 2):
+        half_log_det += math.log(rows[row, scan.ROOT] * rows[row + 1, scan.ROOT + 1])
     return -0.5 * nis - half_log_det - used * LOG_TURN
 
 
@@ -404,24 +406,24 @@ def examine(
 
     Readings of new landmarks get nan.  The rows of the system are overwritten.
     """
-    mean, P, system = belief.mean, belief.covariance, rows[gain.FIRST :]
+    mean, P, system = belief.mean, belief.covariance, rows[scan.FIRST :]
     for k in range(count):
         own[k, 0] = own[k, 1] = own[k, 2] = math.nan
-        if ledger[gain.SLOT, k] < 0:
+        if ledger[scan.SLOT, k] < 0:
             continue
-        c = 3 + 2 * ledger[gain.SLOT, k]
+        c = 3 + 2 * ledger[scan.SLOT, k]
         expected = math.hypot(mean[c] - mean[0], mean[c + 1] - mean[1])
         if min(expected, readings[k, 1]) < rules.min_range:
             continue
         at = readings[k, 1] if rules.noise_as_read else expected
         row, below = 2 * k, 2 * k + 1
-        system[row, gain.READING], system[below, gain.READING] = (
+        system[row, scan.READING], system[below, scan.READING] = (
             readings[k, 0],
             readings[k, 1],
         )
-        system[row, gain.VARIANCE], system[below, gain.VARIANCE] = variances(rules, at)
+        system[row, scan.VARIANCE], system[below, scan.VARIANCE] = variances(rules, at)
         linearise(mean, belief.reference, rules.linearisation, system, row, c)
         s00, s10, s11 = own_covariance(P, system, row, c)
-        own[k, 0] = system[row, gain.INNOVATION] / math.sqrt(s00)
-        own[k, 1] = system[below, gain.INNOVATION] / math.sqrt(s11)
+        own[k, 0] = system[row, scan.INNOVATION] / math.sqrt(s00)
+        own[k, 1] = system[below, scan.INNOVATION] / math.sqrt(s11)
         own[k, 2] = math.log(s00 * s11 - s10 * s10)

@@ -11,53 +11,36 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from math import inf, log1p
 from statistics import NormalDist
-from typing import Any, ClassVar, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
-from ..guards import argument_checks, saved_states
-from ..guards.argument_checks import LandmarkIds, landmark_pairs
-from ..guards.saved_states import with_prefix
-from ..guards.undo import Undo, attributes, undo_all, undone_on_error, with_copies
-from ..interface import Belief, MapView, UpdateReport, describe_filter
-from ..kernels import kalman_gain as gain
-from ..kernels.kalman_gain import BeliefArrays, Rules
-from ..kernels.scan_update import DONE, NOT_USABLE
+from ..beliefs import Belief, MapView, UpdateReport, describe_filter
+from ..guards import argument_checks
+from ..guards.argument_checks import LandmarkIds, landmark_pairs, with_copies
+from ..kernels import scan_update as scan
+from ..kernels.scan_update import DONE, FRAMES, NOT_USABLE, BeliefArrays, Rules
 from ..models.motions import UNICYCLE, Motion, MotionNoise
-from ..models.sensors import (
-    BEARING_RANGE,
-    DELAYED,
-    Sensor,
-    find_sensor,
-    for_sensor,
-    two_stds,
-)
-from .delayed_landmarks import Waiting, collect, is_landmark, read_waiting
-from .gaussian_map import (
-    MAP_STATE,
-    REPEATED,
-    GaussianMap,
-    UpdateKernel,
-    move_pose,
-    update_map,
-)
-from .pose_readings import ObservesPoses, coincide
+from ..models.rigid_motion import ErrorFrame
+from ..models.sensors import BEARING_RANGE, DELAYED, Sensor, find_sensor, two_stds
+from .gaussian_map import REPEATED, GaussianMap, UpdateKernel, move_pose, update_map
+
+if TYPE_CHECKING:
+    from .pose_readings import ObservedMap, PoseReading
 
 #: How a new landmark enters the map.
 LANDMARK_INITS = ("full", "independent", DELAYED)
 
 
-class MapFilter(ObservesPoses):
+class MapFilter:
     """A filter without its steps: reset, belief, saved state, map editing."""
 
     #: The belief, in the arrays that steps change.
     map: GaussianMap
     #: What distinguishes this filter's updates from another's.
     rules: Rules
-    #: Readings that wait, of a sensor that does not place landmarks one by one.
-    waiting: Waiting | None = None
 
     __repr__ = describe_filter
 
@@ -74,8 +57,61 @@ class MapFilter(ObservesPoses):
         first = argument_checks.finite_vector("pose", pose, 3)
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
         self.map.reset(first, np.diag(std**2))
-        if self.waiting is not None:
-            self.waiting, self._report = Waiting(), None
+
+    def observe_pose(
+        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
+    ) -> UpdateReport:
+        """Correct the belief with a reading of the pose, such as compass or GPS.
+
+        The reading is z = H (x, y, θ) + w.  A compass has H = [0 0 1], a GPS
+        H = [1 0 0; 0 1 0].
+
+        Parameters
+        ----------
+        reading : array_like, shape (k,)
+            z [m or rad]; a component that depends on the heading alone is an angle.
+        matrix : array_like, shape (k, 3)
+            H.
+        covariance : array_like, shape (k, k)
+            R, of the noise w; positive definite.
+
+        Returns
+        -------
+        UpdateReport
+            NIS, innovation (k,) and its covariance.  It has no degrees of freedom where
+            the gate of the filter, if any, rejects the reading.
+
+        Raises
+        ------
+        ValueError
+            If an argument is malformed; the belief is then as before.
+
+        Examples
+        --------
+        >>> from slamgym.estimator import InvariantEkfSlam
+        >>> slam = InvariantEkfSlam((0, 0, 0), (0.1, 0.1), initial_pose_std=(1, 1, 1))
+        >>> slam.observe_pose(0.5, [0, 0, 1], 1.0).degrees_of_freedom
+        1
+        >>> slam.belief().pose
+        array([0.  , 0.  , 0.25])
+        """
+        from .pose_readings import PoseReading, gate_of  # noqa: PLC0415 (for few drives)
+
+        given = PoseReading.checked(reading, matrix, covariance)
+        mean, P, reference = self.map.used
+        found = self._observe(given, mean, P)
+        if not found.nis <= gate_of(self.rules, len(found.innovation)):
+            return UpdateReport()
+        after = BeliefArrays(found.mean, found.covariance, reference)
+        block, report = self.map.blank(self.map.room), found.report()
+        self.map.hold(after, self.map.slots, block=block, steps=1, report=report)
+        return report
+
+    def _observe(
+        self, given: PoseReading, mean: Array, covariance: Array
+    ) -> ObservedMap:
+        once = self.rules.iterations == 1
+        return given.correct(mean, covariance, frame=self.frame, once=once)
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise landmarks; the remaining belief is unchanged to the last bit.
@@ -110,9 +146,11 @@ class MapFilter(ObservesPoses):
         numpy.linalg.LinAlgError
             If a distance has no uncertainty, or is far beyond it; nothing is merged.
         """
+        from .pose_readings import coincide  # noqa: PLC0415 (few drives merge)
+
         kept, gone = landmark_pairs(pairs, self.slots)
         (mean, P, reference), slots = self.map.used, self.map.slots
-        at_estimate = self.rules.linearisation == gain.AT_ESTIMATE
+        at_estimate = self.rules.linearisation == scan.AT_ESTIMATE
         merged = coincide(
             mean,
             P,
@@ -133,16 +171,11 @@ class MapFilter(ObservesPoses):
         """
         if landmark_ids is not None:
             landmark_ids = argument_checks.mapped_identities(landmark_ids, self.slots)
-        elif self.waiting is not None:
-            landmark_ids = self.landmark_ids
         return self.map.belief(self.frame, landmark_ids)
 
     def map_view(self) -> MapView:
         """Return pose and map without a copy; it is valid until the next step."""
-        if self.waiting is None:
-            return self.map.view()
-        belief = self.belief()
-        return MapView(belief.mean, belief.covariance, belief.landmark_ids)
+        return self.map.view()
 
     @property
     def landmark_ids(self) -> tuple[int, ...]:
@@ -152,17 +185,16 @@ class MapFilter(ObservesPoses):
     @property
     def slots(self) -> Mapping[int, int]:
         """Place of each landmark in the state: column 3 + 2 slot."""
-        slots = self.map.slots
-        if self.waiting is None:
-            return slots
-        return {i: slot for i, slot in slots.items() if is_landmark(i)}
+        return self.map.landmark_slots
+
+    @property
+    def frame(self) -> ErrorFrame:
+        """Coordinates in which the filter takes its error to be Gaussian."""
+        return FRAMES[self.rules.frame]
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of mean, covariance, ids and linearisation points."""
-        state = {"estimator": np.array(type(self).__name__), **self.map.state_dict()}
-        if self.waiting is not None:
-            state |= with_prefix("waiting", self.waiting._asdict(), "_")
-        return state
+        return {"estimator": np.array(type(self).__name__), **self.map.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state, bit for bit in a filter of the same settings.
@@ -178,35 +210,25 @@ class MapFilter(ObservesPoses):
             If the state lacks an entry, belongs to another estimator, or does not fit
             together; the belief is then as before.
         """
-        name = {"estimator": type(self).__name__}
-        checked = saved_states.read(state, MAP_STATE, of=name)
-        if self.waiting is not None:
-            checked |= read_waiting(state, checked["landmark_ids"])
+        checked = self.map.checked(state, estimator=type(self).__name__)
         MapFilter.restore(self, checked)  # subclasses read what is theirs
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state that this process has saved, without checks."""
-        with undone_on_error(self.bookmark()):
-            self.map.restore(state)
-            if self.waiting is not None:
-                self.waiting = Waiting(state["waiting_ids"], state["waiting_readings"])
-                self._report = None
+        self.map.restore(state)
 
     def snapshot(self) -> dict[str, Any]:
         """Return the present state, for :meth:`resume`."""
-        return {**with_copies(vars(self)), "map": self.map.block.copy()}
+        return {**with_copies(vars(self)), "map": self.map.snapshot()}
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
         """Return to a :meth:`snapshot` of a filter with the same settings."""
         self.map.resume(snapshot["map"])
-        vars(self).pop("_report", None)  # that of the class, unless a snapshot has one
         vars(self).update(with_copies({**snapshot, "map": self.map}))
 
-    def bookmark(self) -> Undo:
+    def bookmark(self) -> Callable[[], None]:
         """Return what takes back later calls, as far as no kernel has run."""
-        if self.waiting is None:
-            return self.map.bookmark()
-        return undo_all(self.map.bookmark(), attributes(self))
+        return self.map.bookmark()
 
     @property
     def steps(self) -> int:
@@ -215,7 +237,7 @@ class MapFilter(ObservesPoses):
 
     def report(self) -> UpdateReport:
         """Return the report of the last update once more; empty after an edit."""
-        return self.map.last_report() if self._report is None else self._report
+        return self.map.last_report()
 
 
 class EkfSlam(MapFilter):
@@ -287,8 +309,8 @@ class EkfSlam(MapFilter):
     array([[3., 0.]])
     """
 
-    _linearisation: ClassVar[int] = gain.AT_ESTIMATE
-    _frame: ClassVar[int] = gain.ADDITIVE
+    _linearisation: ClassVar[int] = scan.AT_ESTIMATE
+    _frame: ClassVar[int] = scan.ADDITIVE
 
     #: The kernels of both steps.
     _update_map: ClassVar[UpdateKernel] = staticmethod(update_map)
@@ -312,7 +334,6 @@ class EkfSlam(MapFilter):
         given = find_sensor(sensor)
         self.sensor = given.delayed() if landmark_init == DELAYED else given
         self._is_default = self.sensor == BEARING_RANGE
-        self.waiting = None if self.sensor.places else Waiting()
         self.rules = checked_rules(
             measurement_std,
             sensor=self.sensor,
@@ -322,8 +343,17 @@ class EkfSlam(MapFilter):
             gate_probability=gate_probability,
             min_range=min_range,
         )
-        self.map = GaussianMap((*self.rules, *self._motion_noise.variance))
+        self.map = self._empty_map()
         self.reset(initial_pose, initial_pose_std)
+
+    def _empty_map(self) -> GaussianMap:
+        """Return a map that the filter's sensor can fill."""
+        values = (*self.rules, *self._motion_noise.variance)
+        if self.sensor.places:
+            return GaussianMap(values)
+        from .delayed_landmarks import WaitingMap  # noqa: PLC0415 (few sensors need it)
+
+        return WaitingMap(values, self.sensor)
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move the pose by one odometry reading.
@@ -375,36 +405,19 @@ class EkfSlam(MapFilter):
         MemoryError
             If memory cannot hold the map; the belief is then as before.
         """
-        sensor, kernel = self.sensor, self._update_map
-        readings = argument_checks.scan(measurements, sensor.columns)
+        readings = argument_checks.scan(measurements, self.sensor.columns)
         ids = argument_checks.identity_array(landmark_ids, len(readings), self)
-        if not self._is_default:
-            kernel = for_sensor(kernel, sensor)
-            if self.waiting is not None:
-                return self._update_and_collect(kernel, readings, ids, self.waiting)
+        kernel = self._update_map if self._is_default else self._kernel_of_sensor()
         status = self.map.take_in(kernel, readings, ids)
         if status != DONE:
             self._refuse(status, readings, ids)
         return self.map.report()
 
-    def _update_and_collect(
-        self, kernel: UpdateKernel, readings: Array, ids: IntArray, waiting: Waiting
-    ) -> UpdateReport:
-        """Update with readings of mapped landmarks; let those of others wait."""
-        argument_checks.refuse_reserved(ids.tolist())
-        with undone_on_error(self.bookmark()):
-            self.map.hold(self.map.used, self.map.slots)  # what follows changes a copy
-            status = self.map.take_in(kernel, readings, ids)
-            if status != DONE:
-                self._refuse(status, readings, ids)
-            report = self.map.report()
-            left = self.map.parts.ledger[gain.OUTCOME, : len(ids)] == gain.WAITING
-            new = Waiting(np.column_stack([ids, ids])[left], readings[left])
-            self.waiting, placed = collect(
-                self.map, self.sensor, self.rules, waiting, new
-            )
-            self._report = report.replace(added_ids=placed)
-        return self._report
+    def _kernel_of_sensor(self) -> UpdateKernel:
+        from ..models.sensor_kernels import for_sensor  # noqa: PLC0415 (compiled anew)
+
+        kernel: UpdateKernel = for_sensor(self._update_map, self.sensor)
+        return kernel
 
     @property
     def motion_values(self) -> Array:
@@ -432,7 +445,7 @@ class EkfSlam(MapFilter):
             argument_checks.refuse_repeated(given)
         if status == NOT_USABLE:
             argument_checks.refuse_unusable(readings, given)
-        used = self.map.parts.ledger[gain.OUTCOME, : len(ids)] == gain.USED
+        used = self.map.parts.ledger[scan.OUTCOME, : len(ids)] == scan.USED
         raise argument_checks.not_positive_definite(given[np.flatnonzero(used)[status]])
 
 
@@ -481,7 +494,7 @@ class InvariantEkfSlam(EkfSlam):
     0.3
     """
 
-    _frame: ClassVar[int] = gain.INVARIANT
+    _frame: ClassVar[int] = scan.INVARIANT
 
     def __init__(
         self,
@@ -517,7 +530,7 @@ class FirstEstimatesEkfSlam(EkfSlam):
        designing consistent EKF SLAM estimators, IJRR 29(5), 2010.
     """
 
-    _linearisation: ClassVar[int] = gain.AT_REFERENCE
+    _linearisation: ClassVar[int] = scan.AT_REFERENCE
 
 
 class ObservabilityConstrainedEkfSlam(EkfSlam):
@@ -540,7 +553,7 @@ class ObservabilityConstrainedEkfSlam(EkfSlam):
        improvement of vision-aided inertial navigation, IEEE T-RO 30(1), 2014.
     """
 
-    _linearisation: ClassVar[int] = gain.PROJECTED
+    _linearisation: ClassVar[int] = scan.PROJECTED
 
 
 class IteratedEkfSlam(EkfSlam):
@@ -591,8 +604,8 @@ def checked_rules(
     measurement_std: ArrayLike,
     *,
     sensor: Sensor,
-    linearisation: int = gain.AT_ESTIMATE,
-    frame: int = gain.ADDITIVE,
+    linearisation: int = scan.AT_ESTIMATE,
+    frame: int = scan.ADDITIVE,
     landmark_init: str = "full",
     gate_probability: float | None = None,
     min_range: float,

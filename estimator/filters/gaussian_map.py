@@ -17,18 +17,16 @@ import numpy as np
 
 from ...arrays import Array, IntArray
 from ...jit import jit_in_place, njit_inlined, njit_internal
-from ..guards import saved_states as saved
+from ..beliefs import Belief, MapView, UpdateReport, columns_of
 from ..guards.argument_checks import (
     aligned_copy,
     aligned_zeros,
     covariance_bytes,
     too_large,
+    with_copies,
 )
-from ..guards.undo import Undo
-from ..interface import Belief, MapView, UpdateReport, columns_of
-from ..kernels import kalman_gain as gain
-from ..kernels.kalman_gain import BeliefArrays, Rules
-from ..kernels.scan_update import DONE, update_lower_half
+from ..kernels import scan_update as scan
+from ..kernels.scan_update import DONE, BeliefArrays, Rules, update_lower_half
 from ..models.rigid_motion import ErrorFrame, predict
 
 FIRST_LANDMARKS = FIRST_READINGS = 8  # that a new map has room for
@@ -57,6 +55,9 @@ VALUES = 24
 
 #: Takes block, readings and ids in; returns the status.
 UpdateKernel = Callable[..., int]
+
+#: Attributes of a map that follow from its block.
+_FROM_BLOCK = {"parts", "_slots", "_last"}
 
 
 class GaussianMap:
@@ -96,31 +97,36 @@ class GaussianMap:
         self._become(new_block(capacity, FIRST_READINGS, np.array(values)))
 
     def _become(
-        self, block: Array, parts: Parts | None = None, last: Any = None
+        self, block: Array, parts: Parts | None = None, last: Any = None, **named: Any
     ) -> None:
         parts = parts or parts_of(block)
 
         def newest() -> Any:  # `last`, and None after the next scan
             return None if parts.numbers[SCANNED] else last
 
-        vars(self).update(block=block, parts=parts, _slots={}, _last=newest)
+        vars(self).update(named, block=block, parts=parts, _slots={}, _last=newest)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the memory; its parts would be copied one by one."""
-        return {"block": self.block}
+        """Return the memory and all else by name, without what follows from them."""
+        return {k: v for k, v in vars(self).items() if k not in _FROM_BLOCK}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Continue with a memory."""
-        self._become(aligned_copy(state["block"]))
+        self._become(aligned_copy(state["block"]), **_without_block(state))
 
-    def resume(self, memory: Array) -> None:
-        """Continue with a copy of a memory, in place where its layout is the same."""
+    def snapshot(self) -> dict[str, Any]:
+        """Return a copy of the memory and all else by name, for :meth:`resume`."""
+        return with_copies(self.__getstate__())
+
+    def resume(self, snapshot: Mapping[str, Any]) -> None:
+        """Return to a :meth:`snapshot`, in place where the layout is the same."""
         self._detach_report()
-        starts = slice(STARTS, NUMBERS)
+        memory, starts = snapshot["block"], slice(STARTS, NUMBERS)
         if memory[starts].tobytes() == self.block[starts].tobytes():
             self._slots, self._last, self.block[:] = {}, type(None), memory
+            vars(self).update(_without_block(snapshot))
         else:
-            self._become(aligned_copy(memory))
+            self.__setstate__(dict(snapshot))
 
     def reset(self, pose: Array, pose_covariance: Array) -> None:
         """Start with an empty map at a pose (3,)."""
@@ -138,6 +144,11 @@ class GaussianMap:
         if len(self._slots) < count:  # a kernel has added landmarks
             self._slots = {i: k for k, i in enumerate(self.parts.ids[:count].tolist())}
         return self._slots
+
+    @property
+    def landmark_slots(self) -> dict[int, int]:
+        """The same, for a map that may hold other points than landmarks."""
+        return self.slots
 
     @property
     def size(self) -> int:
@@ -267,7 +278,7 @@ class GaussianMap:
             status = update(self.block, readings, ids)
         return status
 
-    def report(self) -> ScanReport:
+    def report(self) -> UpdateReport:
         """Return the report of the scan that has just been taken in."""
         report = ScanReport.__new__(ScanReport)  # in half the time of an __init__
         report.__dict__["_parts"] = self.parts  # a frozen dataclass refuses setattr
@@ -292,7 +303,7 @@ class GaussianMap:
         """Marginalise landmarks; all other numbers keep their last bit."""
         self.keep_without(self.used, ids)
 
-    def bookmark(self) -> Undo:
+    def bookmark(self) -> Callable[[], None]:
         """Return a function that undoes later changes, except those of kernels."""
         return partial(vars(self).update, vars(self).copy())
 
@@ -333,10 +344,20 @@ class GaussianMap:
         found = {name: part.copy() for name, part in self.used._asdict().items()}
         return {**found, "landmark_ids": np.array(list(self.slots), dtype=np.int64)}
 
+    def checked(self, state: Mapping[str, Any], **of: str) -> dict[str, Any]:
+        """Return a saved state, or refuse it; ``of`` are classes that it must name."""
+        from ..guards import saved_states  # noqa: PLC0415 (few drives load a state)
+
+        return saved_states.read(state, saved_states.MAP_STATE, of=of)
+
     def restore(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned, without checks."""
         saved = state["mean"], state["covariance"], state["reference"]
         self.hold(BeliefArrays(*saved), np.asarray(state["landmark_ids"]).tolist())
+
+
+def _without_block(state: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in state.items() if name != "block"}
 
 
 # --------------------------------------------------------------------------------------
@@ -369,11 +390,11 @@ def new_block(capacity: int, readings: int, values: Array) -> Array:
     values : ndarray
         The rules, and the variances of the motion per step.
     """
-    iterated = values[gain.ITERATIONS] > 1
+    iterated = values[scan.ITERATIONS] > 1
     capacity, readings = (-(-size // 8) * 8 for size in (capacity, readings))
-    height = gain.FIRST + (2 if iterated else 1) * (2 * readings + 2)
-    before, table = min(capacity, gain.LARGE + 6), 1 << capacity.bit_length()
-    rows, ledger = height * (capacity + gain.META_WIDTH), gain.LEDGER_HEIGHT * readings
+    height = scan.FIRST + (2 if iterated else 1) * (2 * readings + 2)
+    before, table = min(capacity, scan.LARGE + 6), 1 << capacity.bit_length()
+    rows, ledger = height * (capacity + scan.META_WIDTH), scan.LEDGER_HEIGHT * readings
     sizes = [VALUES, capacity, capacity**2, capacity, rows]
     sizes += [before**2, capacity, table, readings, ledger]
     starts = [*accumulate(sizes, initial=NUMBERS)]
@@ -396,12 +417,12 @@ def parts_of(block: Array) -> Parts:
         block[at[1] : at[2]],
         block[at[2] : at[3]].reshape((n, n)),
         block[at[3] : at[4]],
-        block[at[4] : at[5]].reshape((height, n + gain.META_WIDTH)),
+        block[at[4] : at[5]].reshape((height, n + scan.META_WIDTH)),
         block[at[5] : at[6]].reshape((before, before)),
         block[at[6] : at[7]].view(np.int64),
         block[at[7] : at[8]].view(np.int64),
         block[at[8] : at[9]].view(np.int64),
-        block[at[9] : at[10]].view(np.int64).reshape((gain.LEDGER_HEIGHT, -1)),
+        block[at[9] : at[10]].view(np.int64).reshape((scan.LEDGER_HEIGHT, -1)),
     )
 
 
@@ -429,7 +450,7 @@ def update_map(block: Array, readings: Array, ids: IntArray) -> int:
         belief has not changed.
     """
     parts, count = parts_jit(block), len(ids)
-    numbers, slots = parts.numbers, parts.ledger[gain.SLOT]
+    numbers, slots = parts.numbers, parts.ledger[scan.SLOT]
     for k in range(count):
         for j in range(k):
             if ids[j] == ids[k]:
@@ -446,10 +467,10 @@ def update_map(block: Array, readings: Array, ids: IntArray) -> int:
     )
     if status == DONE:
         if used > 0:
-            numbers[LOWER] = size > gain.LARGE
+            numbers[LOWER] = size > scan.LARGE
         for k in range(count):
             parts.scan_ids[k] = ids[k]
-            if parts.ledger[gain.OUTCOME, k] == gain.ADDED:
+            if parts.ledger[scan.OUTCOME, k] == scan.ADDED:
                 parts.ids[slots[k]] = ids[k]
                 numbers[LANDMARKS] += 1
         numbers[SCANNED], numbers[IN_USE], parts.values[NIS] = count, used, nis
@@ -467,15 +488,15 @@ def complete(block: Array) -> None:
 @njit_internal
 def complete_rows(parts: Parts, count: int) -> None:
     """Complete the rows of the landmarks of a scan, or all rows if these are many."""
-    numbers, slots = parts.numbers, parts.ledger[gain.SLOT]
+    numbers, slots = parts.numbers, parts.ledger[scan.SLOT]
     size = 3 + 2 * numbers[LANDMARKS]
     if numbers[LOWER] and 8 * count >= numbers[LANDMARKS]:
-        gain.mirror(parts.covariance, size)
+        scan.mirror(parts.covariance, size)
         numbers[LOWER] = 0
     elif numbers[LOWER]:
         for k in range(count):
             if slots[k] >= 0:
-                gain.refresh(parts.covariance, size, 3 + 2 * slots[k])
+                scan.refresh(parts.covariance, size, 3 + 2 * slots[k])
 
 
 @njit_internal
@@ -496,7 +517,7 @@ def find_slots(parts: Parts, ids: IntArray) -> int:
         at = hash_of(ids[k]) & mask
         while table[at] > 0 and parts.ids[table[at] - 1] != ids[k]:
             at = (at + 1) & mask
-        parts.ledger[gain.SLOT, k] = table[at] - 1
+        parts.ledger[scan.SLOT, k] = table[at] - 1
         new += table[at] == 0
     return new
 
@@ -533,15 +554,7 @@ def move_pose(
 
 
 # --------------------------------------------------------------------------------------
-# Saved states, and what the last scan has left in the memory.
-
-#: What a saved map must be.
-MAP_STATE: saved.Table = {
-    "landmark_ids": (saved.IDS, "n"),
-    "mean": (saved.NUMBERS, "3+2n"),
-    "covariance": (saved.COVARIANCE, "3+2n", "3+2n"),
-    "reference": (saved.NUMBERS, "3+2n"),
-}
+# What the last scan has left in the memory.
 
 
 def without_landmarks(array: Array, slots: Iterable[int]) -> Array:
@@ -583,13 +596,13 @@ class ScanRecord(NamedTuple):
         """
         count, used = parts.numbers[SCANNED : IN_USE + 1].tolist()
         ids, ledger = parts.scan_ids[:count].copy(), parts.ledger[:, :count].copy()
-        found = parts.rows[gain.FIRST : gain.FIRST + 2 * used]
-        if found.shape[1] <= 4 * (3 + 2 * used + gain.META_WIDTH):
+        found = parts.rows[scan.FIRST : scan.FIRST + 2 * used]
+        if found.shape[1] <= 4 * (3 + 2 * used + scan.META_WIDTH):
             return cls(ids, found.copy(), ledger)
-        columns = ledger[gain.COLUMN, :used]
+        columns = ledger[scan.COLUMN, :used]
         landmarks = np.stack([columns, columns + 1], axis=1).ravel()
-        chosen = np.concatenate([[0, 1, 2], landmarks, np.arange(-gain.META_WIDTH, 0)])
-        ledger[gain.COLUMN, :used] = 3 + 2 * np.arange(used)
+        chosen = np.concatenate([[0, 1, 2], landmarks, np.arange(-scan.META_WIDTH, 0)])
+        ledger[scan.COLUMN, :used] = 3 + 2 * np.arange(used)
         return cls(ids, found[:, chosen], ledger)
 
     def joint_factor(self) -> Array:
@@ -598,15 +611,15 @@ class ScanRecord(NamedTuple):
         Off its diagonal blocks L = H Aᵀ, since Q is diagonal.
         """
         rows, count = self.rows, len(self.rows)
-        H = rows[:, gain.JACOBIAN : gain.JACOBIAN + 5]
-        columns = np.repeat(self.ledger[gain.COLUMN, : count // 2], 2)
+        H = rows[:, scan.JACOBIAN : scan.JACOBIAN + 5]
+        columns = np.repeat(self.ledger[scan.COLUMN, : count // 2], 2)
         every = np.arange(count)
         pose = H[:, :3] @ rows[:, :3].T
         x = H[every, 3, None] * rows[:, columns].T
         y = H[every, 4, None] * rows[:, columns + 1].T
         factor: Array = np.tril(pose + x + y)
         pair = (every - every % 2)[:, None] + (0, 1)
-        factor[every[:, None], pair] = rows[:, gain.ROOT : gain.ROOT + 2]
+        factor[every[:, None], pair] = rows[:, scan.ROOT : scan.ROOT + 2]
         return factor
 
 
@@ -657,42 +670,42 @@ class ScanReport(UpdateReport):
     def degrees_of_freedom(self) -> int:
         """Of the NIS: how many numbers the associated readings have."""
         parts = self._parts
-        return int(parts.numbers[IN_USE]) * int(parts.values[gain.NUMBERS_READ])
+        return int(parts.numbers[IN_USE]) * int(parts.values[scan.NUMBERS_READ])
 
     @property
     def associated_ids(self) -> tuple[int, ...]:
         """Mapped landmarks whose readings corrected the belief."""
-        return self._with_outcome(gain.USED)
+        return self._with_outcome(scan.USED)
 
     @property
     def added_ids(self) -> tuple[int, ...]:
         """Landmarks that entered the map."""
-        return self._with_outcome(gain.ADDED)
+        return self._with_outcome(scan.ADDED)
 
     @property
     def rejected_ids(self) -> tuple[int, ...]:
         """Mapped landmarks whose readings the chi-square gate rejected."""
-        return self._with_outcome(gain.GATED)
+        return self._with_outcome(scan.GATED)
 
     @property
     def skipped_ids(self) -> tuple[int, ...]:
         """Landmarks whose readings are too close to use."""
-        return self._with_outcome(gain.SKIPPED)
+        return self._with_outcome(scan.SKIPPED)
 
     @cached_property
     def near_ids(self) -> tuple[int, ...]:
         """Mapped landmarks within 10 σ of the robot."""
         ids, ledger = self._entries
-        return tuple(ids[ledger[gain.NEAR] != 0].tolist())
+        return tuple(ids[ledger[scan.NEAR] != 0].tolist())
 
     @cached_property
     def innovation(self) -> Array:
         """ν, shape (m, 2), rows (bearing, range) [rad, m]."""
-        return self._record.rows[:, gain.INNOVATION].reshape(-1, 2)
+        return self._record.rows[:, scan.INNOVATION].reshape(-1, 2)
 
     def _with_outcome(self, value: int) -> tuple[int, ...]:
         ids, ledger = self._entries
-        outcomes = ledger[gain.OUTCOME].tolist()
+        outcomes = ledger[scan.OUTCOME].tolist()
         if value not in outcomes:  # mostly so
             return ()
         pairs = zip(ids.tolist(), outcomes, strict=True)

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array
+from ..beliefs import UpdateReport
 from ..guards import argument_checks, saved_states
 from ..guards.argument_checks import LandmarkIds
 from ..guards.undo import Undo, attributes, undo_all, undone_on_error
-from ..interface import UpdateReport
-from ..kernels.kalman_gain import AT_ESTIMATE, AT_TRUTH, BeliefArrays
+from ..kernels.scan_update import AT_ESTIMATE, AT_TRUTH, BeliefArrays
 from ..models.rigid_motion import composed, pose_rotation
 from ..models.sensors import only_bearing_range
 from .ekf import EkfSlam

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, IntArray
 from ..guards import argument_checks
 from ..kernels.imagine import Imagined, as_view, imagine_plans
-from ..kernels.kalman_gain import AFTER_STDS, FIRST_STD, workspace_for
+from ..kernels.scan_update import AFTER_STDS, FIRST_STD, workspace_for
 from ..models.motions import only_unicycle
-from ..models.sensors import for_sensor
+from ..models.sensor_kernels import for_sensor
 from .batch import BatchSlam, can_batch
 from .ekf import EkfSlam
 

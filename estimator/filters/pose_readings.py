@@ -1,8 +1,8 @@
 """Condition a Gaussian map: on its pose, on a place, or on landmarks being one.
 
-`ObservesPoses` is a filter that takes readings of its pose.  Below it are pure
-functions of mean (3 + 2n,) and covariance P (3 + 2n, 3 + 2n) in the order
-(x, y, θ, l1x, l1y, …); a landmark is named by its slot 0 … n − 1.
+`PoseReading` is a reading of the pose.  Below it are pure functions of mean (3 + 2n,)
+and covariance P (3 + 2n, 3 + 2n) in the order (x, y, θ, l1x, l1y, …); a landmark is
+named by its slot 0 … n − 1.
 """
 
 from __future__ import annotations
@@ -14,16 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import Array, IntArray
+from ..beliefs import Belief, UpdateReport
 from ..guards import argument_checks
-from ..guards.undo import attributes, undone_on_error
-from ..interface import Belief, UpdateReport
-from ..kernels.kalman_gain import ADDITIVE, INVARIANT, BeliefArrays, Rules
+from ..kernels.scan_update import Rules
 from ..models.bearing_range import wrap_angle
 from ..models.relative_geometry import lever_of
 from ..models.rigid_motion import ErrorFrame, left_jacobian, points_of, state_of
-from .gaussian_map import GaussianMap
-
-FRAMES: dict[int, ErrorFrame] = {ADDITIVE: "additive", INVARIANT: "invariant"}
 
 MOST_ITERATIONS = 50
 STEP_TOLERANCE = 1e-10  # iterations of a pose end when it moves by less [m, rad]
@@ -39,77 +35,6 @@ class ConditionedMap(NamedTuple):
 
 # --------------------------------------------------------------------------------------
 # A reading of the pose: compass, GPS, or any other linear function of (x, y, θ).
-
-
-class ObservesPoses:
-    """A filter on a Gaussian map that takes readings of its pose."""
-
-    #: The belief, in the arrays that steps change.
-    map: GaussianMap
-    #: What distinguishes this filter's updates from another's.
-    rules: Rules
-    #: The report of the last update, unless the memory of the map holds it.
-    _report: UpdateReport | None = None
-
-    @property
-    def frame(self) -> ErrorFrame:
-        """Coordinates in which the filter takes its error to be Gaussian."""
-        return FRAMES[self.rules.frame]
-
-    def observe_pose(
-        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
-    ) -> UpdateReport:
-        """Correct the belief with a reading of the pose, such as compass or GPS.
-
-        The reading is z = H (x, y, θ) + w.  A compass has H = [0 0 1], a GPS
-        H = [1 0 0; 0 1 0].
-
-        Parameters
-        ----------
-        reading : array_like, shape (k,)
-            z [m or rad]; a component that depends on the heading alone is an angle.
-        matrix : array_like, shape (k, 3)
-            H.
-        covariance : array_like, shape (k, k)
-            R, of the noise w; positive definite.
-
-        Returns
-        -------
-        UpdateReport
-            NIS, innovation (k,) and its covariance.  It has no degrees of freedom where
-            the gate of the filter, if any, rejects the reading.
-
-        Raises
-        ------
-        ValueError
-            If an argument is malformed; the belief is then as before.
-
-        Examples
-        --------
-        >>> from slamgym.estimator import InvariantEkfSlam
-        >>> slam = InvariantEkfSlam((0, 0, 0), (0.1, 0.1), initial_pose_std=(1, 1, 1))
-        >>> slam.observe_pose(0.5, [0, 0, 1], 1.0).degrees_of_freedom
-        1
-        >>> slam.belief().pose
-        array([0.  , 0.  , 0.25])
-        """
-        given = PoseReading.checked(reading, matrix, covariance)
-        (mean, P, reference), map_ = self.map.used, self.map
-        found = self._observe(given, mean, P)
-        if not found.nis <= gate_of(self.rules, len(found.innovation)):
-            return UpdateReport()
-        after = BeliefArrays(found.mean, found.covariance, reference)
-        block, report = map_.blank(map_.room), found.report()
-        with undone_on_error(attributes(self, map_)):
-            self._report = None
-            map_.hold(after, map_.slots, block=block, steps=1, report=report)
-        return report
-
-    def _observe(
-        self, given: PoseReading, mean: Array, covariance: Array
-    ) -> ObservedMap:
-        once = self.rules.iterations == 1
-        return given.correct(mean, covariance, frame=self.frame, once=once)
 
 
 class PoseReport(UpdateReport):

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ...jit import jit_in_place, njit_internal
+from ..beliefs import Belief, MapView, part_of
 from ..guards import argument_checks, saved_states
 from ..guards.argument_checks import LandmarkIds
-from ..interface import Belief, MapView, part_of
 from ..kernels.scan_update import DONE
 from ..models.rigid_motion import as_covariance
 from ..models.sensors import only_placing

@@ -8,11 +8,14 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ...jit import njit_allocating, specialised
-from ..kernels import kalman_gain as gain
-from ..kernels.kalman_gain import BeliefArrays, Rules, Workspace
+from ...jit import njit_allocating
+from ...kernel_variants import specialised
+from ..kernels import scan_update as scan
 from ..kernels.scan_update import (
     DONE,
+    BeliefArrays,
+    Rules,
+    Workspace,
     add_landmarks,
     as_rules,
     screen,
@@ -96,7 +99,7 @@ def update_through_points(
     if used > 0:
         root = symmetric_root(belief.covariance, size, size)
         spread, used = look_from_points(belief.mean, root, rules, rows, ledger, count)
-        failed = condition(belief, root, spread[: 2 * used], rows, ledger[gain.COLUMN])
+        failed = condition(belief, root, spread[: 2 * used], rows, ledger[scan.COLUMN])
         if failed >= 0:
             return failed // 2, used, 0.0
     add_landmarks(belief, size, readings, count, rules, ledger)
@@ -112,15 +115,15 @@ def look_from_points(
     These are the m readings within the gate.  The function also writes their ν to the
     system, and the diagonal of their Q at the mean distance of the points.
     """
-    size, system, read, used = len(root), rows[gain.FIRST :], 0, 0
+    size, system, read, used = len(root), rows[scan.FIRST :], 0, 0
     spread = np.empty((2 * count, 2 * size))
     for k in range(count):
-        if ledger[gain.OUTCOME, k] != gain.USED:
+        if ledger[scan.OUTCOME, k] != scan.USED:
             continue
-        row, c = 2 * used, ledger[gain.COLUMN, read]
+        row, c = 2 * used, ledger[scan.COLUMN, read]
         meta = system[2 * read : 2 * read + 2]
-        z0, z1 = meta[0, gain.READING], meta[1, gain.READING]
-        v0, v1 = meta[0, gain.VARIANCE], meta[1, gain.VARIANCE]
+        z0, z1 = meta[0, scan.READING], meta[1, scan.READING]
+        v0, v1 = meta[0, scan.VARIANCE], meta[1, scan.VARIANCE]
         read, distance, first, second = read + 1, 0.0, spread[row], spread[row + 1]
         dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
         e0, e1 = expected_reading_jit(dx, dy, mean[2])
@@ -140,11 +143,11 @@ def look_from_points(
             s00, s10 = (first * first).mean() + v0, (first * second).mean()
             s11 = (second * second).mean() + v1
             if not squared_ratio(n0, n1, s00, s10, s11) <= rules.gate:
-                ledger[gain.OUTCOME, k] = gain.GATED
+                ledger[scan.OUTCOME, k] = scan.GATED
                 continue
-        system[row, gain.INNOVATION], system[row + 1, gain.INNOVATION] = n0, n1
-        system[row, gain.VARIANCE], system[row + 1, gain.VARIANCE] = v0, v1
-        ledger[gain.COLUMN, used] = c
+        system[row, scan.INNOVATION], system[row + 1, scan.INNOVATION] = n0, n1
+        system[row, scan.VARIANCE], system[row + 1, scan.VARIANCE] = v0, v1
+        ledger[scan.COLUMN, used] = c
         used += 1
     return spread, used
 
@@ -163,16 +166,16 @@ def condition(
     with the deviations D of the points.  Returns -1, or the row at which S is not
     positive definite; the belief is then as before.
     """
-    (bottom, points), size, system = spread.shape, len(root), rows[gain.FIRST :]
-    gain.begin_correction(size, rows, system, bottom)
-    delta, A = rows[gain.CORRECTION], (spread[:, :size] - spread[:, size:]) @ root
+    (bottom, points), size, system = spread.shape, len(root), rows[scan.FIRST :]
+    scan.begin_correction(size, rows, system, bottom)
+    delta, A = rows[scan.CORRECTION], (spread[:, :size] - spread[:, size:]) @ root
     L = spread @ spread.T
     for i in range(bottom):
-        row, w = system[i], system[i, gain.INNOVATION]
+        row, w = system[i], system[i, scan.INNOVATION]
         row[: len(belief.mean)] = 0.0
         for j in range(size):
             row[j] = A[i, j] / points
-        own = L[i, i] / points + row[gain.VARIANCE]
+        own = L[i, i] / points + row[scan.VARIANCE]
         rest = own
         for k in range(i):
             factor = L[i, k] / points
@@ -180,22 +183,22 @@ def condition(
                 factor -= L[i, j] * L[k, j]
             L[i, k] = factor = factor / L[k, k]
             rest -= factor * factor
-            w -= factor * system[k, gain.WHITE]
+            w -= factor * system[k, scan.WHITE]
             for j in range(size):
                 row[j] -= factor * system[k, j]
-        if not rest > gain.SINGULAR * own:
+        if not rest > scan.SINGULAR * own:
             return i
         L[i, i] = root_of_rest = np.sqrt(rest)
-        row[gain.WHITE] = w / root_of_rest
+        row[scan.WHITE] = w / root_of_rest
         for j in range(size):
             row[j] /= root_of_rest
-            delta[j] += row[gain.WHITE] * row[j]
+            delta[j] += row[scan.WHITE] * row[j]
     for j in range(size):
         belief.mean[j] += delta[j]
-    gain.downdate(belief.covariance, size, system, 0, bottom)
+    scan.downdate(belief.covariance, size, system, 0, bottom)
     for j in range(size):  # below zero by rounding alone
         belief.covariance[j, j] = max(belief.covariance[j, j], 0.0)
-    gain.restore_upper(belief.covariance, size)
+    scan.restore_upper(belief.covariance, size)
     record(L, system, columns)
     return -1
 
@@ -205,10 +208,10 @@ def record(L: Array, system: Array, columns: IntArray) -> None:
     """Leave L where a report looks for H Aᵀ, with H that selects a column."""
     for i in range(len(L)):
         c = columns[i // 2] + i % 2
-        system[i, gain.ROOT] = L[i, i & -2]
-        system[i, gain.ROOT + 1] = L[i, i] * (i % 2)
-        system[i, gain.JACOBIAN : gain.JACOBIAN + 5] = 0.0
-        system[i, gain.LANDMARK_X + i % 2] = 1.0
+        system[i, scan.ROOT] = L[i, i & -2]
+        system[i, scan.ROOT + 1] = L[i, i] * (i % 2)
+        system[i, scan.JACOBIAN : scan.JACOBIAN + 5] = 0.0
+        system[i, scan.LANDMARK_X + i % 2] = 1.0
         system[: len(L), c] = L[i]
 
 

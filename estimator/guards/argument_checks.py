@@ -398,6 +398,17 @@ def aligned_copy(array: Array) -> Array:
     return copy
 
 
+_CHANGED_IN_PLACE = frozenset((np.ndarray, list, dict, set))
+
+
+def with_copies(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return attributes with copies of those that are arrays, lists, dicts or sets."""
+    return {
+        name: value.copy() if type(value) in _CHANGED_IN_PLACE else value
+        for name, value in values.items()
+    }
+
+
 def usable_cores() -> int:
     """Return the number of cores that this process may use, 1 where it is unknown."""
     if hasattr(os, "sched_getaffinity"):

@@ -222,6 +222,14 @@ WHOLE = Kind(np.int64, whole_numbers)
 COUNTS = Kind(np.int64, partial(whole_numbers, least=0))
 IDS = Kind(np.int64, landmark_ids)
 
+#: What a saved map of a pose and n landmarks must be.
+MAP_STATE: Table = {
+    "landmark_ids": (IDS, "n"),
+    "mean": (NUMBERS, "3+2n"),
+    "covariance": (COVARIANCE, "3+2n", "3+2n"),
+    "reference": (NUMBERS, "3+2n"),
+}
+
 
 # --------------------------------------------------------------------------------------
 # Saved states inside saved states, distinguished by a prefix of their keys.

@@ -1,9 +1,9 @@
 """Calls that change all of a state or nothing, also where an interrupt ends them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
+from .argument_checks import with_copies
 
 #: What takes back later changes; it may be called more than once.
 Undo = Callable[[], None]
@@ -83,14 +83,3 @@ def contents(*objects: object) -> Undo:
             values.update(with_copies(old))
 
     return undo
-
-
-_CHANGED_IN_PLACE = frozenset((np.ndarray, list, dict, set))
-
-
-def with_copies(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return attributes with copies of those that are arrays, lists, dicts or sets."""
-    return {
-        name: value.copy() if type(value) in _CHANGED_IN_PLACE else value
-        for name, value in values.items()
-    }

@@ -9,8 +9,16 @@ import numpy as np
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, jit_in_place, njit_allocating, njit_internal
 from ..models.rigid_motion import predict
-from .kalman_gain import ADDED, LEDGER_HEIGHT, OUTCOME, SLOT
-from .scan_update import DONE, as_rules, update_belief, usable
+from .scan_update import (
+    ADDED,
+    DONE,
+    LEDGER_HEIGHT,
+    OUTCOME,
+    SLOT,
+    as_rules,
+    update_belief,
+    usable,
+)
 
 NEVER = -1
 
@@ -48,7 +56,7 @@ def drive_runs(
     """Take each run through all its steps, in place.
 
     The arguments are plain tuples of the entries of :class:`RunArrays`,
-    :class:`StepData` and :class:`.kalman_gain.Workspace`, because numba takes
+    :class:`StepData` and :class:`.scan_update.Workspace`, because numba takes
     microseconds to recognise a NamedTuple.
 
     Parameters

@@ -16,8 +16,8 @@ from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
 from ..models.bearing_range import expected_reading_jit
 from ..models.rigid_motion import predict
-from .kalman_gain import LEDGER_HEIGHT, SLOT, half_log_det, largest_variance
-from .scan_update import DONE, as_rules, update_belief
+from .scan_update import DONE, LEDGER_HEIGHT, SLOT, as_rules, update_belief
+from .sizes_of_covariances import half_log_det, largest_variance
 
 
 class Settings(NamedTuple):

@@ -30,7 +30,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST, Array
-from ...suggestions import closest, imported
 from ..guards import argument_checks
 from .rigid_motion import composed
 
@@ -237,6 +236,8 @@ def find_motion(motion: str | Motion) -> Motion:
         return motion
     if not isinstance(motion, str):
         raise ValueError(f"motion must be a label or a Motion, got {motion!r}")
+    from ...suggestions import closest, imported  # noqa: PLC0415 (for labels)
+
     if re.fullmatch(r"[\w.]+:\w+", motion):
         return find_motion(imported(motion, f"cannot import motion '{motion}': "))
     match = re.fullmatch(r"\s*(\w+)\s*(?:\[(.*)\])?\s*", motion, re.DOTALL)
@@ -297,45 +298,6 @@ def only_unicycle(motion: Motion, part: str) -> None:
         raise ValueError(
             f"{part} takes the odometry of a unicycle only, got motion '{motion.name}'"
         )
-
-
-def check_motion(motion: str | Motion, trials: int = 1000) -> None:
-    """Test a drive with random odometry.
-
-    It checks that rest moves nothing, that results are finite, that arrays give the
-    same as numbers, and that the displacement is smooth: a filter takes its derivative
-    by the noise as constant.
-
-    Parameters
-    ----------
-    motion : str or Motion
-        The drive.
-    trials : int
-        Number of random readings, with both numbers in [−1, 1].
-
-    Raises
-    ------
-    ValueError
-        With the first mistake found.
-    """
-    model, rng = find_motion(motion), np.random.default_rng(0)
-    odometry = np.vstack([np.zeros(2), rng.uniform(-1.0, 1.0, (trials, 2))])
-    kept = odometry.copy()
-    moved = model.displacements(odometry)
-    mistakes = {
-        "must not write into its arguments": not np.array_equal(kept, odometry),
-        "must return the same values for arrays as for numbers": not np.allclose(
-            [model.displacement(*row) for row in odometry.tolist()], moved, atol=1e-12
-        ),
-        "must be finite": not np.isfinite(moved).all(),
-    }
-    steps = model.displacements(odometry + 1e-6) - moved
-    mistakes[
-        "must be smooth: a change of 1e-6 in the odometry changes it by more than 1e-3"
-    ] = np.abs(steps).max() > 1e-3
-    for mistake, made in mistakes.items():
-        if made:
-            raise ValueError(f"the displacement of motion '{model.name}' {mistake}")
 
 
 class MotionPrediction(NamedTuple):

@@ -1,9 +1,10 @@
 """Sensors as values: what a reading of a landmark is, for filters and their kernels.
 
 A `Sensor` holds a measurement function of the landmark in the robot's frame, with its
-slopes, in plain Python. From it the library derives the Jacobians, compiles kernels,
-and computes in numpy.  `SENSORS` lists the shipped ones: ``bearing_range``,
-``position``, ``bearing`` and ``range``.  `check_sensor` tests one of your own.
+slopes, in plain Python. From it the library derives the Jacobians, compiles kernels
+(`sensor_kernels`), and computes in numpy.  `SENSORS` lists the shipped ones:
+``bearing_range``, ``position``, ``bearing`` and ``range``.  `check_sensor` tests one of
+your own.
 
 Symbols
 -------
@@ -21,18 +22,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import LARGEST_RANGE_GROWTH, Array
-from ...jit import jit, njit_allocating, njit_inlined, specialised
-from ...suggestions import closest, imported
 from ..guards import argument_checks
-from . import bearing_range
-from .bearing_range import LandmarkLocation, MeasurementPrediction, wrap_angle_jit
+from .bearing_range import LandmarkLocation, MeasurementPrediction, wrap_angle
 from .rigid_motion import rotation
 
 Real = Any  # a number, or an array of any shape
@@ -255,7 +252,7 @@ class Sensor:
         apart = np.subtract(readings, expected, dtype=np.float64)
         for column, is_angle in enumerate(self.wraps):
             if is_angle:
-                apart[..., column] = bearing_range.wrap_angle(apart[..., column])
+                apart[..., column] = wrap_angle(apart[..., column])
         if self.size == 1:
             apart[..., 1] = 0.0
         return apart
@@ -377,6 +374,8 @@ def find_sensor(sensor: str | Sensor) -> Sensor:
     name = str(sensor)
     if name in SENSORS:
         return SENSORS[name]
+    from ...suggestions import closest, imported  # noqa: PLC0415 (for other names)
+
     if ":" in name:
         found = imported(name, f"cannot import sensor '{name}': ", kind=True)
         if isinstance(found, Sensor):
@@ -391,6 +390,14 @@ def sensor_in(options: Mapping[str, Any]) -> Sensor:
     sensor = find_sensor(options.get("sensor", BEARING_RANGE))
     numbers = {name: options[name] for name in NUMBERS if name in options}
     return sensor.with_noise(**numbers) if numbers else sensor
+
+
+def two_stds(sensor: Sensor, measurement_std: ArrayLike) -> Array:
+    """Return the noise as two numbers, the second without use where one is read."""
+    if sensor.size == 1 and np.size(measurement_std) == 1:
+        given = argument_checks.as_floats("measurement_std", measurement_std)
+        measurement_std = np.resize(given, 2)
+    return argument_checks.standard_deviations("measurement_std", measurement_std, 2)
 
 
 def only_bearing_range(sensor: str | Sensor, part: str) -> Sensor:
@@ -410,268 +417,3 @@ def only_placing(sensor: Sensor, part: str) -> None:
             f"{part} needs a sensor whose single reading locates a landmark, got "
             f"'{sensor.name}'"
         )
-
-
-# --------------------------------------------------------------------------------------
-# Kernels of a sensor.
-#
-# Kernels are written for bearing and range, entry by entry.  For another sensor they
-# are compiled again, with functions of that sensor in place of those of bearing and
-# range: `bearing_range` lists them.
-
-Kernel = Callable[..., Any]
-
-
-@cache
-def for_sensor(kernel: Any, sensor: Sensor) -> Any:
-    """Return a kernel as it is for another sensor than ``bearing_range``.
-
-    Parameters
-    ----------
-    kernel : callable
-        A kernel for bearing and range.
-    sensor : Sensor
-        The sensor of its readings.
-    """
-    if sensor == BEARING_RANGE:
-        return kernel
-    return specialised(kernel, kernel_parts(sensor), sensor.name)
-
-
-@cache
-def kernel_parts(sensor: Sensor) -> Mapping[Kernel, Kernel]:
-    """Return a sensor's counterpart of each function in a kernel that is for readings.
-
-    See :mod:`.bearing_range` for what each of them returns.  They count references,
-    because functions of a user may return arrays.
-    """
-    h, std, (first, second) = njit_allocating(sensor.h), sensor.std, sensor.wraps
-    std, is_single, places = njit_allocating(std), sensor.size == 1, sensor.places
-    inverse = njit_allocating(sensor.inverse or _nowhere)
-
-    def expected(dx: float, dy: float, heading: float) -> Numbers:
-        cos, sin = np.cos(heading), np.sin(heading)
-        (z0, z1), _ = h(cos * dx + sin * dy, cos * dy - sin * dx)
-        return z0, z1
-
-    def slopes(dx: float, dy: float, heading: float) -> tuple[float, ...]:
-        cos, sin = np.cos(heading), np.sin(heading)
-        x, y = cos * dx + sin * dy, cos * dy - sin * dx
-        _, (ax, ay, bx, by) = h(x, y)
-        a = ax * cos - ay * sin, ax * sin + ay * cos
-        b = bx * cos - by * sin, bx * sin + by * cos
-        return a[0], a[1], b[0], b[1], ax * y - ay * x, bx * y - by * x
-
-    def difference(z0: float, z1: float, e0: float, e1: float) -> Numbers:
-        d0, d1 = z0 - e0, z1 - e1
-        d0 = wrap_angle_jit(d0) if first else d0
-        d1 = wrap_angle_jit(d1) if second else d1
-        return d0, 0.0 if is_single else d1
-
-    def distance(z0: float, z1: float) -> float:
-        x, y = inverse(z0, z1)
-        return float(np.sqrt(x * x + y * y))
-
-    def variances(noise: Noise, distance: float) -> Numbers:
-        s0, s1 = std(noise, distance)
-        return s0 * s0, 1.0 if is_single else s1 * s1
-
-    def placed(
-        pose: tuple[float, float, float], z0: float, z1: float, v0: float, v1: float
-    ) -> tuple[float, ...]:
-        cos, sin = np.cos(pose[2]), np.sin(pose[2])
-        x, y = inverse(z0, z1)
-        _, (ax, ay, bx, by) = h(x, y)
-        per = 1 / (ax * by - ay * bx)
-        ux, uy, wx, wy = by * per, -bx * per, -ay * per, ax * per  # columns of D⁻¹
-        ux, uy, wx, wy = (
-            *(cos * ux - sin * uy, sin * ux + cos * uy),
-            *(cos * wx - sin * wy, sin * wx + cos * wy),
-        )
-        dx, dy = cos * x - sin * y, sin * x + cos * y
-        xy = ux * uy * v0 + wx * wy * v1
-        return (
-            *(pose[0] + dx, pose[1] + dy, -dy, dx),
-            *(ux * ux * v0, wx * wx * v1, xy, uy * uy * v0, wy * wy * v1),
-        )
-
-    def places_at_once() -> bool:
-        return places
-
-    return {
-        bearing_range.expected_reading_jit: jit(expected),
-        bearing_range.pose_slopes_jit: jit(slopes),
-        bearing_range.difference_jit: njit_inlined(difference),
-        bearing_range.read_distance_jit: jit(distance),
-        bearing_range.reading_variances_jit: jit(variances),
-        bearing_range.placed_jit: jit(placed),
-        bearing_range.places_at_once_jit: njit_inlined(places_at_once),
-    }
-
-
-def _nowhere(z0: float, z1: float) -> tuple[float, float]:
-    """Return infinity, in place of a landmark that a reading does not determine."""
-    return z0 + np.inf, z1 + np.inf
-
-
-# --------------------------------------------------------------------------------------
-# Check of a sensor that somebody has written.
-
-
-class SensorContractError(AssertionError):
-    """Raised for a sensor whose functions contradict each other."""
-
-
-def check_sensor(
-    sensor: str | Sensor, measurement_std: ArrayLike = (0.1, 0.1), trials: int = 200
-) -> None:
-    """Check slopes, inverse, angles, noise and compiled code of a sensor.
-
-    Parameters
-    ----------
-    sensor : str or Sensor
-        The sensor.
-    measurement_std : array_like, shape (1,) or (2,)
-        Noise to try.
-    trials : int
-        Number of landmarks to try, all around, from 0.1 to 100 m away.
-
-    Raises
-    ------
-    ValueError
-        If filters would refuse the noise.
-    SensorContractError
-        At the first contradiction, naming the number and where it was seen.
-    """
-    checked = find_sensor(sensor)
-    noise = two_stds(checked, measurement_std)
-    rng = np.random.default_rng(0)
-    r, turn = 10 ** rng.uniform(-1, 2, trials), rng.uniform(-np.pi, np.pi, trials)
-    x, y = r * np.cos(turn), r * np.sin(turn)
-    _check_arrays(checked, x, y)
-    _check_slopes(checked, x, y)
-    _check_angles(checked, x, y)
-    _check_inverse(checked, x, y)
-    _check_std(checked, noise, r)
-    _check_compiled(checked, x, y)
-
-
-def _refuse(sensor: Sensor, what: str) -> None:
-    raise SensorContractError(f"sensor '{sensor.name}': {what}")
-
-
-def _name(sensor: Sensor, column: int) -> str:
-    return sensor.columns[column] if column < sensor.size else "the unused number"
-
-
-def two_stds(sensor: Sensor, measurement_std: ArrayLike) -> Array:
-    """Return the noise as two numbers, the second without use where one is read."""
-    if sensor.size == 1 and np.size(measurement_std) == 1:
-        given = argument_checks.as_floats("measurement_std", measurement_std)
-        measurement_std = np.resize(given, 2)
-    return argument_checks.standard_deviations("measurement_std", measurement_std, 2)
-
-
-def _check_arrays(sensor: Sensor, x: Array, y: Array) -> None:
-    """Look for functions of numbers alone, such as those of `math`."""
-    name = "h"
-    try:
-        readings = sensor.read(x, y)
-        sensor.slopes(x, y)
-        name = "inverse"
-        if sensor.inverse is not None:
-            sensor.inverse(*readings.T)
-    except (TypeError, ValueError) as error:
-        _refuse(
-            sensor,
-            f"{name} must accept arrays: use functions of numpy, not of math, and no "
-            f"if ({error})",
-        )
-
-
-def _check_slopes(sensor: Sensor, x: Array, y: Array) -> None:
-    given, step = sensor.slopes(x, y), 1e-6 * np.hypot(x, y)
-    for axis, (mx, my) in enumerate(((step, 0 * step), (0 * step, step))):
-        ahead, behind = sensor.read(x + mx, y + my), sensor.read(x - mx, y - my)
-        numeric = sensor.difference(ahead, behind) / (2 * step[:, None])
-        scale = 1e-6 * (1 + np.abs(numeric)) + 1e-15 / step[:, None]
-        wrong = ~(np.abs(given[:, :, axis] - numeric) <= scale)
-        if sensor.size == 1:
-            wrong[:, 1] = given[:, 1, axis] != 0
-        if wrong.any():
-            k, column = np.argwhere(wrong)[0]
-            _refuse(
-                sensor,
-                f"∂{_name(sensor, column)}/∂{'xy'[axis]} at ({x[k]:.3g}, {y[k]:.3g}) "
-                f"is {numeric[k, column]:.6g} by finite differences, "
-                f"but h returns {given[k, column, axis]:.6g}",
-            )
-
-
-def _check_angles(sensor: Sensor, x: Array, y: Array) -> None:
-    """Compare the entries of angles with units, values, and jumps around the robot."""
-    spans = np.ptp(sensor.read(x, y), axis=0)
-    for column in range(sensor.size):
-        unit, span, is_angle = sensor.units[column], spans[column], sensor.wraps[column]
-        jumps = _jumps_by_a_turn(sensor, column)
-        if jumps and not is_angle:
-            what = "jumps by 2π around the robot"
-        elif is_angle and not unit.startswith("rad"):
-            what = f"has the unit '{unit}', but only radians are wrapped"
-        elif is_angle and not jumps and span > 2 * np.pi:
-            what = f"varies by {span:.3g} and never jumps by 2π"
-        else:
-            continue
-        what += f": set its entry of angles to {not is_angle}"
-        _refuse(sensor, f"{_name(sensor, column)} {what}")
-
-
-def _jumps_by_a_turn(sensor: Sensor, column: int) -> bool:
-    """Return whether a number jumps by 2π, not at a pole, on a circle of 3 m."""
-
-    def read(turn: Array) -> Array:
-        return sensor.read(3 * np.cos(turn), 3 * np.sin(turn))[:, column]
-
-    ends = np.linspace(0.0, 2 * np.pi, 721)
-    low, high = ends[:-1], ends[1:]
-    for _ in range(30):  # halve each step, keep the half that changes more
-        middle = (low + high) / 2
-        at_low, at_middle, at_high = read(low), read(middle), read(high)
-        later = np.abs(at_high - at_middle) > np.abs(at_middle - at_low)
-        low, high = np.where(later, middle, low), np.where(later, high, middle)
-    jumps = np.abs(read(high) - read(low))
-    return bool((np.abs(jumps - 2 * np.pi) < 1e-3).any())
-
-
-def _check_inverse(sensor: Sensor, x: Array, y: Array) -> None:
-    if sensor.inverse is None:
-        return
-    found = np.stack(sensor.inverse(*sensor.read(x, y).T), axis=-1)
-    off = np.hypot(found[:, 0] - x, found[:, 1] - y) / np.hypot(x, y)
-    if not (off <= 1e-6).all():
-        k = int(np.argmax(~(off <= 1e-6)))
-        _refuse(
-            sensor,
-            f"inverse of the reading of ({x[k]:.3g}, {y[k]:.3g}) is "
-            f"({found[k, 0]:.3g}, {found[k, 1]:.3g})",
-        )
-
-
-def _check_std(sensor: Sensor, noise: Array, distances: Array) -> None:
-    for distance in distances.tolist():
-        std = sensor.std(sensor.noise(noise), distance)
-        if len(std) != 2 or not all(np.isfinite(std)) or not min(std) > 0:
-            _refuse(
-                sensor,
-                f"std must return two finite numbers > 0 at {distance:.3g} m for "
-                f"measurement_std {noise.tolist()}, got {std}",
-            )
-
-
-def _check_compiled(sensor: Sensor, x: Array, y: Array) -> None:
-    expected = kernel_parts(sensor)[bearing_range.expected_reading_jit]
-    for k in range(len(x)):
-        compiled = expected(float(x[k]), float(y[k]), 0.0)
-        plain = sensor.read(x[k : k + 1], y[k : k + 1])[0]
-        if not np.allclose(sensor.difference(compiled, plain), 0, atol=1e-9):
-            _refuse(sensor, f"h returns {compiled} if compiled, but {plain} in numpy")

@@ -17,7 +17,7 @@ from ...arrays import Array, IntArray
 from ..filters.ekf import checked_rules
 from ..filters.pose_readings import PoseReading
 from ..guards import argument_checks
-from ..kernels.kalman_gain import AT_ESTIMATE
+from ..kernels.scan_update import AT_ESTIMATE
 from ..models.bearing_range import wrap_angle
 from ..models.motions import UNICYCLE, Motion, MotionNoise
 from ..models.rigid_motion import pose_rotation, predict

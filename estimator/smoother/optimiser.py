@@ -14,10 +14,9 @@ from scipy.linalg import cho_factor, cho_solve
 
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
+from ..beliefs import Belief, part_of
 from ..filters.ekf import InvariantEkfSlam
-from ..interface import Belief, part_of
-from ..kernels.kalman_gain import Rules
-from ..kernels.scan_update import as_rules, variances
+from ..kernels.scan_update import Rules, as_rules, variances
 from ..models.bearing_range import (
     difference_jit,
     expected_reading_jit,
@@ -25,7 +24,8 @@ from ..models.bearing_range import (
     read_distance_jit,
     wrap_angle,
 )
-from ..models.sensors import Sensor, for_sensor
+from ..models.sensor_kernels import for_sensor
+from ..models.sensors import Sensor
 from . import elimination
 from .drive import Drive, DriveArrays, Sightings
 

@@ -18,7 +18,7 @@ from ...arrays import Array, IntArray
 from ...estimator.filters.batch import can_batch
 from ...estimator.filters.drive_likelihood import GATE, DriveEvents, DriveRecord
 from ...estimator.filters.ekf import EkfSlam
-from ...estimator.kernels.kalman_gain import USED
+from ...estimator.kernels.scan_update import USED
 from ...estimator.models.rigid_motion import ErrorFrame
 from ...evaluation.hypothesis_tests import (
     autocorrelation,

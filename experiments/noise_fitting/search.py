@@ -23,7 +23,7 @@ from ...estimator.filters.drive_likelihood import (
     drive_likelihood,
 )
 from ...estimator.filters.ekf import EkfSlam
-from ...estimator.kernels.kalman_gain import GATED
+from ...estimator.kernels.scan_update import GATED
 from ..run_and_replay.filter_settings import FilterSettings
 from . import scoring
 from .intervals import NOT_ZERO, Verdict, intervals

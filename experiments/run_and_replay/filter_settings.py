@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 from ...estimator import interface, registry
 from ...estimator.guards import argument_checks
 from ...estimator.models.sensors import Sensor, sensor_in
-from ...leaves import is_here
+from ...public_names import is_here
 from ...sim_configs import Scenario
 from ...suggestions import closest
 from ..logs.ground_truth import hides_identities

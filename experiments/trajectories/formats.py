@@ -22,7 +22,7 @@ from ...estimator.filters.ekf import EkfSlam
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.motions import UNICYCLE, Motion, find_motion, only_unicycle
 from ...estimator.models.rigid_motion import composed
-from ...leaves import is_here
+from ...public_names import is_here
 from ...sim_configs import Scenario
 from ...sim_configs.field_types import unknown_choice
 from ...sim_configs.scenario_files import scenario_text

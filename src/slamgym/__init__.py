@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import gymnasium
 
-from .leaves import is_here
-from .public_names import attach
+from .public_names import attach, is_here
 
 __version__ = "0.1.0"
 

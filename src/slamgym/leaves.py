@@ -7,8 +7,9 @@ left out.
 """
 
 from importlib import import_module
-from pathlib import Path
 from typing import Any
+
+from .public_names import is_here
 
 #: Each leaf with its modules and folders.
 LEAVES: dict[str, tuple[str, ...]] = {
@@ -53,17 +54,6 @@ LEAVES: dict[str, tuple[str, ...]] = {
         "agents.wall_routes",
     ),
 }
-
-
-def is_here(module: str) -> bool:
-    """Return whether a module or folder of the package exists, by its dotted name."""
-    return holds(Path(__file__).parent, module)
-
-
-def holds(folder: Path, module: str) -> bool:
-    """Return whether a folder holds a module or room, by its dotted name in it."""
-    place = folder.joinpath(*module.split("."))
-    return (place / "__init__.py").is_file() or place.with_suffix(".py").is_file()
 
 
 def leaf(module: str) -> Any:

@@ -12,8 +12,6 @@ from typing import Any
 
 import lazy_loader
 
-from .leaves import holds
-
 
 def attach(package: str) -> Any:
     """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package.
@@ -57,3 +55,14 @@ def listed(file: Path) -> dict[str, str]:
                 else:
                     names[alias.name] = module
     return names
+
+
+def is_here(module: str) -> bool:
+    """Return whether a module or folder of the package exists, by its dotted name."""
+    return holds(Path(__file__).parent, module)
+
+
+def holds(folder: Path, module: str) -> bool:
+    """Return whether a folder holds a module or room, by its dotted name in it."""
+    place = folder.joinpath(*module.split("."))
+    return (place / "__init__.py").is_file() or place.with_suffix(".py").is_file()

@@ -31,8 +31,8 @@ from slamgym.jit import (
     njit_allocating,
     njit_apart,
     njit_internal,
-    specialised,
 )
+from slamgym.kernel_variants import specialised
 
 CALLER = """
     from ..jit import jit

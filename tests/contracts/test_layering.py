@@ -27,6 +27,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
     "estimator": """
         guards
         models
+        beliefs
         interface
         kernels
         association
@@ -79,7 +80,7 @@ STRANGERS = {
     ("envs", "evaluation"),
     ("estimator", "sim_configs"),
 }
-EVALUATION_KNOWS = {"models", "guards", "interface"}
+EVALUATION_KNOWS = {"models", "guards", "beliefs", "interface"}
 MAY_IMPORT = {  # besides the standard library
     "sim_configs": {"numpy", "pydantic", "pydantic_core"},
     "envs": {"numpy", "scipy", "gymnasium", "pymunk"},

@@ -23,7 +23,7 @@ from slamgym.estimator.association.tentative_landmarks import (
 from slamgym.estimator.guards.saved_states import is_semidefinite
 from slamgym.estimator.interface import MapView
 from slamgym.estimator.kernels import scan_update as screening
-from slamgym.estimator.kernels.kalman_gain import (
+from slamgym.estimator.kernels.scan_update import (
     ADDED,
     FIRST,
     JACOBIAN,

@@ -7,7 +7,7 @@ from far_origins import far_origins, rounding
 
 from slamgym.estimator import UnscentedSlam, make_estimator
 from slamgym.estimator.filters.drive_likelihood import DriveEvents, drive_likelihood
-from slamgym.estimator.kernels.kalman_gain import ADDED, GATED, SKIPPED
+from slamgym.estimator.kernels.scan_update import ADDED, GATED, SKIPPED
 
 NOISE = np.array([*MOTION_STD, *MEASUREMENT_STD, 0.01, 0.02])
 GATE_PROBABILITY = 0.95

@@ -11,7 +11,7 @@ from comparison import assert_same_bits, digest, part_of
 
 from slamgym.estimator import EkfSlam, UpdateReport, make_estimator
 from slamgym.estimator.filters.gaussian_map import LOWER
-from slamgym.estimator.kernels.kalman_gain import LARGE
+from slamgym.estimator.kernels.scan_update import LARGE
 
 NOISE = {"motion_std": (0.05, 0.02, 0.01), "measurement_std": (0.03, 0.1)}
 FAMILY = (

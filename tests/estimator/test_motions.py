@@ -12,10 +12,10 @@ from slamgym.estimator.filters.imagine import imagine
 from slamgym.estimator.map_management.hypotheses import manage
 from slamgym.estimator.models import motions
 from slamgym.estimator.models.bearing_range import wrap_angle
+from slamgym.estimator.models.model_checks import check_motion
 from slamgym.estimator.models.motions import (
     Motion,
     bicycle,
-    check_motion,
     differential,
     find_motion,
     predict_pose,

@@ -22,6 +22,8 @@ from slamgym.estimator import (
 from slamgym.estimator.filters.delayed_landmarks import MOST_POSES, SeenLandmark
 from slamgym.estimator.filters.imagine import imagine
 from slamgym.estimator.models import bearing_range
+from slamgym.estimator.models.model_checks import SensorContractError, check_sensor
+from slamgym.estimator.models.sensor_kernels import kernel_parts
 from slamgym.estimator.models.sensors import (
     BEARING,
     BEARING_RANGE,
@@ -29,10 +31,7 @@ from slamgym.estimator.models.sensors import (
     RANGE,
     SENSORS,
     Sensor,
-    SensorContractError,
-    check_sensor,
     find_sensor,
-    kernel_parts,
     read_bearing_range,
 )
 from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
@@ -531,7 +530,7 @@ def test_landmarks_are_placed_from_several_poses(label, sensor):
 def test_delayed_readings_of_bearing_and_range_wait_for_several_poses():
     slam = waiting_filter("invariant", BEARING_RANGE, landmark_init="delayed")
     pose, _ = drive_past(slam, BEARING_RANGE, 1)
-    assert (slam.landmark_ids, len(slam.waiting.ids)) == ((), 5)
+    assert (slam.landmark_ids, len(slam.map.waiting.ids)) == ((), 5)
     rng = np.random.default_rng(5)
     pose = pose + np.array([0.3 * np.cos(pose[2]), 0.3 * np.sin(pose[2]), 0.15])
     slam.predict((0.3, 0.15))
@@ -572,7 +571,7 @@ def test_mirror_images_of_ranges_are_kept_until_they_separate():
     one = LANDMARKS[1:2] * (-1, 1)
     pose, _ = drive_past(slam, RANGE, 25, landmarks=one, turn=0.0, noise=0.1)
     assert slam.landmark_ids == ()
-    assert len(slam.waiting.ids) == 25
+    assert len(slam.map.waiting.ids) == 25
     rng = np.random.default_rng(1)
     for _ in range(12):
         pose = pose + np.array([0.3 * np.cos(pose[2]), 0.3 * np.sin(pose[2]), 0.2])
@@ -677,7 +676,7 @@ def test_a_heading_that_has_drifted_loses_no_run_of_bearings():
 def test_waiting_filters_continue_from_a_saved_state_bit_for_bit():
     slam = waiting_filter("invariant", RANGE)
     pose, _ = drive_past(slam, RANGE, 8)
-    assert len(slam.waiting.ids)
+    assert len(slam.map.waiting.ids)
     other = waiting_filter("invariant", RANGE)
     other.load_state_dict(slam.state_dict())
     rng = np.random.default_rng(4)
@@ -716,7 +715,7 @@ def test_an_update_that_fails_leaves_the_readings_waiting():
         slam.update([(1.0,)], [-(2**63)])
     assert digest(slam) == before
     slam.reset((0, 0, 0), (0, 0, 0))
-    assert len(slam.waiting.ids) == 0
+    assert len(slam.map.waiting.ids) == 0
 
 
 @far_origins
@@ -749,7 +748,7 @@ def test_past_poses_at_equal_distances_are_forgotten_in_the_same_order(far):
     for origin in ((0, 0), far):
         slam = waiting_filter("ekf", BEARING, initial_pose=(*origin, 0))
         drive_past(slam, BEARING, 55, landmarks=np.array([[1e5, 1e5]]))
-        left.append(slam.waiting.ids[:, 1])
+        left.append(slam.map.waiting.ids[:, 1])
     np.testing.assert_array_equal(*left)
 
 
@@ -759,7 +758,7 @@ def test_past_poses_do_not_exceed_their_limit():
     drive_past(slam, BEARING, 60, landmarks=far)
     assert slam.landmark_ids == ()
     assert len(slam.map.slots) == 2 * MOST_POSES
-    assert len(slam.waiting.ids) == MOST_POSES
+    assert len(slam.map.waiting.ids) == MOST_POSES
 
 
 def test_readings_of_whole_numbers_are_compared_as_real_numbers():

@@ -9,7 +9,10 @@ from slamgym.public_names import listed
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("sim_configs", "envs", "estimator", "evaluation", "agents", "experiments")
 # Beside the rooms; every room may import them.
-GROUND = {"arrays", "jit", "leaves", "public_names", "restorable", "suggestions"}
+GROUND = {
+    *("arrays", "jit", "kernel_variants", "leaves", "public_names", "restorable"),
+    "suggestions",
+}
 
 
 def module_name(file):

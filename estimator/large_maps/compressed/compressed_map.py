@@ -14,10 +14,9 @@ from numpy.typing import ArrayLike
 
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam, InvariantEkfSlam
-from ...filters.gaussian_map import MAP_STATE
 from ...guards import saved_states
 from ...guards.argument_checks import LOWEST_ID, covariance_bytes
-from ...guards.saved_states import with_prefix, without_prefix
+from ...guards.saved_states import MAP_STATE, with_prefix, without_prefix
 from ...interface import Belief
 from ..multifrontal import pairs, symmetric
 from . import phase_update

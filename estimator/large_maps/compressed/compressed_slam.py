@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...beliefs import Belief, MapView, UpdateReport, describe_filter
 from ...filters.ekf import (
     EkfSlam,
     FirstEstimatesEkfSlam,
@@ -19,7 +20,7 @@ from ...filters.ekf import (
 from ...guards import argument_checks, saved_states
 from ...guards.argument_checks import LandmarkIds
 from ...guards.undo import Undo, attributes, undo_all, undone_on_error
-from ...interface import Belief, MapView, UpdateReport, advance, describe_filter
+from ...interface import advance
 from ...models.sensors import only_placing
 from .compressed_map import (
     SHORT_PHASE,

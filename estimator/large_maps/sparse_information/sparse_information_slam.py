@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ....arrays import Array, IntArray
+from ...beliefs import Belief, MapView, UpdateReport, describe_filter
 from ...filters.ekf import EkfSlam
 from ...guards import argument_checks, saved_states
 from ...guards.argument_checks import LandmarkIds
 from ...guards.saved_states import with_prefix, without_prefix
 from ...guards.undo import Undo, attributes, undo_all, undone_on_error
-from ...interface import Belief, MapView, UpdateReport, describe_filter
 from ...models.bearing_range import wrap_angle
 from ..multifrontal import PLACES, ROWS
 from . import local_information

@@ -16,7 +16,6 @@ from scipy.linalg.blas import dsyrk
 
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
-from ...filters.pose_readings import FRAMES
 from ...guards import argument_checks
 from ...guards.undo import Undo, attributes, undo_all
 from ...interface import Belief
@@ -406,7 +405,7 @@ class ActiveSubmap:
     def __init__(self, slam: EkfSlam) -> None:
         self.filter = slam
         #: Coordinates of the error.
-        self.frame = FRAMES[slam.rules.frame]
+        self.frame = slam.frame
 
     def begin(self) -> None:
         """Begin a new submap, with the robot at the origin of the frame."""

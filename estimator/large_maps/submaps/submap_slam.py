@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ....arrays import Array, IntArray
+from ...beliefs import Belief, MapView, UpdateReport, describe_map
 from ...filters.ekf import EkfSlam, InvariantEkfSlam
 from ...guards import argument_checks, saved_states
 from ...guards.argument_checks import LandmarkIds
 from ...guards.saved_states import with_prefix, without_prefix
 from ...guards.undo import Undo, attributes, undo_all, undone_on_error
-from ...interface import Belief, MapView, UpdateReport, advance, describe_map
+from ...interface import advance
 from ...models.sensors import only_placing
 from .closed_submaps import ClosedSubmaps, Neighbourhood, Region, merged
 from .graph import ORIGIN, ActiveSubmap, Chain, ClosingRule, SubmapGraph
