@@ -108,7 +108,7 @@ class WaitingMap(GaussianMap):
 
     def __init__(self, values: Sequence[float], sensor: Sensor) -> None:
         super().__init__(values)
-        self._sensor, self.waiting, self._report = sensor, Waiting(), None
+        self._sensor, self.waiting = sensor, Waiting()
 
     @property
     def rules(self) -> Rules:
@@ -125,10 +125,8 @@ class WaitingMap(GaussianMap):
         super().reset(pose, pose_covariance)
         self.waiting = Waiting()
 
-    def hold(self, *belief: Any, **others: Any) -> None:
-        """Continue with another belief; the readings that wait stay."""
-        super().hold(*belief, **others)
-        self._report = None
+    def _become(self, *memory: Any, **named: Any) -> None:
+        super()._become(*memory, **{"_report": None, **named})
 
     def take_in(self, update: UpdateKernel, readings: Array, ids: IntArray) -> int:
         """Update with readings of mapped landmarks; let those of others wait."""
