@@ -32,9 +32,9 @@ def slamgym(line):
     except SystemExit as end:
         assert not end.code, line
 
-slamgym("run six_landmarks --steps 4 --no-every-step --out run")
+slamgym("run six_landmarks --steps 2 --no-every-step --out run")
 slamgym("replay run/log.csv -e ekf --no-every-step --out replay")
-slamgym("generate six_landmarks --episodes 2 --steps 4 --out data")
+slamgym("generate six_landmarks --episodes 2 --steps 2 --out data")
 slamgym("estimators")
 for file in ("run/map.png", "replay/summary.json", "data"):
     assert Path(file).exists(), file
@@ -51,7 +51,7 @@ from slamgym.experiments.figures import style
 style.draw_file = lambda figure, path, *_: path.touch()
 """
 MANY_RUNS = """
-slamgym("monte-carlo six_landmarks -e ekf,invariant --runs 2 --steps 4 --out many")
+slamgym("monte-carlo six_landmarks -e ekf,invariant --runs 2 --steps 2 --out many")
 assert Path("many/report.html").exists()
 """
 

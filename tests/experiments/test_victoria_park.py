@@ -4,7 +4,6 @@ import math
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
@@ -47,35 +46,19 @@ def filtered(log, management, estimator="ekf"):
     return summarise(replay(log, settings.make(log.start)), settings)
 
 
-class Expected(NamedTuple):
-    """What a filter is expected to make of the events before a time."""
-
-    end: float
-    landmarks: tuple[int, int]
-    removed: int
-    ate: float  # against GPS, aligned
-
-
-WHOLE = Expected(math.inf, (350, 420), 100, 2.6)
-BEGINNING = Expected(500.0, (175, 210), 40, 1.5)
-
-
 def before(log, end):
     return replace(log, events=tuple(event for event in log.events if event.t < end))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "expected"), [("ekf", WHOLE), ("invariant", BEGINNING)]
-)
-def test_management_keeps_the_map_small_and_the_path_true(log, name, expected):
-    part = before(log, expected.end)
+@pytest.mark.parametrize("name", ["ekf", "invariant"])
+def test_management_keeps_the_map_small_and_the_path_true(log, name):
+    part = before(log, 500.0)
     summary = filtered(part, POLICY, name)
-    least, most = expected.landmarks
-    assert least <= len(summary["landmarks"]) <= most
-    assert summary["map_changes"]["most"] <= most
-    assert summary["map_changes"]["removed"] > expected.removed
-    assert summary["ate"]["aligned"] < expected.ate
+    assert 175 <= len(summary["landmarks"]) <= 210
+    assert summary["map_changes"]["most"] <= 210
+    assert summary["map_changes"]["removed"] > 40
+    assert summary["ate"]["aligned"] < 1.5  # against GPS
 
     counts = summary["readings"]  # every one is accounted for
     scans = [event for event in part.events if isinstance(event, Scan)]
