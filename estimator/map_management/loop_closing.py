@@ -62,24 +62,30 @@ from ..models.rigid_motion import invariant_covariance, seen_from
 #: Landmarks that are the same: (kept, gone).
 Pairs = list[tuple[int, int]]
 
+# Squared distances in σ are χ² of 2 degrees.  `benchmarks/loop_closure.py` counts what
+# the limits without a formula decide: loops that are closed, and different landmarks
+# that are merged.
+
 #: Landmarks count as local within this many times the reach of the readings.
 LOCAL_REACH = 3.0
-#: Largest χ² of the offset of two landmarks that may be the same; 2 degrees.
+#: Largest χ² of the offset of two landmarks that may be the same: 5 σ, a tail of 4e-6.
 OFFSET_GATE = 25.0
-#: Largest χ² of the offset of two landmarks that are the same; 2 degrees, 99 %.
+#: Largest χ² of the offset of two landmarks that are the same, 99 %: −2 ln 0.01.
 SAME_GATE = 9.21
-#: Landmarks around the robot are those more certain than this times lost ones.
+#: Landmarks around the robot are those with a σ below this share of that of lost ones.
 LOCAL_STD = 0.5
-#: An offset is accurate if its σ is less than this times that of lost landmarks.
+#: An offset is accurate if its σ is below this share of that of lost landmarks.
 ACCURATE = 0.25
-#: How many σ beyond the reach of a reading its landmark may be.
+#: Beyond the reach of a reading, its landmark may be by this multiple of the σ of lost
+#: landmarks: no landmark that matters is left out.
 NEAR_STDS = 10.0
-TURN_STDS = 4.0
-#: The heading may be wrong by this number of σ, and by this angle [rad].
-SLACK = 0.2
-#: Covariance of a pose around a place that a scan shows [m², rad²].
-AROUND = np.diag([0.25, 0.25, 0.0225])
-#: Added to variances that may be zero [m², rad²].
+#: The heading may be wrong by this number of σ, a tail of 6e-5, and by this angle more,
+#: where its σ is too small [rad].
+TURN_STDS, SLACK = 4.0, 0.2
+#: Covariance of a pose around a place that a scan shows, (0.5 m)² and (0.15 rad)²: far
+#: wider than a scan leaves it, and narrow enough for linearised readings.
+AROUND = np.diag([0.5, 0.5, 0.15]) ** 2
+#: Added to variances that may be zero, against rounding [m², rad²].
 TINY = 1e-12
 #: Number of Gauss-Newton steps for the turn of the robot, from each of two starts.
 TURNS = 4
