@@ -30,7 +30,7 @@ from slamgym.experiments.run_and_replay.filter_settings import (
 from slamgym.experiments.run_and_replay.log_replay import replay
 from slamgym.jit import jit
 from slamgym.sim_configs import list_presets, load_scenario
-from slamgym.sim_configs.scenario import Gps, Randomise, Sensor
+from slamgym.sim_configs.scenario import Gps, Randomise, SensorTable
 
 pytestmark = pytest.mark.usefixtures("here")
 COMMANDS = "run replay smooth fit-noise generate judge monte-carlo noise-study render"
@@ -811,7 +811,7 @@ def test_a_scenario_is_explained_as_a_file_that_gives_the_same_world(name, tmp_p
     assert slamgym("scenarios", name, "--new", path).exit_code == 0
     assert load_scenario(path) == load_scenario(name)
     assert printed("scenarios", name) == path.read_text()
-    for part in (Sensor, Gps, Randomise):  # set or not
+    for part in (SensorTable, Gps, Randomise):  # set or not
         for key, field in part.model_fields.items():
             assert re.search(rf"^(# )?{key} =", path.read_text(), re.MULTILINE)
             assert field.description in path.read_text()
