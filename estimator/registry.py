@@ -9,6 +9,7 @@ import inspect
 import re
 import tomllib
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from numpy.typing import ArrayLike
@@ -167,9 +168,9 @@ def make_estimator(
     own_factory = factory = find_estimator(name)
     options = with_sensor(factory, options)
     if management is not None and management is not False:
-        from .map_management import manage  # noqa: PLC0415 (heavy)
+        from .map_management import ManagedSlam  # noqa: PLC0415 (heavy)
 
-        factory = manage(factory, management)
+        factory = partial(ManagedSlam, factory, management=management)
     try:
         return factory(
             motion_std=motion_std,

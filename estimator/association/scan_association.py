@@ -46,7 +46,7 @@ LABEL_BITS = 20
 
 
 class ScanAssociation:
-    """Association of the rows of one scan.
+    """All decisions about the rows of one scan.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class ScanAssociation:
     def __init__(
         self, policy: AssociationPolicy, candidates: Candidates, readings: Array
     ) -> None:
-        self._policy, self._readings = policy, readings
+        self._policy, self.readings = policy, readings
         self._tentative = candidates.tentative
         self._waiting = dict(candidates.waiting)
         self._next_id, self.scan = candidates.next_id, candidates.scan
@@ -75,6 +75,10 @@ class ScanAssociation:
         self.ambiguous_rows: list[int] = []
         #: Landmarks that some row may belong to, so that they are not missing.
         self.explained: set[int] = set()
+        #: Landmarks that the scan should have shown and did not.
+        self.missed: set[int] = set()
+        #: Landmarks that it has shown, once the filter has taken it.
+        self.seen: set[int] = set()
         self._is_assigned = False
         #: Cost of the landmarks that it confirms, once the filter has taken the scan.
         self.price = 0.0
@@ -84,7 +88,7 @@ class ScanAssociation:
         known = self.scan << LABEL_BITS  # lower labels are those of earlier scans
         new = [row for row, i in enumerate(self.row_ids) if i is None]
         new = [row for row in new if not 0 <= self.labels[row] < known]
-        density = self._density.after(self._readings, new, len(self.confirmed))
+        density = self._density.after(self.readings, new, len(self.confirmed))
         turn = view.covariance[2, 2]
         lost = self._detections.lost.with_heading(turn, len(view.mapped) > 0)
         if self._is_assigned:
@@ -139,7 +143,7 @@ class ScanAssociation:
         A row that is ambiguous because of a tentative landmark begins another one: the
         first sighting of that landmark may have been an outlier.
         """
-        tentative, readings = self._tentative, self._readings
+        tentative, readings = self._tentative, self.readings
         density = self._density.at(readings[rows], self._policy.density)
         view = tentative.view()
         found = assign_scan(self._policy, view, readings[rows], noise, density, most=1)

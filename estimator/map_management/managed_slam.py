@@ -1,22 +1,28 @@
 """Manage the landmarks of any filter by a policy: `ManagedSlam`.
 
 A managed filter associates readings without identity, confirms tentative landmarks,
-and prunes its map after each scan. `RecentScans` repeats the last scans once a landmark
-is confirmed.
+and prunes its map after each scan.  It holds a list of hypotheses, one or many.  Each
+is one sequence of associations, with a filter that follows it.  The decisions about a
+scan are one record, `ScanAssociation`: `associate` begins it, the update of the filter
+completes it, and the map is pruned by it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from itertools import islice
+from math import log
+from operator import itemgetter
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ..association.missed_landmarks import LOST_SCORE
-from ..association.scan_assignments import AssociationSensor
+from ..association.scan_assignments import SAME, AssociationSensor
 from ..association.scan_association import (
     Candidates,
     Option,
@@ -27,8 +33,9 @@ from ..filters.pose_readings import PoseReading, observe_relative_pose
 from ..guards import argument_checks, saved_states
 from ..guards.argument_checks import LandmarkIds
 from ..guards.saved_states import with_prefix, without_prefix
-from ..guards.undo import Undo, attributes, undo_all, undone_on_error
+from ..guards.undo import Undo, attributes, to_the_end, undo_all, undone_on_error
 from ..interface import (
+    Answer,
     Belief,
     MapView,
     ScanDecisions,
@@ -45,6 +52,7 @@ from ..interface import (
     taking_poses,
     view_map,
 )
+from ..models.bearing_range import wrap_angle
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.rigid_motion import rotation
 from .loop_closing import AROUND, FEWEST_READINGS, is_astray, places_of_scan
@@ -53,74 +61,34 @@ from .policy import LandmarkPolicy, as_policy
 from .pruning import LandmarkRecords, MapPruner
 from .recent_scans import FedScans, RecentScans
 
+#: Hypotheses e^20 times less probable than the best one are discarded.
+SPREAD = 40.0
 
-class ManagedFilter:
-    """The results of a managed filter: those of its most probable hypothesis."""
+#: Associations tried in a scan, for each hypothesis kept.
+TRIED = 4
 
-    _policy: LandmarkPolicy
+#: Most hypotheses whose poses overlap.
+PER_BASIN = 3
 
-    @property
-    def best(self) -> ManagedSlam:
-        """The filter of the most probable hypothesis."""
-        raise NotImplementedError
+#: Least variance of a pose that counts [m², rad²].
+NIL = 1e-12
 
-    @property
-    def policy(self) -> LandmarkPolicy:
-        """The policy that decides about landmarks."""
-        return self._policy
-
-    @property
-    def filter(self) -> SlamEstimator:
-        """The filter inside."""
-        return self.best._filter
-
-    @property
-    def tentative_landmarks(self) -> Array:
-        """Estimated positions of tentative landmarks, shape (t, 2) [m]."""
-        places = self.best.candidates.tentative.places
-        x, y, heading = self.best._editor.map_view().mean[:3]
-        return np.asarray(places @ rotation(heading).T + (x, y))
-
-    @property
-    def lost_score(self) -> float:
-        """Evidence that the run is lost, see `LostEvidence` [-]; 0 at the start."""
-        return self.best.candidates.detections.lost.largest
-
-    @property
-    def probably_lost(self) -> bool:
-        """Whether the run is probably lost: `lost_score` is above `LOST_SCORE`."""
-        return self.lost_score > LOST_SCORE
-
-    @property
-    def decisions(self) -> list[ScanDecisions]:
-        """The decisions about the scans since the start or the last loaded state."""
-        return self.best._recent.decisions
-
-    @property
-    def landmark_ids(self) -> tuple[int, ...]:
-        """The mapped landmarks, in the order of the belief."""
-        return mapped_ids(self.filter)
-
-    def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
-        """Return the present belief, of the whole map or of pose and some landmarks."""
-        if landmark_ids is None:
-            return self.filter.belief()
-        return marginal(self.filter, landmark_ids)
-
-    def map_view(self) -> MapView:
-        """Return pose and map, without a copy where possible, until the next step."""
-        return view_map(self.filter)
-
-    def report(self) -> UpdateReport:
-        """Return the report of the last update once more."""
-        return self.best._report
+#: Two poses overlap up to this Bhattacharyya distance in every coordinate.
+OVERLAP = 0.5
 
 
-class ManagedSlam(ManagedFilter):
+class ManagedSlam:
     """A filter of any kind that associates, confirms, removes and merges landmarks.
 
     A :class:`LandmarkPolicy` decides which landmark each reading belongs to, when a new
     landmark is confirmed, and which landmarks to merge or to remove.
+
+    With the association "hypotheses", each hypothesis splits into the most likely joint
+    assignments of a scan.  The costs of the scans are added.  Hypotheses beyond the
+    number that the policy allows, and those e^20 times less probable than the best one,
+    are discarded [1]_, and so are variants of the better ones whose poses overlap with
+    theirs.  The belief and the reports are those of the most probable hypothesis.  With
+    any other association, there is one.
 
     Parameters
     ----------
@@ -146,14 +114,19 @@ class ManagedSlam(ManagedFilter):
     does not change the belief.  Readings before the confirming one correct nothing
     unless backdated.
 
+    References
+    ----------
+    .. [1] D. Reid, An algorithm for tracking multiple targets, IEEE Transactions on
+       Automatic Control 24, 1979.
+
     Examples
     --------
     >>> from slamgym.estimator import EkfSlam
     >>> slam = ManagedSlam(EkfSlam, (0.1, 0.1, 0.05), (0.02, 0.1), management=True)
     >>> for _ in range(3):
     ...     report = slam.update([(0.5, 4.0)])
-    >>> report.confirmed_ids, slam.belief().landmark_ids
-    ((0,), (0,))
+    >>> report.confirmed_ids, slam.belief().landmark_ids, len(slam.hypotheses)
+    ((0,), (0,), 1)
     """
 
     def __init__(
@@ -165,66 +138,103 @@ class ManagedSlam(ManagedFilter):
         management: LandmarkPolicy | Mapping[str, Any] | bool = True,
         **options: Any,
     ) -> None:
-        self._policy = as_policy(management)
+        policy = _settled(as_policy(management), estimator)
         noise = {"motion_std": motion_std, "measurement_std": measurement_std}
-        self._filter = estimator(**noise, **options)
-        self._sensor = AssociationSensor.checked(measurement_std, options)
+        self._estimator = partial(estimator, **noise, **options)
+        first = self._estimator()
+        sensor = AssociationSensor.checked(measurement_std, options)
         motion = options.get("motion", UNICYCLE)
         at_rest = options.get("noise_at_rest", True)
-        self._motion_noise = MotionNoise.checked(motion_std, at_rest, motion)
-        merging = self._policy.merge_within is not None
-        self._editor = MapEditor(self._filter, merging=merging)
-        self._pruner = MapPruner(self._policy, self._editor, self._sensor.noise)
-        #: Landmarks that are not in the map yet.
-        self.candidates = Candidates()
+        noise_of_motion = MotionNoise.checked(motion_std, at_rest, motion)
+        self._settings = SharedSettings(policy, sensor, noise_of_motion)
+        #: The hypotheses, the most probable first.
+        self.hypotheses = [Hypothesis(first, self._settings)]
+        #: All hypotheses made so far, and those of them that are not in use.
+        self._made = self.hypotheses
+        self._spare: list[Hypothesis] = []
         #: Number of steps taken.
         self.steps = 0
-        self._report = UpdateReport()
-        self._recent = RecentScans(self._filter, self._editor, self._policy)
-        for name, member in optional_members(self._filter).items():
-            setattr(self, name, member)
+        if policy.association != "hypotheses":
+            for name, member in optional_members(first).items():
+                setattr(self, name, member)
+
+    # The results, which are those of the most probable hypothesis.
 
     @property
-    def best(self) -> ManagedSlam:
-        """The filter itself, which follows one hypothesis."""
-        return self
+    def best(self) -> Hypothesis:
+        """The most probable hypothesis."""
+        return self.hypotheses[0]
+
+    @property
+    def filter(self) -> SlamEstimator:
+        """Its filter."""
+        return self.best.filter
+
+    @property
+    def policy(self) -> LandmarkPolicy:
+        """The policy that decides about landmarks."""
+        return self._settings.policy
+
+    @property
+    def tentative_landmarks(self) -> Array:
+        """Estimated positions of tentative landmarks, shape (t, 2) [m]."""
+        places = self.best.candidates.tentative.places
+        x, y, heading = self.best.editor.map_view().mean[:3]
+        return np.asarray(places @ rotation(heading).T + (x, y))
+
+    @property
+    def lost_score(self) -> float:
+        """Evidence that the run is lost, see `LostEvidence` [-]; 0 at the start."""
+        return self.best.candidates.detections.lost.largest
+
+    @property
+    def probably_lost(self) -> bool:
+        """Whether the run is probably lost: `lost_score` is above `LOST_SCORE`."""
+        return self.lost_score > LOST_SCORE
+
+    @property
+    def decisions(self) -> list[ScanDecisions]:
+        """The decisions about the scans since the start or the last loaded state."""
+        return self.best.recent.decisions
+
+    @property
+    def landmark_ids(self) -> tuple[int, ...]:
+        """The mapped landmarks, in the order of the belief."""
+        return mapped_ids(self.filter)
+
+    def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
+        """Return the present belief, of the whole map or of pose and some landmarks."""
+        if landmark_ids is None:
+            return self.filter.belief()
+        return marginal(self.filter, landmark_ids)
+
+    def map_view(self) -> MapView:
+        """Return pose and map, without a copy where possible, until the next step."""
+        return view_map(self.filter)
+
+    def report(self) -> UpdateReport:
+        """Return the report of the last update once more."""
+        return self.best.report
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
-        with undone_on_error(self.bookmark()):
-            self._filter.reset(pose, pose_std)
-            self._editor.expire()
-            self._pruner.records = LandmarkRecords()
-            self.candidates = Candidates()
-            self._recent.forget()
-            self._report = UpdateReport()
+        self._change_best(lambda best: best.reset(pose, pose_std))
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], dt multiplies its noise variance."""
         reading = argument_checks.pair("odometry", odometry)
         if type(dt) is not float or dt != 1.0:
             argument_checks.duration(dt)
-        candidates, noise = self.candidates, self._motion_noise
-        displacement = noise.motion.moved(reading)
-        if len(candidates.tentative.seen):
-            variance = noise.over(displacement, dt)
-            moved = candidates.tentative.moved(displacement, variance)
-            candidates = candidates._replace(tentative=moved)
-
-        def follow(_: object) -> None:
-            self._editor.expire()
-            self.candidates = candidates
-            self._recent.note_motions((*reading, dt))
-            self.steps += 1
-
-        step = partial(self._filter.predict, reading, dt)
-        undo = attributes(self, self._recent)
-        advance(self._filter, step, follow, undo, lambda: undo)
+        every, noise = self.hypotheses, self._settings.motion_noise
+        step = reading, dt, noise.motion.moved(reading)
+        self._carry_out(every, lambda k: every[k].predict(*step), lambda: None)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
         """Associate one scan, correct the belief with it, then prune the map.
+
+        A hypothesis whose filter fails is discarded, as long as another one succeeds.
 
         Parameters
         ----------
@@ -245,18 +255,25 @@ class ManagedSlam(ManagedFilter):
             all is then as before.
         """
         readings = argument_checks.scan(measurements)
-        with undone_on_error(self.bookmark_views(), unless_moved=self):
+        views = (h.editor.bookmark() for h in self.hypotheses)
+        with undone_on_error(undo_all(*views, attributes(self)), unless_moved=self):
             if landmark_ids is None:
-                plan = self.alternatives(readings)[0][1]()
-            else:
-                given = argument_checks.identities(landmark_ids, len(readings))
-                plan = self.as_given(readings, given)
-            return self.take(readings, plan)
+                return self._take(self._branches(readings))
+            ids = argument_checks.identities(landmark_ids, len(readings))
+            given = [
+                Branch(h.cost, h, partial(h.as_given, readings, ids))
+                for h in self.hypotheses
+            ]
+            return self._take(given)
 
     def observe_pose(
         self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
     ) -> UpdateReport:
-        """Correct the belief with a reading of the pose, as `EkfSlam.observe_pose`.
+        """Correct every hypothesis with a reading of the pose.
+
+        Its cost, νᵀ S⁻¹ ν + ln det S, is added to that of the hypothesis, unless the
+        gate of the best one rejects it.  Parameters and report are those of
+        `EkfSlam.observe_pose`.
 
         Raises
         ------
@@ -265,23 +282,330 @@ class ManagedSlam(ManagedFilter):
             all is then as before.
         """
         given = PoseReading.checked(reading, matrix, covariance)
+        every = self.hypotheses
+        costs = [h.cost for h in every]
+
+        def then() -> UpdateReport:
+            reports, after = [h.report for h in every], costs
+            if reports[0].degrees_of_freedom:
+                pairs = zip(costs, reports, strict=True)
+                after = [cost + cost_of(report) for cost, report in pairs]
+            ranked = sorted(zip(after, every, strict=True), key=itemgetter(0))
+            return self._take_over(ranked)
+
+        return self._carry_out(every, lambda k: every[k].observe_pose(given), then)
+
+    def remove(self, landmark_ids: LandmarkIds) -> None:
+        """Marginalise mapped landmarks by hand, shape (n,); all else stays.
+
+        Only the best hypothesis continues.
+        """
+        ids = argument_checks.mapped_identities(landmark_ids, {*self.landmark_ids})
+        self._change_best(lambda best: best.remove(ids))
+
+    def merge(self, kept: int, gone: int) -> None:
+        """Merge two mapped landmarks by hand; both identities then name the first.
+
+        Only the best hypothesis continues.
+        """
+        argument_checks.two_landmarks(kept, gone, self.landmark_ids)
+        self._change_best(lambda best: best.merge(kept, gone))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of every hypothesis, as arrays."""
+        state: dict[str, Any] = {
+            "estimator": np.array(type(self).__name__),
+            "costs": np.array([h.cost for h in self.hypotheses]),
+        }
+        for k, hypothesis in enumerate(self.hypotheses):
+            state |= with_prefix(str(k), hypothesis.state_dict())
+        return state
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a saved state, bit for bit under the same settings.
+
+        Raises
+        ------
+        ValueError
+            If the state lacks an entry, or belongs to another estimator; all is then as
+            before.
+        """
+        saved_states.refuse_other_state(state, (), estimator=type(self).__name__)
+        table = {"costs": (saved_states.NUMBERS, -1)}
+        costs = saved_states.read(state, table)["costs"].tolist()
+        if not costs or costs[0] < 0 or costs != sorted(costs):
+            raise ValueError(f"state['costs'] must be >= 0 and ascend, got {costs}")
+        with undone_on_error(self.bookmark()):
+            # In place, as far as possible: members of the filter are passed on.
+            missing = len(costs) - len(self.hypotheses)
+            fresh = [self._fresh() for _ in range(missing)]
+            loaded = [*self.hypotheses, *fresh][: len(costs)]
+            for k, hypothesis in enumerate(loaded):
+                hypothesis.load_state_dict(without_prefix(state, str(k)))
+            self._take_over([*zip(costs, loaded, strict=True)])
+
+    def snapshot(self) -> tuple[Any, ...]:
+        """Return the present state of every hypothesis, for :meth:`resume`."""
+        return [(h.cost, h.snapshot()) for h in self.hypotheses], self.steps
+
+    def resume(self, before: tuple[Any, ...]) -> None:
+        """Return to a :meth:`snapshot` of a filter with the same settings."""
+        kept, self.steps = before
+        for hypothesis in self.hypotheses:
+            hypothesis.recent.forget()
+        self._spare = self._made
+        self._take_over([(cost, self._resumed(own)) for cost, own in kept])
+
+    def bookmark(self) -> Undo:
+        """Return what takes back later calls, as far as no kernel has run."""
+        parts = (h.bookmark() for h in self.hypotheses)
+        return undo_all(*parts, attributes(self))
+
+    def __repr__(self) -> str:
+        count = len(self.hypotheses)
+        several = f", best of {count} hypotheses" if count > 1 else ""
+        return f"Managed {self.filter!r}{several}"
+
+    # One scan: all ways to associate it.  The most probable ones continue.
+
+    def _branches(self, readings: Array) -> list[Branch]:
+        """Return the best associations of a scan, the cheapest first."""
+        every, policy = self.hypotheses, self.policy
+        if policy.association != "hypotheses":
+            return [Branch(h.cost, h, h.alternatives(readings)[0][1]) for h in every]
+        astray = [h for h in every if h.is_astray(readings)]
+        branches: list[Branch] = []
+        most, ceiling = TRIED * policy.hypotheses, np.inf
+        for h in [*every, *self._at_places(readings, astray)]:
+            found = h.alternatives(readings, ceiling - h.cost)
+            if h in astray:
+                found += h.deferred(readings, *found[0])
+            branches += [Branch(h.cost + cost, h, plan) for cost, plan in found]
+            branches.sort(key=itemgetter(0))
+            ceiling = branches[0].cost + SPREAD
+            branches = [b for b in branches[:most] if b.cost <= ceiling]
+            if len(branches) == most:
+                ceiling = branches[-1].cost
+        return branches
+
+    def _at_places(
+        self, readings: Array, astray: Sequence[Hypothesis]
+    ) -> list[Hypothesis]:
+        """Return the parts of hypotheses around the places that a scan shows.
+
+        The part around a pose c among landmarks is the prior times exp(−½ ‖z − c‖²) in
+        the metric of R, where z is the pose relative to them.  Its weight is that of c
+        in the prior of z with R added, relative to N(0; 0, R).
+        """
+        parts: list[Hypothesis] = []
+        found = ((h, h.places_of_scan(readings)) for h in astray)
+        for h, places in islice(filter(itemgetter(1), found), PER_BASIN):
+            for place in places:
+                part = self._resumed(h.snapshot())
+                reports = part.move_to(*place)
+                # The gate of the filter may refuse the place.
+                if all(report.degrees_of_freedom for report in reports):
+                    cost = sum(map(cost_of, reports)) - log(np.linalg.det(AROUND))
+                    part.cost = h.cost + cost
+                    parts.append(part)
+        return parts
+
+    def _take(self, branches: Sequence[Branch]) -> UpdateReport:
+        """Update filters by their associations, and continue with the best of them."""
+        errors: dict[int, Exception] = {}
+        plans = [branch.complete() for branch in branches]
+        every: list[Hypothesis] = []
+        for _, h, _ in branches:  # copied where a hypothesis splits
+            every.append(self._resumed(h.snapshot()) if h in every else h)
+
+        def take(k: int) -> None:
+            try:
+                every[k].take(plans[k])
+            except (np.linalg.LinAlgError, MemoryError) as error:
+                errors[k] = error
+
+        def then() -> UpdateReport:
+            taken = [k for k in range(len(every)) if k not in errors]
+            if not taken:
+                raise errors[0]
+            kept = [(branches[k].cost + plans[k].price, every[k]) for k in taken]
+            kept.sort(key=itemgetter(0))
+            chosen = distinct([h for _, h in kept], self.policy.hypotheses)
+            return self._take_over([pair for pair in kept if pair[1] in chosen])
+
+        return self._carry_out(every, take, then)
+
+    def _take_over(self, ranked: Sequence[tuple[float, Hypothesis]]) -> UpdateReport:
+        """Continue with hypotheses and their costs, the best first; return its report.
+
+        All others are reused later.
+        """
+        used = [hypothesis for _, hypothesis in ranked]
+        for cost, hypothesis in ranked:
+            hypothesis.cost = cost - ranked[0][0]
+        spare = [h for h in self._made if h not in used]
+        for hypothesis in {*spare}.difference(self._spare):
+            hypothesis.recent.forget()
+        self.hypotheses, self._spare = used, spare
+        return self.report()
+
+    def _fresh(self) -> Hypothesis:
+        """Return a hypothesis that is not in use, in any state."""
+        if not self._spare:
+            self._spare = [Hypothesis(self._estimator(), self._settings)]
+            self._made = [*self._made, *self._spare]
+        *self._spare, hypothesis = self._spare
+        return hypothesis
+
+    def _resumed(self, before: tuple[Any, ...]) -> Hypothesis:
+        """Return a hypothesis that was not in use, continuing from a snapshot."""
+        hypothesis = self._fresh()
+        hypothesis.resume(before)
+        return hypothesis
+
+    def _change_best(self, change: Callable[[Hypothesis], None]) -> None:
+        """Change the best hypothesis; only this one continues."""
+        with undone_on_error(self.bookmark()):
+            change(self.best)
+            self._take_over([(0.0, self.best)])
+
+    def _carry_out(
+        self,
+        every: Sequence[Hypothesis],
+        step: Callable[[int], object],
+        then: Callable[[], Answer],
+    ) -> Answer:
+        """Take one step with each hypothesis; return what follows from all steps.
+
+        An interrupt finds no filter moved, or lets the others follow.
+        """
+        begun, steps = [h.steps for h in every], self.steps + 1
+
+        def finish() -> Answer:
+            for k, hypothesis in enumerate(every):
+                if hypothesis.steps == begun[k]:
+                    step(k)
+            answer = then()
+            self.steps = steps
+            return answer
+
+        try:
+            return finish()
+        except BaseException:
+            if begun != [h.steps for h in every]:
+                to_the_end(finish)
+            raise
+
+
+class SharedSettings(NamedTuple):
+    """What all hypotheses of a filter have in common."""
+
+    policy: LandmarkPolicy
+    sensor: AssociationSensor
+    motion_noise: MotionNoise
+
+
+class Branch(NamedTuple):
+    """One way to associate a scan in one hypothesis."""
+
+    #: −2 ln of the probability, with that of the hypothesis.
+    cost: float
+    hypothesis: Hypothesis
+    #: Completes the association.
+    complete: Callable[[], ScanAssociation]
+
+
+def _settled(
+    policy: LandmarkPolicy, estimator: Callable[..., SlamEstimator]
+) -> LandmarkPolicy:
+    """Return a policy that names the association, where it says "auto"."""
+    if policy.association != "auto":
+        return policy
+    made = estimator.func if isinstance(estimator, partial) else estimator
+    one = hasattr(made, "local_view") or hasattr(made, "observe_truth")
+    return replace(policy, association="joint" if one else "hypotheses")
+
+
+class Hypothesis:
+    """One sequence of associations, and the filter that has followed it.
+
+    Parameters
+    ----------
+    slam : SlamEstimator
+        The filter.
+    settings : SharedSettings
+        Those of all hypotheses.
+    """
+
+    def __init__(self, slam: SlamEstimator, settings: SharedSettings) -> None:
+        policy, sensor, _ = self.policy, self.sensor, self.motion_noise = settings
+        self.filter = slam
+        #: −2 ln of its probability, relative to the best hypothesis.
+        self.cost = 0.0
+        self.editor = MapEditor(slam, merging=policy.merge_within is not None)
+        self.pruner = MapPruner(policy, self.editor, sensor.noise)
+        self.recent = RecentScans(slam, self.editor, policy)
+        #: Landmarks that are not in the map yet.
+        self.candidates = Candidates()
+        #: The report of the last update.
+        self.report = UpdateReport()
+        #: Number of steps taken.
+        self.steps = 0
+
+    def map_view(self) -> MapView:
+        """Return pose and map, without a copy where possible, until the next step."""
+        return view_map(self.filter)
+
+    def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
+        """Start a new run, without a map."""
+        self.filter.reset(pose, pose_std)
+        self.editor.expire()
+        self.pruner.records = LandmarkRecords()
+        self.candidates, self.report = Candidates(), UpdateReport()
+        self.recent.forget()
+
+    def predict(
+        self,
+        reading: tuple[float, float],
+        dt: float,
+        displacement: tuple[float, float, float],
+    ) -> None:
+        """Move by odometry (d, α), which is a displacement in the robot's frame."""
+        candidates = self.candidates
+        if len(candidates.tentative.seen):
+            variance = self.motion_noise.over(displacement, dt)
+            moved = candidates.tentative.moved(displacement, variance)
+            candidates = candidates._replace(tentative=moved)
+
+        def follow(_: object) -> None:
+            self.editor.expire()
+            self.candidates = candidates
+            self.recent.note_motions((*reading, dt))
+            self.steps += 1
+
+        step = partial(self.filter.predict, reading, dt)
+        undo = attributes(self, self.recent)
+        advance(self.filter, step, follow, undo, lambda: undo)
+
+    def observe_pose(self, given: PoseReading) -> UpdateReport:
+        """Correct the belief with a reading of the pose."""
 
         def follow(report: UpdateReport) -> UpdateReport:
-            self._editor.expire()
-            self._recent.note_motions(*given.rows())
-            self._report = report
+            self.editor.expire()
+            self.recent.note_motions(*given.rows())
+            self.report = report
             self.steps += 1
             return report
 
-        step = partial(taking_poses(self._filter).observe_pose, *given)
-        undo = attributes(self, self._recent)
-        return advance(self._filter, step, follow, undo, lambda: undo)
+        step = partial(taking_poses(self.filter).observe_pose, *given)
+        undo = attributes(self, self.recent)
+        return advance(self.filter, step, follow, undo, lambda: undo)
 
     def as_given(self, readings: Array, ids: Sequence[int]) -> ScanAssociation:
         """Associate readings (m, 2) by their identities, which must differ."""
-        plan = ScanAssociation(self._policy, self.candidates, readings)
-        view = self._pruner.view_around(readings)
-        plan.translate(ids, view.mapped, self._pruner.records.aliases)
+        plan = ScanAssociation(self.policy, self.candidates, readings)
+        view = self.pruner.view_around(readings)
+        plan.translate(ids, view.mapped, self.pruner.records.aliases)
         return plan
 
     def alternatives(self, readings: Array, ceiling: float = np.inf) -> list[Option]:
@@ -290,15 +614,15 @@ class ManagedSlam(ManagedFilter):
         Of those that cost more than ``ceiling`` only the most likely is of interest.
         """
         argument_checks.refuse_unusable(readings)
-        known, view = self.candidates, self._pruner.view_for(readings)
-        return associate(self._policy, known, readings, view, self._sensor, ceiling)
+        known, view = self.candidates, self.pruner.view_for(readings)
+        return associate(self.policy, known, readings, view, self.sensor, ceiling)
 
     def is_astray(self, readings: Array) -> bool:
         """Return whether a scan (m, 2) finds the robot astray in its map."""
-        rules = self._policy.constellations
+        rules = self.policy.constellations
         if rules is None or not len(readings):
             return False
-        return is_astray(self._pruner.view_around(readings), rules)
+        return is_astray(self.pruner.view_around(readings), rules)
 
     def deferred(
         self, readings: Array, cost: float, best: Callable[[], ScanAssociation]
@@ -310,8 +634,8 @@ class ManagedSlam(ManagedFilter):
         """
         if sum(i is not None for i in best().row_ids) >= FEWEST_READINGS:
             return []
-        plan = ScanAssociation(self._policy, self.candidates, readings)
-        plan.explained.update(self._pruner.view_around(readings).ids)
+        plan = ScanAssociation(self.policy, self.candidates, readings)
+        plan.explained.update(self.pruner.view_around(readings).ids)
         plan.ambiguous_rows.extend(range(len(readings)))
         return [(cost, lambda: plan)]
 
@@ -321,58 +645,55 @@ class ManagedSlam(ManagedFilter):
         A filter whose belief cannot be moved observes its absolute pose there: only
         landmarks of accurate absolute position count.
         """
-        view, rules = self._pruner.view_around(readings), self._policy.constellations
+        view, rules = (self.pruner.view_around(readings), self.policy.constellations)
         assert rules is not None  # else the robot is not astray
-        noise, min_range = self._sensor
+        noise, min_range = self.sensor
         places = places_of_scan(view, readings, noise, rules, min_range)
-        if not places or self._editor.can_move:
+        if not places or self.editor.can_move:
             return places
-        if not isinstance(self._filter, SupportsPoses):
+        if not isinstance(self.filter, SupportsPoses):
             return []
         spread = np.trace(view.landmark_covariances, axis1=1, axis2=2)
         return [place for place in places if spread[place[1]].max() <= AROUND[0, 0] / 4]
 
     def move_to(self, pose: Array, slots: IntArray) -> list[UpdateReport]:
         """Correct the belief with a place that a scan has shown."""
-        if not self._editor.can_move:
+        if not self.editor.can_move:
             # The heading first: a large turn and a shift together are not linear.
             axes, parts = np.eye(3), (slice(2, 3), slice(2))
             readings = [(pose[k], axes[k], AROUND[k, k]) for k in parts]
-            return [self.observe_pose(*reading) for reading in readings]
-        part = observe_relative_pose(self._filter.belief(), pose, slots, AROUND)
-        self._editor.replace_belief(part.mean, part.covariance)
+            return [self.observe_pose(PoseReading.checked(*each)) for each in readings]
+        part = observe_relative_pose(self.filter.belief(), pose, slots, AROUND)
+        self.editor.replace_belief(part.mean, part.covariance)
         # The scans before cannot be repeated, since the place would not be.
-        self._recent.scans, self._recent.motions = [], ()
+        self.recent.scans, self.recent.motions = [], ()
         return [part.report()]
 
-    def take(self, readings: Array, plan: ScanAssociation) -> UpdateReport:
-        """Correct the belief with readings (m, 2) as associated, then prune the map."""
-        missed = self._pruner.expected(readings) - plan.explained
-        fed = self._recent.with_scan(readings, plan)
-        step = partial(self._recent.feed, fed)
-        follow = partial(self._follow, readings, fed, missed)
+    def take(self, plan: ScanAssociation) -> UpdateReport:
+        """Correct the belief with a scan as associated, then prune the map."""
+        plan.missed = self.pruner.expected(plan.readings) - plan.explained
+        fed = self.recent.with_scan(plan)
+        step, follow = partial(self.recent.feed, fed), partial(self._follow, fed)
         if fed.first is None:
-            return advance(self._filter, step, follow, undo_all(), self.bookmark)
+            return advance(self.filter, step, follow, undo_all(), self.bookmark)
         # The filter repeats its steps since a saved state, in new arrays.
         with undone_on_error(self.bookmark()):
             return follow(step())
 
-    def _follow(
-        self, readings: Array, fed: FedScans, missed: set[int], report: UpdateReport
-    ) -> UpdateReport:
+    def _follow(self, fed: FedScans, report: UpdateReport) -> UpdateReport:
         """Do what follows an update of the filter; return the whole report."""
         plan = fed.plan
-        self._recent.note_scan(fed, report)
-        self._editor.expire()
-        view = self._pruner.view_around(readings)
+        self.recent.note_scan(fed, report)
+        self.editor.expire()
+        view = self.pruner.view_around(plan.readings)
         self.candidates = plan.candidates_after(view)
-        made = self.decisions[-1]
-        seen = set(view.ids).intersection(made.row_ids)
+        made = self.recent.decisions[-1]
+        plan.seen = set(view.ids).intersection(made.row_ids)
         if plan.confirmed:  # the filter may refuse the last sighting of a new one
-            seen -= {*report.rejected_ids, *report.skipped_ids}
-        removed, merged = self._pruner.prune(readings, plan, seen, missed)
-        self._recent.note_edits(removed, merged)
-        self._report = report.completed(
+            plan.seen -= {*report.rejected_ids, *report.skipped_ids}
+        removed, merged = self.pruner.prune(plan)
+        self.recent.note_edits(removed, merged)
+        self.report = report.completed(
             removed_ids=tuple(removed),
             merged_ids=tuple(merged),
             confirmed_ids=tuple(i for i in made.added if i in plan.confirmed),
@@ -381,72 +702,115 @@ class ManagedSlam(ManagedFilter):
             ambiguous_rows=tuple(plan.ambiguous_rows),
         )
         self.steps += 1
-        return self._report
+        return self.report
 
-    def remove(self, landmark_ids: LandmarkIds) -> None:
-        """Marginalise mapped landmarks by hand, shape (n,); all else stays."""
-        ids = argument_checks.mapped_identities(landmark_ids, {*self.landmark_ids})
-        with undone_on_error(self.bookmark()):
-            self._recent.note_edits(self._pruner.remove(ids), ())
+    def remove(self, ids: list[int]) -> None:
+        """Marginalise mapped landmarks; all else stays."""
+        self.recent.note_edits(self.pruner.remove(ids), ())
 
     def merge(self, kept: int, gone: int) -> None:
-        """Merge two mapped landmarks by hand; both identities then name the first."""
-        argument_checks.two_landmarks(kept, gone, self.landmark_ids)
-        with undone_on_error(self.bookmark()):
-            self._pruner.join([(kept, gone)])
-            self._recent.note_edits((), [(kept, gone)])
+        """Merge two mapped landmarks; both identities then name the first."""
+        self.pruner.join([(kept, gone)])
+        self.recent.note_edits((), [(kept, gone)])
 
     def state_dict(self) -> dict[str, Any]:
         """Return the filter's state and the records of landmarks, as arrays."""
         return {
-            "estimator": np.array(type(self).__name__),
-            **with_prefix("landmarks", self._pruner.records.state_dict()),
+            **with_prefix("landmarks", self.pruner.records.state_dict()),
             **with_prefix("tentative", self.candidates.state_dict()),
-            **with_prefix("recent", self._recent.state_dict()),
-            **with_prefix("filter", self._filter.state_dict()),
+            **with_prefix("recent", self.recent.state_dict()),
+            **with_prefix("filter", self.filter.state_dict()),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state, bit for bit under the same settings.
-
-        An error leaves all as before.
-        """
-        saved_states.refuse_other_state(state, (), estimator=type(self).__name__)
+        """Continue from a saved state; an error leaves the hypothesis in any state."""
         candidates = Candidates.from_state_dict(without_prefix(state, "tentative"))
-        with undone_on_error(self.bookmark()):
-            self._pruner.records.load_state_dict(without_prefix(state, "landmarks"))
-            self._recent.load_state_dict(without_prefix(state, "recent"))
-            self._filter.load_state_dict(without_prefix(state, "filter"))
-            self._editor.expire()
-            self.candidates, self._report = candidates, UpdateReport()
-
-    def forget_scans(self) -> None:
-        """Free the memory of the last scans, of a filter that nobody uses."""
-        self._recent.forget()
+        self.pruner.records.load_state_dict(without_prefix(state, "landmarks"))
+        self.recent.load_state_dict(without_prefix(state, "recent"))
+        self.filter.load_state_dict(without_prefix(state, "filter"))
+        self.editor.expire()
+        self.candidates, self.report = candidates, UpdateReport()
 
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
-        parts = self._recent.bookmark(), self._editor.bookmark()
-        own = attributes(self, self._pruner, self._pruner.records)
-        return undo_all(*parts, bookmark(self._filter), own)
-
-    def bookmark_views(self) -> Undo:
-        """Return what takes back that associations have looked at the map."""
-        return self._editor.bookmark()
+        parts = self.recent.bookmark(), self.editor.bookmark()
+        own = attributes(self, self.pruner, self.pruner.records)
+        return undo_all(*parts, bookmark(self.filter), own)
 
     def snapshot(self) -> tuple[Any, ...]:
         """Return the present state, decisions included, for :meth:`resume`."""
-        kept = self.candidates, self.steps, self._report
-        parts = self._pruner.records.state(), self._recent.state()
-        return snapshot(self._filter), *parts, *kept
+        kept = self.candidates, self.steps, self.report
+        parts = self.pruner.records.state(), self.recent.state()
+        return snapshot(self.filter), *parts, *kept
 
     def resume(self, before: tuple[Any, ...]) -> None:
-        """Return to a :meth:`snapshot` of a filter with the same settings."""
-        inside, records, recent, self.candidates, self.steps, self._report = before
-        resume(self._filter, inside)
-        self._pruner.records.restore(records)
-        self._recent.restore(recent)
-        self._editor.expire()
+        """Return to a :meth:`snapshot` of another hypothesis of the same settings."""
+        inside, records, recent, self.candidates, self.steps, self.report = before
+        resume(self.filter, inside)
+        self.pruner.records.restore(records)
+        self.recent.restore(recent)
+        self.editor.expire()
 
-    def __repr__(self) -> str:
-        return f"Managed {self._filter!r}"
+
+def distinct(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
+    """Return the hypotheses that differ from all that are more probable.
+
+    The effect of readings that were left out fades with time.  Of hypotheses with
+    overlapping poses, which are variants of one decision, the most probable are
+    returned only, so that they leave room for another decision.
+    """
+    if len(hypotheses) == 1:
+        return [*hypotheses]
+    views = [h.map_view() for h in hypotheses]
+    variances = np.maximum([v.covariance.diagonal()[:3] for v in views], 0.0) + NIL
+    poses = np.hstack([[v.mean[:3] for v in views], variances]).tolist()
+    labels = [h.candidates.tentative.labels.tobytes() for h in hypotheses]
+    chosen: list[int] = []
+    for k, view in enumerate(views):
+        if len(chosen) == most:
+            break
+        overlapping = sum(_overlap(poses[n], poses[k]) for n in chosen)
+        alike = (views[n] for n in chosen if labels[n] == labels[k])
+        if overlapping < PER_BASIN and not any(is_near(v, view) for v in alike):
+            chosen.append(k)
+    return [hypotheses[k] for k in chosen]
+
+
+def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
+    """Return whether two poses overlap, each three means, then three variances.
+
+    The Bhattacharyya distance of two Gaussians is, in one coordinate, ::
+
+        (μ₂ − μ₁)² / 4 (σ₁² + σ₂²) + ½ ln ((σ₁² + σ₂²) / 2 σ₁σ₂)
+    """
+    for k in range(3):
+        gap, variance, v = other[k] - one[k], one[k + 3], other[k + 3]
+        apart = (wrap_angle(gap) if k == 2 else gap) ** 2 / (4 * (variance + v))
+        apart += log((variance + v) ** 2 / (4 * variance * v)) / 4
+        if not apart <= OVERLAP:
+            return False
+    return True
+
+
+def is_near(one: MapView, other: MapView) -> bool:
+    """Return whether two maps of the same landmarks have nearly the same belief.
+
+    In every coordinate with means μ₁, μ₂ and deviations σ₁, σ₂, the second belief must
+    not be far off the first one and not be much less certain::
+
+        (μ₂ − μ₁)² + σ₂² − σ₁² ≤ (SAME σ₁)²
+    """
+    if one.ids != other.ids:
+        return False
+    size = 3 + 2 * len(one.ids)
+    gap = other.mean[:size] - one.mean[:size]
+    gap[2] = wrap_angle(float(gap[2]))
+    variances, others = (m.covariance.diagonal()[:size] for m in (one, other))
+    return bool((gap**2 + others <= (1 + SAME**2) * variances).all())
+
+
+def cost_of(report: UpdateReport) -> float:
+    """Return νᵀ S⁻¹ ν + ln det S of a reading, or SPREAD if it was rejected."""
+    if not report.degrees_of_freedom:
+        return SPREAD
+    return report.nis + 2 * float(np.log(report.innovation_factor.diagonal()).sum())

@@ -64,25 +64,16 @@ class MapPruner:
         mask &= ~lost(view, policy.constellations)
         return {view.ids[slot] for slot in np.flatnonzero(mask).tolist()}
 
-    def prune(
-        self, readings: Array, plan: ScanAssociation, seen: set[int], missed: set[int]
-    ) -> tuple[list[int], Pairs]:
-        """Remove and merge landmarks; return the removed ids and pairs (kept, gone).
+    def prune(self, plan: ScanAssociation) -> tuple[list[int], Pairs]:
+        """Remove and merge landmarks after a scan that the filter has taken.
 
-        Parameters
-        ----------
-        readings : ndarray, shape (m, 2)
-            The scan.
-        plan : ScanAssociation
-            Landmarks of its rows, and those that it has confirmed.
-        seen, missed : set of int
-            Landmarks that the scan has shown, and those that it should have shown.
+        Return the removed landmarks, and the merged ones as pairs (kept, gone).
         """
-        self._note_sightings(readings, plan.row_ids, seen)
-        removed = self._remove_missing(missed)
-        merged = self._merge_duplicates(seen)
-        merged += self._close_loops(plan.confirmed, readings)
-        return removed + self._keep_capacity(seen), merged
+        self._note_sightings(plan)
+        removed = self._remove_missing(plan.missed)
+        merged = self._merge_duplicates(plan.seen)
+        merged += self._close_loops(plan.confirmed, plan.readings)
+        return removed + self._keep_capacity(plan.seen), merged
 
     def remove(self, ids: list[int]) -> list[int]:
         """Remove landmarks from the map and from the records; return them."""
@@ -107,17 +98,16 @@ class MapPruner:
             return False
         return True
 
-    def _note_sightings(
-        self, readings: Array, row_ids: Sequence[int | None], seen: set[int]
-    ) -> None:
+    def _note_sightings(self, plan: ScanAssociation) -> None:
         """Record the landmarks that a scan has shown, and that they differ."""
-        view, within = self._editor.map_view(), self._policy.merge_within
+        view, seen = self._editor.map_view(), plan.seen
+        within = self._policy.merge_within
         self.records.follow(view.mapped)
         if not seen:
             return
-        rows = [row for row, i in enumerate(row_ids) if i in seen]
-        slots = self.records.slots(i for i in row_ids if i in seen)
-        sighting = readings[rows], view.mean[2], self._noise
+        shown_by = {row: i for row, i in enumerate(plan.row_ids) if i in seen}
+        slots = self.records.slots(shown_by.values())
+        sighting = plan.readings[[*shown_by]], view.mean[2], self._noise
         _add_sightings(self.records.renewed(), slots, *sighting)
         if within is not None:
             shown = view.landmarks[slots := slots_of(view, seen)]

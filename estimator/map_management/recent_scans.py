@@ -100,11 +100,11 @@ class RecentScans(Restorable):
                 removed=(*last.removed, *removed), merged=(*last.merged, *merged)
             )
 
-    def with_scan(self, readings: Array, plan: ScanAssociation) -> FedScans:
+    def with_scan(self, plan: ScanAssociation) -> FedScans:
         """Return what to feed to the filter: a new scan, and earlier ones to repeat."""
         decided = tuple(plan.row_ids), tuple(plan.labels)
         # The caller may reuse the array of readings.
-        scan = RecentScan(plan.scan, self.motions, readings.copy(), *decided)
+        scan = RecentScan(plan.scan, self.motions, plan.readings.copy(), *decided)
         newest = max(scan.labels, default=NO_LABEL)
         if self._window and newest >= scan.number << LABEL_BITS:  # its first sighting
             scan = scan._replace(before=self._slam.state_dict())

@@ -195,9 +195,9 @@ def _name_of(estimator: SlamEstimator, given: str | None) -> str:
     """Return a given name, or that of the class; of a managed filter, the filter's."""
     if given:
         return given
-    from ...estimator.map_management.managed_slam import ManagedFilter  # noqa: PLC0415 (many)
+    from ...estimator.map_management.managed_slam import ManagedSlam  # noqa: PLC0415 (many)
 
-    if isinstance(estimator, ManagedFilter):
+    if isinstance(estimator, ManagedSlam):
         return type(estimator.filter).__name__
     return type(estimator).__name__
 

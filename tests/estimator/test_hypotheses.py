@@ -10,15 +10,13 @@ from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import EkfSlam, UpdateReport, make_estimator
 from slamgym.estimator.association import scan_assignments
 from slamgym.estimator.interface import MapView
-from slamgym.estimator.map_management.hypotheses import (
+from slamgym.estimator.map_management.managed_slam import (
     OVERLAP,
     PER_BASIN,
-    Hypothesis,
-    HypothesisSlam,
+    ManagedSlam,
     distinct,
     is_near,
 )
-from slamgym.estimator.map_management.managed_slam import ManagedSlam
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.evaluation import score_association
 from slamgym.sim_configs import action_sequence, load_scenario
@@ -171,7 +169,6 @@ def test_a_density_of_clutter_wrong_by_a_factor_of_three_does_no_harm(factor):
 def test_hypotheses_are_as_many_as_the_policy_allows(slippery_drive):
     world, scans = slippery_drive
     slam = make(world, association="hypotheses", hypotheses=4)
-    assert isinstance(slam, HypothesisSlam)
     for k, (odometry, readings, _) in enumerate(scans[:40]):
         if k:
             slam.predict(odometry)
@@ -265,7 +262,7 @@ def test_a_hypothesis_whose_filter_fails_is_discarded(slippery_drive):
     failing_after(failing, 0)
     slam.predict(odometry)
     slam.update(readings)
-    assert failing not in [h.slam for h in slam.hypotheses]
+    assert failing not in slam.hypotheses
     assert slam.hypotheses[0].cost == 0.0
 
 
@@ -274,7 +271,7 @@ def test_where_every_filter_fails_nothing_has_changed(slippery_drive, monkeypatc
     slam, (_, readings, _) = several_hypotheses(scans, world)
     before = digest(slam)
     for hypothesis in slam.hypotheses:
-        failing_after(hypothesis.slam, 0)
+        failing_after(hypothesis, 0)
     make_filter = slam._fresh
 
     def make_failing():
@@ -337,7 +334,7 @@ def test_a_discarded_hypothesis_keeps_no_scans(slippery_drive):
     follow(slam, scans[:60])
     _, spare = filters_of(slam)
     assert len(spare) > 0
-    assert not any(each.decisions for each in spare)
+    assert not any(each.recent.decisions for each in spare)
 
 
 def test_alternatives_that_are_skipped_would_not_have_been_kept(
@@ -349,7 +346,8 @@ def test_alternatives_that_are_skipped_would_not_have_been_kept(
     monkeypatch.setattr(scan_assignments, "_is_superfluous", lambda *_: False)
     thorough = follow(options[1], scans[:60])
     assert [r.row_ids for r in quick] == [r.row_ids for r in thorough]
-    assert digest(options[0].best) == digest(options[1].best)
+    assert digest(options[0].filter) == digest(options[1].filter)
+    assert options[0].decisions == options[1].decisions
 
 
 def test_a_sighting_of_clutter_does_not_drag_a_new_landmark_along():
@@ -378,9 +376,9 @@ def test_a_sighting_of_clutter_does_not_drag_a_new_landmark_along():
 def test_an_interrupted_update_loses_no_filter(slippery_drive, monkeypatch):
     world, scans = slippery_drive
     slam = make(world, association="hypotheses")
-    made, take_over = [], HypothesisSlam._take_over
-    make_one = slam._make
-    slam._make = lambda: made.append(0) or make_one()
+    made, take_over = [], ManagedSlam._take_over
+    make_one = slam._estimator
+    slam._estimator = lambda: made.append(0) or make_one()
 
     def interrupted(self, hypotheses):
         monkeypatch.undo()
@@ -391,7 +389,7 @@ def test_an_interrupted_update_loses_no_filter(slippery_drive, monkeypatch):
     def go_on():
         for odometry, readings, _ in scans:
             slam.predict(odometry)
-            monkeypatch.setattr(HypothesisSlam, "_take_over", interrupted)
+            monkeypatch.setattr(ManagedSlam, "_take_over", interrupted)
             slam.update(readings)
 
     with pytest.raises(KeyboardInterrupt):
@@ -488,16 +486,17 @@ def test_a_loop_is_not_closed_for_good_by_one_reading_of_clutter():
         slam.predict((0.0, 0.0))
         slam.update(np.empty((0, 2)))
     slam.update(reading)
-    stds = [np.sqrt(h.slam.map_view().covariance[0, 0]) for h in slam.hypotheses]
+    stds = [np.sqrt(h.map_view().covariance[0, 0]) for h in slam.hypotheses]
     assert len(stds) == 2
     assert max(stds) > 2 * min(stds)
 
 
-def standing(x, std):
-    """Return a filter without landmarks at a place on the x axis."""
+def standing(x, std, rows=0):
+    """Return a hypothesis at a place on the x axis, after one scan."""
     slam = ManagedSlam(EkfSlam, (0.1, 0.1, 0.1), (0.1, 0.1))
     slam.reset((x, 0.0, 0.0), (std, 0.1, 0.1))
-    return slam
+    slam.update([(1.0 * row, 3.0) for row in range(rows)])
+    return slam.best
 
 
 def bhattacharyya(x, std, other, other_std):
@@ -524,10 +523,9 @@ def test_a_loop_is_not_closed_by_a_new_landmark_that_earlier_scans_would_have_sh
 )
 def test_variants_of_one_pose_leave_room_for_another(gap, ratio):
     std, count = 0.2, PER_BASIN + 1
-    first = [Hypothesis(k, standing(1e-3 * k, std)) for k in range(PER_BASIN)]
-    for k, hypothesis in enumerate(first):  # they differ by what is not confirmed
-        hypothesis.slam.update([(1.0 * row, 3.0) for row in range(k + 1)])
-    other = Hypothesis(9.0, standing(gap * std, ratio * std))
+    # They differ by what is not confirmed.
+    first = [standing(1e-3 * k, std, rows=k + 1) for k in range(PER_BASIN)]
+    other = standing(gap * std, ratio * std)
     is_variant = bhattacharyya(0.0, std, gap * std, ratio * std) <= OVERLAP
     kept = distinct([*first, other], most=10)
     assert len(kept) == count - is_variant
@@ -536,10 +534,9 @@ def test_variants_of_one_pose_leave_room_for_another(gap, ratio):
 
 
 def test_hypotheses_are_compared_where_rounding_makes_a_variance_negative():
-    slams = [standing(x, 0.2) for x in (*[0.0] * (PER_BASIN + 1), 1.0)]
-    for slam in slams:
-        slam.map_view().covariance[0, 0] = -1e-9
-    hypotheses = [Hypothesis(k, slam) for k, slam in enumerate(slams)]
+    hypotheses = [standing(x, 0.2) for x in (*[0.0] * (PER_BASIN + 1), 1.0)]
+    for hypothesis in hypotheses:
+        hypothesis.map_view().covariance[0, 0] = -1e-9
     kept = [*hypotheses[:PER_BASIN], hypotheses[-1]]
     assert distinct(hypotheses, most=10) == kept
 
@@ -551,10 +548,10 @@ def test_readings_that_a_hypothesis_does_not_explain_cost_their_poisson_probabil
         for more in ({}, {"density": 0.1})
     )
     for scan in ([(0.3, 4.0), (2.0, 3.0)], [(-2.0, 5.0)], [(1.0, 2.0)]):
-        density, none = free.candidates.density, np.empty((0, 2))
+        density, none = free.best.candidates.density, np.empty((0, 2))
         expected = 2 * density.readings / density.scans
-        assert free.alternatives(none)[0][0] == pytest.approx(expected)
-        assert told.alternatives(none)[0][0] == 0
+        assert free.best.alternatives(none)[0][0] == pytest.approx(expected)
+        assert told.best.alternatives(none)[0][0] == 0
         free.update(scan)
         told.update(scan)
     assert expected > 0.5
@@ -569,9 +566,9 @@ def test_a_copy_continues_like_its_original_where_views_are_a_part_of_the_map():
     for _ in range(3):
         slam.predict((0.1, 0.0))
         copied.resume(slam.snapshot())
-        complete = slam.alternatives(readings)[0][1]
+        complete = slam.best.alternatives(readings)[0][1]
         for each in (slam, copied):
-            each.take(readings, complete())
+            each.best.take(complete())
         assert digest(copied) == digest(slam)
 
 

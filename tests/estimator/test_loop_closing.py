@@ -282,7 +282,7 @@ def test_a_scan_that_fits_two_places_continues_at_both():
     slam = lost_alone(two, (0.0, 0.0, 0.0))
     slam.predict((0.0, 0.0), dt=15_000.0)
     slam.update(readings_of(group))
-    found = [h.slam.belief(()).pose[:2].round(1).tolist() for h in slam.hypotheses]
+    found = [h.filter.belief(()).pose[:2].round(1).tolist() for h in slam.hypotheses]
     assert [0.0, 0.0] in found
     assert [0.0, 4.0] in found
 
@@ -561,4 +561,4 @@ def test_readings_beside_the_robot_and_far_away_show_no_place_and_give_no_warnin
     with np.errstate(all="raise"):
         found = slam._at_places(np.vstack([bad, scan]), slam.hypotheses)
     (other,) = twin._at_places(scan, twin.hypotheses)
-    assert_same_bits(found[0].slam.belief(), other.slam.belief())
+    assert_same_bits(found[0].filter.belief(), other.filter.belief())

@@ -152,7 +152,7 @@ def test_tentative_landmarks_remain_in_place_while_the_robot_moves(motion):
     slam.update(polar(points))
     slam.predict((0.5, 0.4), dt=4.0)
     np.testing.assert_allclose(slam.tentative_landmarks, points, atol=1e-12)
-    doubt = slam.state_dict()["tentative.covariance"][:3, :3]
+    doubt = slam.state_dict()["0.tentative.covariance"][:3, :3]
     np.testing.assert_allclose(doubt, slam.belief().covariance, atol=1e-15)
 
 
@@ -246,7 +246,7 @@ def test_a_tentative_landmark_stays_as_it_is_while_a_robot_without_noise_rests()
     before = slam.state_dict()
     slam.predict((0.0, 0.0))
     after = slam.state_dict()
-    key = "tentative.covariance"
+    key = "0.tentative.covariance"
     np.testing.assert_array_equal(before[key], after[key])
     slam.predict((0.1, 0.0))
     assert (np.linalg.det(slam.state_dict()[key]) > np.linalg.det(before[key])).all()
@@ -255,7 +255,7 @@ def test_a_tentative_landmark_stays_as_it_is_while_a_robot_without_noise_rests()
 def test_a_saved_tentative_landmark_of_negative_variance_is_refused():
     slam = make(management={})
     slam.update(polar([(3, 4)]))
-    key = "tentative.covariance"
+    key = "0.tentative.covariance"
     state = slam.state_dict()
     with pytest.raises(ValueError, match=r"covariance'\] must be positive semidef"):
         slam.load_state_dict(state | {key: -state[key]})
@@ -268,7 +268,7 @@ def test_saved_tentative_landmarks_of_another_number_are_refused(keys):
     slam, other = make(management={}), make(management={})
     slam.update(polar([(3, 4), (4, -2)]))
     other.update(polar([(3, 4)]))
-    parts = {key: other.state_dict()[key] for key in (f"tentative.{k}" for k in keys)}
+    parts = {key: other.state_dict()[key] for key in (f"0.tentative.{k}" for k in keys)}
     with pytest.raises(ValueError, match="must have shape"):
         slam.load_state_dict(slam.state_dict() | parts)
 
@@ -633,12 +633,22 @@ def busy_run(slam, steps, start=0):
     return beliefs
 
 
+def test_members_that_a_filter_passes_on_are_its_own_after_a_state_is_loaded():
+    slam = make("sparse_information", True)
+    busy_run(slam, 4)
+    saved = slam.state_dict()
+    slam.load_state_dict(saved)
+    slam.resume(slam.snapshot())
+    slam.reset((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
+    assert slam.local_view.__self__ is slam.filter
+
+
 def test_a_foreign_or_damaged_state_is_refused():
     slam, other = make(management=TIDY), make(management=None)
     busy_run(slam, 8)
     saved, before = slam.state_dict(), digest(slam)
-    damaged = saved | {"landmarks.apart": np.zeros((2, 3), dtype=int)}
-    lacking = {key: saved[key] for key in saved if key != "landmarks.misses"}
+    damaged = saved | {"0.landmarks.apart": np.zeros((2, 3), dtype=int)}
+    lacking = {key: saved[key] for key in saved if key != "0.landmarks.misses"}
     for state, message in (
         (other.state_dict(), "state is of EkfSlam, not of ManagedSlam"),
         (lacking, r"state must hold 'landmarks\.misses'"),
@@ -780,8 +790,8 @@ def test_landmarks_begun_in_a_new_submap_count_as_seen():
         assert slam.update(readings[ids], ids).removed_ids == ()
     state = slam.state_dict()
     assert slam.filter.closed_count > 3
-    assert state["landmarks.misses"].tolist() == [0] * 5 + [1]
-    assert (state["landmarks.information"][:, [0, 2]] > 0).all()
+    assert state["0.landmarks.misses"].tolist() == [0] * 5 + [1]
+    assert (state["0.landmarks.information"][:, [0, 2]] > 0).all()
 
 
 @pytest.mark.slow

@@ -37,7 +37,6 @@ from slamgym.estimator.association.tentative_landmarks import (
     UnexplainedDensity,
 )
 from slamgym.estimator.interface import MapView
-from slamgym.estimator.map_management.hypotheses import Hypothesis
 
 LONGEST = 6.0
 NONE = np.empty(0, np.int64)
@@ -198,13 +197,13 @@ def test_only_scans_before_the_first_sighting_make_a_landmark_dear(confirm, dear
         motion_std=(0.01, 0.0, 0.01),
         measurement_std=(0.02, 0.05),
         management={"association": "hypotheses", "confirm": confirm},
-    ).best
+    )
     prices = []
     for scan in range(12):  # each remembers a pose
         readings = scan_at(np.array([scan - 6.0, 0.0, 0.0]))[: 5 if scan >= 6 else 4]
-        _, complete = slam.alternatives(readings)[0]
+        _, complete = slam.best.alternatives(readings)[0]
         plan = complete()
-        slam.take(readings, plan)
+        slam.best.take(plan)
         slam.predict((1.0, 0.0))
         prices.append(plan.price)
     assert np.flatnonzero(np.array(prices) > 1).tolist() == dear
@@ -276,7 +275,7 @@ def test_a_reading_of_a_tentative_landmark_is_no_clutter():
     )
     costs = []
     for scan in ([(0.5, 4.0)], [(0.5, 4.0)], [(-2.0, 4.0)]):
-        costs.append(slam.alternatives(np.array(scan))[0][0])
+        costs.append(slam.best.alternatives(np.array(scan))[0][0])
         slam.update(scan)
     assert costs[0] == costs[2] == missing_costs(np.array([0.02]))[0]
     assert costs[1] < costs[0] - 5
@@ -353,8 +352,7 @@ def test_a_robot_that_sees_its_map_is_not_lost(association):
 
 def test_the_alarm_is_that_of_the_reported_hypothesis():
     slam = circling("hypotheses")
-    other = circling("hypotheses", kidnapped_at=30).best
-    slam.hypotheses.append(Hypothesis(1.0, other))
+    slam.hypotheses.append(circling("hypotheses", kidnapped_at=30).best)
     assert not slam.probably_lost
     slam.hypotheses.reverse()
     assert slam.probably_lost
@@ -655,7 +653,7 @@ def detected(*counts):
 )
 def test_a_saved_state_with_impossible_detections_is_refused(name, value):
     slam = circling("joint", steps=5)
-    state = slam.state_dict() | {f"tentative.{name}": np.array(value, float)}
+    state = slam.state_dict() | {f"0.tentative.{name}": np.array(value, float)}
     with pytest.raises(ValueError, match=rf"tentative\.{name}'\] must be"):
         slam.load_state_dict(state)
 
@@ -688,7 +686,7 @@ def test_a_single_wrong_range_does_not_stretch_the_cells(scan, wrong):
     np.testing.assert_array_equal(other.belief().mean, clean.belief().mean)
     shares = [
         detections.detected[0].sum(axis=0) / detections.detected[1].sum(axis=0)
-        for detections in (s.candidates.detections for s in (clean, other))
+        for detections in (s.best.candidates.detections for s in (clean, other))
     ]
     np.testing.assert_allclose(*shares, atol=0.05)
     assert not other.probably_lost

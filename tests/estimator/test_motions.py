@@ -9,7 +9,7 @@ from numeric_jacobian import numeric_jacobian
 from slamgym.estimator import EkfSlam, list_estimators, make_batch, make_estimator
 from slamgym.estimator.filters.gaussian_map import move_pose
 from slamgym.estimator.filters.imagine import imagine
-from slamgym.estimator.map_management.hypotheses import manage
+from slamgym.estimator.map_management import ManagedSlam
 from slamgym.estimator.models import motions
 from slamgym.estimator.models.bearing_range import wrap_angle
 from slamgym.estimator.models.model_checks import check_motion
@@ -199,9 +199,9 @@ def test_a_managed_filter_refuses_a_displacement_that_its_filter_would_take(
     association, confirm
 ):
     blows_up = Motion("blows_up", ("a", "b"), ("", ""), lambda a, b: (a, b, 1e300 * a))
-    slam = manage(Trusting, {"association": association, "confirm": confirm})(
-        motion_std=(0.1, 0.1, 0.1), measurement_std=(0.1, 0.1), motion=blows_up
-    )
+    management = {"association": association, "confirm": confirm}
+    options = {"management": management, "motion": blows_up}
+    slam = ManagedSlam(Trusting, (0.1, 0.1, 0.1), (0.1, 0.1), **options)
     slam.update([(0.5, 2.0)])
     before = digest(slam)
     with pytest.raises(ValueError, match="finite displacement with motion 'blows_up'"):

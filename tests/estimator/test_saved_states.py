@@ -222,7 +222,7 @@ def without_the_last(value):
          "local_slots'] must be whole numbers <= 2⁵³"),
         ("sparse_information", "local_slots", lambda v: v[:, None],
          r"state\['local_slots'\] must have shape"),
-        *(("joint", f"landmarks.{key}", without_the_last, r"state\['landmarks")
+        *(("joint", f"0.landmarks.{key}", without_the_last, r"state\['landmarks")
           for key in ("ids", "misses", "information")),
     ],
 )  # fmt: skip

@@ -38,8 +38,8 @@ def map_of(slam):
 
 
 def filters_of(slam):
-    """Return the filters of a filter with several hypotheses, and the spare ones."""
-    return slam._filters, slam._spare
+    """Return the hypotheses that a managed filter has made, and the spare ones."""
+    return slam._made, slam._spare
 
 
 def spied(monkeypatch, owner, name, note):
