@@ -55,6 +55,7 @@ class Motion:
     --------
     An omnidirectional robot that reports its motion ahead and to the left:
 
+    >>> from slamgym.estimator.models import check_motion
     >>> omni = Motion("omni", ("ahead", "left"), ("m", "m"), lambda a, l: (a, l, 0 * a))
     >>> check_motion(omni)
     """
