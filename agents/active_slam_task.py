@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array, BoolArray, IntArray
 from ..estimator.filters.batch import BatchStorage
-from ..estimator.interface import SupportsDecisions
 from ..estimator.map_management.policy import policy_of
 from ..evaluation.association_scores import score_association
 from ..restorable import Restorable
@@ -314,7 +313,7 @@ class AssociationRecord(Restorable):
         table = np.full((len(SCORES), len(filters)), -1.0)
         for b in np.flatnonzero(ended).tolist():
             slam = filters[b]
-            if isinstance(slam, SupportsDecisions):
+            if hasattr(type(slam), "decisions"):
                 scores = score_association(
                     slam.decisions, self._true_ids[b], confirm=policy_of(slam).confirm
                 ).as_dict()

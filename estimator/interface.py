@@ -23,13 +23,6 @@ __all__ = [
     "ScanDecisions",
     "SlamEstimator",
     "SmoothedPath",
-    "SupportsBeliefLimit",
-    "SupportsDecisions",
-    "SupportsJoin",
-    "SupportsLocalView",
-    "SupportsPoses",
-    "SupportsSmoothing",
-    "SupportsTruth",
     "UpdateReport",
     "optional_members",
     "restore",
@@ -48,6 +41,19 @@ class SlamEstimator(Protocol):
 
     Any class with these methods works in an experiment or an agent's loop.
     :func:`slamgym.estimator.check_estimator` names what a class of your own lacks.
+
+    A class may have further members; only their names count:
+
+    - ``observe_truth(pose, landmarks)`` takes the true pose (3,) and landmarks before
+      the predict of a step, for a filter that linearises there;
+    - ``observe_pose(reading, matrix, covariance)`` takes z = H (x, y, θ) + w, w of
+      covariance R, from z, H and R, and returns an `UpdateReport`;
+    - ``decisions`` lists the `ScanDecisions` about every scan since the start;
+    - ``smoothed()`` returns the `SmoothedPath` of the drive until now;
+    - ``local_view(within)`` returns a `MapView` of the pose and at least the landmarks
+      within a distance [m], faster than the whole belief;
+    - ``join()``, beside it, joins parts of a map that were kept apart until then;
+    - ``belief_limit`` is the largest number of landmarks of a dense belief.
     """
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
@@ -74,30 +80,9 @@ class SlamEstimator(Protocol):
         """Continue from a saved state, bit for bit."""
 
 
-@runtime_checkable
-class SupportsTruth(Protocol):
-    """An estimator that linearises at the ground truth, for study only."""
-
-    def observe_truth(
-        self, pose: ArrayLike, landmarks: Mapping[int, ArrayLike]
-    ) -> None:
-        """Pass the true pose (3,) and landmarks before the predict of a step."""
-
-
-@runtime_checkable
-class SupportsPoses(Protocol):
-    """An estimator that takes readings of the pose, such as compass or GPS."""
-
-    def observe_pose(
-        self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
-    ) -> UpdateReport:
-        """Take in z = H (x, y, θ) + w, w of covariance R, from z, H and R."""
-        ...
-
-
-def taking_poses(estimator: object) -> SupportsPoses:
+def taking_poses(estimator: Any) -> Any:
     """Return an estimator that takes readings of the pose; refuse any other."""
-    if not isinstance(estimator, SupportsPoses):
+    if not hasattr(estimator, "observe_pose"):
         name = type(estimator).__name__
         raise ValueError(f"{name} does not accept readings of the pose")
     return estimator
@@ -109,15 +94,6 @@ def with_fix(report: UpdateReport, fix: UpdateReport) -> UpdateReport:
         nis=report.nis + fix.nis,
         degrees_of_freedom=report.degrees_of_freedom + fix.degrees_of_freedom,
     )
-
-
-@runtime_checkable
-class SupportsDecisions(Protocol):
-    """An estimator that associates readings and lists its decisions about them."""
-
-    @property
-    def decisions(self) -> Sequence[ScanDecisions]:
-        """The decisions about every scan since the start, as they stand now."""
 
 
 class SmoothedPath(Protocol):
@@ -134,40 +110,6 @@ class SmoothedPath(Protocol):
     def belief(self) -> Belief:
         """Return the belief about the last pose and the map."""
         ...
-
-
-@runtime_checkable
-class SupportsSmoothing(Protocol):
-    """An estimator that knows more of a pose once it has seen the whole drive."""
-
-    def smoothed(self) -> SmoothedPath:
-        """Return the beliefs about all poses, given the drive until now."""
-        ...
-
-
-@runtime_checkable
-class SupportsLocalView(Protocol):
-    """An estimator that returns the belief around the robot faster than the whole."""
-
-    def local_view(self, within: float) -> MapView:
-        """Return the pose and at least the landmarks within that distance [m]."""
-        ...
-
-
-@runtime_checkable
-class SupportsJoin(SupportsLocalView, Protocol):
-    """An estimator that keeps parts of its map apart until it joins them."""
-
-    def join(self) -> None:
-        """Join the parts of the map, and continue from the joined map."""
-
-
-@runtime_checkable
-class SupportsBeliefLimit(Protocol):
-    """An estimator that refuses a dense belief of too many landmarks."""
-
-    #: Largest number of landmarks of a dense belief.
-    belief_limit: int
 
 
 def optional_members(estimator: SlamEstimator) -> dict[str, Any]:
@@ -294,16 +236,20 @@ def marginal(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
     return part_of(whole, ids, whole.frame)
 
 
+def joins_its_map(slam: object) -> bool:
+    """Return whether a filter keeps parts of its map apart until it joins them."""
+    return hasattr(slam, "join") and hasattr(slam, "local_view")
+
+
 def marginal_without_joining(slam: SlamEstimator, ids: Sequence[int]) -> Belief:
     """Return a marginal as the filter has it without joining the parts of its map.
 
     For a filter that joins its map, it is taken from ``local_view``, if that holds
     these landmarks; its error is then judged in the invariant frame.
     """
-    # The first test takes far less time than the second, and mostly decides.
-    if not hasattr(slam, "join") or not isinstance(slam, SupportsJoin):
+    if not joins_its_map(slam):
         return marginal(slam, ids)
-    view = slam.local_view(0.0)
+    view: MapView = slam.local_view(0.0)  # type: ignore[attr-defined]
     if not set(ids) <= set(view.ids):
         return marginal(slam, ids)
     return part_of(view, ids, "invariant")

@@ -40,7 +40,6 @@ from ..interface import (
     MapView,
     ScanDecisions,
     SlamEstimator,
-    SupportsPoses,
     UpdateReport,
     advance,
     bookmark,
@@ -651,7 +650,7 @@ class Hypothesis:
         places = places_of_scan(view, readings, noise, rules, min_range)
         if not places or self.editor.can_move:
             return places
-        if not isinstance(self.filter, SupportsPoses):
+        if not hasattr(self.filter, "observe_pose"):
             return []
         spread = np.trace(view.landmark_covariances, axis1=1, axis2=2)
         return [place for place in places if spread[place[1]].max() <= AROUND[0, 0] / 4]

@@ -31,7 +31,6 @@ from ..guards.undo import Undo
 from ..interface import (
     MapView,
     SlamEstimator,
-    SupportsTruth,
     bookmark,
     hides_its_belief,
     restore,
@@ -133,7 +132,7 @@ class MapEditor:
     def can_move(self) -> bool:
         """Whether :meth:`replace_belief` can change the belief."""
         state = self._slam.state_dict()
-        if isinstance(self._slam, SupportsTruth) or not {*DENSE} <= set(state):
+        if hasattr(self._slam, "observe_truth") or not {*DENSE} <= set(state):
             return False
         belief = self._slam.belief()
         ids, places = np.array(belief.landmark_ids), belief.mean[3:]

@@ -22,14 +22,7 @@ from ..filters.pose_readings import PoseReading
 from ..guards import saved_states
 from ..guards.saved_states import with_prefix, without_prefix
 from ..guards.undo import Undo, attributes
-from ..interface import (
-    ScanDecisions,
-    SlamEstimator,
-    SupportsLocalView,
-    SupportsTruth,
-    UpdateReport,
-    restore,
-)
+from ..interface import ScanDecisions, SlamEstimator, UpdateReport, restore
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy
 
@@ -59,7 +52,7 @@ class RecentScans(Restorable):
         self, slam: SlamEstimator, editor: MapEditor, policy: LandmarkPolicy
     ) -> None:
         self._slam, self._editor, self._gate = slam, editor, policy.pair_gate
-        can_repeat = not isinstance(slam, SupportsTruth | SupportsLocalView)
+        can_repeat = not (hasattr(slam, "observe_truth") or hasattr(slam, "local_view"))
         self._window = policy.confirm[1] if policy.backdate and can_repeat else 0
         self.forget()
 

@@ -17,7 +17,7 @@ from scipy.linalg import cho_solve, solve_triangular
 from ...arrays import Array, IntArray
 from ..guards import argument_checks
 from ..guards.argument_checks import LandmarkIds
-from ..interface import Belief, SlamEstimator, SupportsSmoothing
+from ..interface import Belief, SlamEstimator
 from ..map_management.managed_slam import ManagedSlam
 from ..models.bearing_range import locate_landmark, wrap_angle
 from ..models.rigid_motion import seen_from
@@ -475,7 +475,7 @@ class SmoothedDrive:
         )
 
 
-def smoother_in(slam: SlamEstimator) -> SupportsSmoothing | None:
+def smoother_in(slam: SlamEstimator) -> Any:
     """Return the smoother, that of the most probable hypothesis; None without one."""
     inner = slam.filter if isinstance(slam, ManagedSlam) else slam
-    return inner if isinstance(inner, SupportsSmoothing) else None
+    return inner if hasattr(inner, "smoothed") else None

@@ -23,7 +23,6 @@ from ...arrays import Array
 from ...envs.spaces import count_rows
 from ...estimator import registry
 from ...estimator.guards.argument_checks import one_of, usable_cores
-from ...estimator.interface import SupportsTruth
 from ...evaluation.diagnosis import SMALLEST_NOISE
 from ...sim_configs import Scenario, load_scenario
 from ..job_folders import Progress, blocks_at_once, blocks_of, engage_workers, resume
@@ -449,7 +448,7 @@ def _checked(choice: EstimatorChoice, scenario: Scenario) -> FilterSettings:
         raise ValueError("folder holds the submaps of one run: leave it out of many")
     settings = choice.settings(scenario)
     slam = settings.make(scenario.start.pose)
-    if not scenario.sensor.identities and isinstance(slam, SupportsTruth):
+    if not scenario.sensor.identities and hasattr(slam, "observe_truth"):
         raise ValueError(
             f"estimator '{choice.name}' linearises at the true landmarks: it needs "
             "sensor.identities = true"

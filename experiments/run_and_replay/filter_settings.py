@@ -470,8 +470,8 @@ def refuse_large_map(landmarks: int, estimator: interface.SlamEstimator) -> None
     ValueError
         If they exceed the filter's ``belief_limit``.
     """
-    if isinstance(estimator, interface.SupportsBeliefLimit):
-        most = estimator.belief_limit
+    if hasattr(estimator, "belief_limit"):
+        most: int = estimator.belief_limit
         argument_checks.refuse_large_belief(landmarks, most, "take fewer steps")
 
 

@@ -143,7 +143,7 @@ def replay(
     steps = list(recording.steps_of(log))
     times = np.array([step.t for step in steps], dtype=np.float64)
     show_truth = _truth_source(estimator, log, times)
-    most = _MOST_JOINED if isinstance(estimator, interface.SupportsJoin) else _MOST_MAPS
+    most = _MOST_JOINED if interface.joins_its_map(estimator) else _MOST_MAPS
     history = MapHistory(None if keep_history else most)
     recorder = RunRecorder(estimator, len(steps), history)
     decisions = DecisionRecorder(estimator)
@@ -209,7 +209,7 @@ def _truth_source(
 
     It does nothing for other estimators, or if the log lacks a part of the truth.
     """
-    if not isinstance(estimator, interface.SupportsTruth):
+    if not hasattr(estimator, "observe_truth"):
         return _unwatched
     if ground_truth.hides_identities(log):
         return _unwatched  # with hidden identities, the estimator's ids are its own

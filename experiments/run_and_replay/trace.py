@@ -200,14 +200,14 @@ class DecisionRecorder:
     """
 
     def __init__(self, slam: interface.SlamEstimator) -> None:
-        self._slam = slam
+        self._slam: Any = slam
         self._reported: list[interface.ScanDecisions] = []
         self._true_ids: list[IntArray | None] = []
 
     def add(self, report: interface.UpdateReport, true_ids: IntArray | None) -> None:
         """Note an update with readings of true landmarks, shape (m,), if known."""
         self._true_ids.append(true_ids)
-        if not isinstance(self._slam, interface.SupportsDecisions):
+        if not hasattr(type(self._slam), "decisions"):
             new = {*report.added_ids, *report.confirmed_ids}
             added = tuple(i for i in report.row_ids if i in new)
             self._reported.append(interface.ScanDecisions(report.row_ids, added))
@@ -218,7 +218,7 @@ class DecisionRecorder:
         None if the estimator reports none, or a true landmark is unknown.
         """
         made: Sequence[interface.ScanDecisions] = self._reported
-        if isinstance(self._slam, interface.SupportsDecisions):
+        if hasattr(type(self._slam), "decisions"):
             made = self._slam.decisions
         true_ids = [ids for ids in self._true_ids if ids is not None]
         if [len(scan.row_ids) for scan in made] != [len(ids) for ids in true_ids]:

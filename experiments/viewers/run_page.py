@@ -23,8 +23,8 @@ from ...envs.rendering.render_state import drawn_readings
 from ...estimator.interface import (
     MapView,
     SlamEstimator,
-    SupportsJoin,
     UpdateReport,
+    joins_its_map,
     view_map,
 )
 from ...evaluation.hypothesis_tests import chi_square_limits
@@ -345,7 +345,7 @@ class RunFrames:
         """Keep a step, if it is due; pass this as ``watch`` of ``replay``."""
         if not self._maps.is_due(step):
             return
-        self.joins = isinstance(slam, SupportsJoin)
+        self.joins = joins_its_map(slam)
         outcomes = row_outcomes(self._scans[step], report)
         if self.joins:
             empty = np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2))
