@@ -4,6 +4,7 @@
     python benchmarks/sparse_information.py --sizes 100000
     python benchmarks/sparse_information.py --nees         # minutes
     python benchmarks/sparse_information.py --error --sizes 300 1000
+    python benchmarks/sparse_information.py --splu --sizes 100000
 
 The robot sees the ten nearest landmarks in each step.  The large map is built without a
 drive: one scan per landmark, from a place beside it without prior knowledge, adds its
@@ -28,9 +29,11 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 from scipy.sparse import csr_array
+from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from slamgym.estimator.large_maps.compressed.compressed_slam import CompressedEkfSlam
+from slamgym.estimator.large_maps.elimination import LandmarkElimination
 from slamgym.estimator.large_maps.sparse_information.sparse_information_slam import (
     SparseInformationSlam,
 )
@@ -186,6 +189,41 @@ def cost(count: int, steps: int = 300, *, largest_belief: int = 10_000) -> Cost:
         getrusage(RUSAGE_SELF).ru_maxrss / 1e6,
         thread_time() - start if asked else np.nan,
     )
+
+
+def elimination_costs(count: int, steps: int = 300) -> tuple[Array, float]:
+    """Return CPU times [s] of each elimination of a drive, and of scipy's at the last.
+
+    scipy factorises the eliminated landmarks, and solves for the Schur complement.
+    """
+    landmarks, times = town(count), []
+    slam, own = known_map(landmarks), LandmarkElimination.eliminate
+    last: list[Any] = []
+
+    def timed(self: Any, matrix: Any, local: Any) -> Any:
+        start = thread_time()
+        found = own(self, matrix, local)
+        times.append(thread_time() - start)
+        last[:] = matrix, found
+        return found
+
+    LandmarkElimination.eliminate = timed  # type: ignore[method-assign]
+    try:
+        for odometry, readings, ids in drive(landmarks, steps):
+            slam.predict(odometry)
+            slam.update(readings, ids)
+    finally:
+        LandmarkElimination.eliminate = own  # type: ignore[method-assign]
+    matrix, found = last  # before the rows of the last local map changed
+    inner = matrix.submatrix(found.slots, found.slots).tocsc()
+    outer = matrix.submatrix(found.slots, found.border).toarray()
+    start = thread_time()
+    symmetric = {"SymmetricMode": True}
+    factor = splu(inner, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+    complement = outer.T @ factor.solve(outer)
+    other = thread_time() - start
+    np.testing.assert_allclose(complement, found.complement, rtol=1e-6)
+    return np.array(times), other
 
 
 class Case(NamedTuple):
@@ -349,6 +387,15 @@ def print_costs(sizes: list[int]) -> None:
     CONSOLE.print(table)
 
 
+def print_eliminations(sizes: list[int]) -> None:
+    """Print the times of the elimination beside those of a factorisation by scipy."""
+    print("| landmarks | first, s | changes | mean, s | splu, s |\n|" + "---:|" * 5)
+    for size in sizes:
+        (first, *later), other = elimination_costs(size)
+        cells = (f"{first:.3g}", len(later), f"{np.mean(later):.3g}", f"{other:.3g}")
+        print(f"| {size} |", " | ".join(map(str, cells)), "|", flush=True)
+
+
 def print_nees(runs: int) -> None:
     """Print the row of each case as soon as it is known."""
     print(f"NEES of the pose per dimension, {runs} runs: mean (median)")
@@ -376,11 +423,14 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="*", default=[1000, 10_000])
     parser.add_argument("--nees", action="store_true")
     parser.add_argument("--error", action="store_true")
+    parser.add_argument("--splu", action="store_true")
     parser.add_argument("--runs", type=int, default=20)
     arguments = parser.parse_args()
     start = perf_counter()
     if arguments.nees:
         print_nees(arguments.runs)
+    elif arguments.splu:
+        print_eliminations(arguments.sizes)
     elif arguments.error:
         print_errors(arguments.sizes)
     else:
