@@ -553,5 +553,5 @@ def _offsets(
     """Return dᵀ D⁻¹ d and √det D of the offsets of landmarks, both (m, n)."""
     i, j = 2 * some[:, None], 2 * others
     d, D = separation(places.ravel(), covariance, i, j)
-    D += 1e-12 * np.eye(2)  # of a landmark and itself
-    return squared_offsets(d, D), np.sqrt(np.linalg.det(D))
+    D += 1e-12 * np.eye(2)  # 0 of a landmark and itself, but for rounding
+    return squared_offsets(d, D), np.sqrt(np.maximum(np.linalg.det(D), 1e-24))
