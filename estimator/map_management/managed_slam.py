@@ -60,19 +60,23 @@ from .policy import LandmarkPolicy, as_policy
 from .pruning import LandmarkRecords, MapPruner
 from .recent_scans import FedScans, RecentScans
 
-#: Hypotheses e^20 times less probable than the best one are discarded.
+# `benchmarks/association.py` counts the bad runs that these limits decide.
+
+#: Difference of −2 ln of probabilities: hypotheses e²⁰ = 5e8 times less probable than
+#: the best one are discarded.
 SPREAD = 40.0
 
-#: Associations tried in a scan, for each hypothesis kept.
+#: Number of associations tried in a scan, for each hypothesis kept.
 TRIED = 4
 
-#: Most hypotheses whose poses overlap.
+#: Largest number of hypotheses whose poses overlap.
 PER_BASIN = 3
 
-#: Least variance of a pose that counts [m², rad²].
+#: Least variance of a pose that counts, against rounding [m², rad²].
 NIL = 1e-12
 
-#: Two poses overlap up to this Bhattacharyya distance in every coordinate.
+#: Two poses overlap up to this Bhattacharyya distance in every coordinate: for equal σ,
+#: means 2 σ apart.
 OVERLAP = 0.5
 
 
