@@ -28,7 +28,11 @@ from numpy.typing import NDArray
 from slamgym import Belief
 from slamgym.estimator import EkfSlam, InvariantEkfSlam, UpdateReport
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
-from slamgym.experiments.monte_carlo import monte_carlo, runner, summarise_monte_carlo
+from slamgym.experiments.monte_carlo_study import (
+    monte_carlo,
+    runner,
+    summarise_monte_carlo,
+)
 from slamgym.sim_configs import Scenario, load_scenario
 
 Array = NDArray[np.float64]

@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from slamgym.evaluation.hypothesis_tests import average_band
-from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo_study import monte_carlo
 
 SCENARIOS = (
     "loop",

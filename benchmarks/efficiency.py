@@ -17,8 +17,8 @@ import argparse
 import time
 from collections.abc import Callable
 
-from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
-from slamgym.experiments.monte_carlo.filtered_runs import bound_runs, filter_runs
+from slamgym.experiments.monte_carlo_study import monte_carlo, summarise_monte_carlo
+from slamgym.experiments.monte_carlo_study.filtered_runs import bound_runs, filter_runs
 from slamgym.experiments.run_and_replay.filter_settings import settings_for_scenario
 from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario

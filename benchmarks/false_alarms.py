@@ -39,8 +39,8 @@ from slamgym.evaluation.hypothesis_tests import (
     whiteness_test,
 )
 from slamgym.experiments import summarise_monte_carlo
-from slamgym.experiments.monte_carlo.looks import Look, Watch, error_rate_after
-from slamgym.experiments.monte_carlo.runner import with_less_noise
+from slamgym.experiments.monte_carlo_study.looks import Look, Watch, error_rate_after
+from slamgym.experiments.monte_carlo_study.runner import with_less_noise
 from slamgym.sim_configs import Scenario
 
 Array = NDArray[np.float64]

@@ -29,7 +29,7 @@ from slamgym.estimator import list_peers, register_estimator
 from slamgym.estimator.check_estimator import CHECKS, find_breaches
 from slamgym.estimator.interface import SlamEstimator
 from slamgym.estimator.registry import accepted_options, find_estimator
-from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
+from slamgym.experiments.monte_carlo_study import monte_carlo, summarise_monte_carlo
 from slamgym.experiments.run_and_replay.filter_settings import (
     EstimatorChoice,
     estimator_choices,

@@ -29,7 +29,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from slamgym.experiments.monte_carlo import (
+from slamgym.experiments.monte_carlo_study import (
     consistency_of,
     monte_carlo,
     summarise_monte_carlo,

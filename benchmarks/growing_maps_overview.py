@@ -34,7 +34,7 @@ from slamgym.experiments.figures.style import (
     save_figure,
     write_title,
 )
-from slamgym.experiments.monte_carlo.figures import log_ticks, look_of
+from slamgym.experiments.monte_carlo_study.figures import log_ticks, look_of
 
 Array = NDArray[np.float64]
 

@@ -22,7 +22,7 @@ from peers import StackedDense
 
 import slamgym
 from slamgym.estimator import BatchSlam, EkfSlam
-from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo_study import monte_carlo
 from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import Scenario, action_sequence, load_scenario
 

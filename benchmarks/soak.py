@@ -44,7 +44,7 @@ from slamgym.estimator.interface import restore
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.motions import predict_pose
 from slamgym.experiments.command_line.monte_carlo import connected
-from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo_study import monte_carlo
 from slamgym.sim_configs import load_scenario
 
 Array = NDArray[np.float64]

@@ -35,7 +35,7 @@ from scipy.spatial import KDTree
 from slamgym.estimator.large_maps.submaps.submap_slam import SubmapSlam
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.motions import predict_pose
-from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo_study import monte_carlo
 
 Array = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -4,7 +4,8 @@
 * :mod:`~slamgym.experiments.run_and_replay` filters a log or simulated runs, and
   summarises them.
 * :mod:`~slamgym.experiments.figures` draws a run: map, errors, covariance.
-* :mod:`~slamgym.experiments.monte_carlo` tests the consistency of filters in many runs.
+* :mod:`~slamgym.experiments.monte_carlo_study` tests the consistency of filters in many
+  runs.
 * :mod:`~slamgym.experiments.judging` judges the estimates of other programs, and
   :mod:`~slamgym.experiments.space_poses` those of poses in space.
 * :mod:`~slamgym.experiments.noise_study` scales each noise, in one run or in many.
@@ -22,7 +23,7 @@ from ..public_names import attach
 if TYPE_CHECKING:
     from . import figures as figures
     from . import logs as logs
-    from . import monte_carlo as monte_carlo
+    from . import monte_carlo_study as monte_carlo_study
     from . import noise_fitting as noise_fitting
     from . import noise_study as noise_study
     from . import run_and_replay as run_and_replay
@@ -31,16 +32,17 @@ if TYPE_CHECKING:
     from .figures import *
     from .judging import judge as judge
     from .logs import *
-    from .monte_carlo import consistency_of as consistency_of
-    from .monte_carlo import heading_figure as heading_figure
-    from .monte_carlo import load_results as load_results
-    from .monte_carlo import merge_blocks as merge_blocks
-    from .monte_carlo import nees_figure as nees_figure
-    from .monte_carlo import nis_figure as nis_figure
-    from .monte_carlo import rmse_figure as rmse_figure
-    from .monte_carlo import runs_figure as runs_figure
-    from .monte_carlo import summarise_monte_carlo as summarise_monte_carlo
-    from .monte_carlo import write_html_report as write_html_report
+    from .monte_carlo_study import consistency_of as consistency_of
+    from .monte_carlo_study import heading_figure as heading_figure
+    from .monte_carlo_study import load_results as load_results
+    from .monte_carlo_study import merge_blocks as merge_blocks
+    from .monte_carlo_study import monte_carlo as monte_carlo
+    from .monte_carlo_study import nees_figure as nees_figure
+    from .monte_carlo_study import nis_figure as nis_figure
+    from .monte_carlo_study import rmse_figure as rmse_figure
+    from .monte_carlo_study import runs_figure as runs_figure
+    from .monte_carlo_study import summarise_monte_carlo as summarise_monte_carlo
+    from .monte_carlo_study import write_html_report as write_html_report
     from .noise_fitting import *
     from .noise_study import NoiseEffect as NoiseEffect
     from .noise_study import NoiseRow as NoiseRow

@@ -40,9 +40,14 @@ from .estimate_files import (
     read_estimates,
     true_path,
 )
-from .monte_carlo.filtered_runs import Failure, FilteredRuns, bound_runs, noise_of_runs
-from .monte_carlo.results import provenance
-from .monte_carlo.run_measures import (
+from .monte_carlo_study.filtered_runs import (
+    Failure,
+    FilteredRuns,
+    bound_runs,
+    noise_of_runs,
+)
+from .monte_carlo_study.results import provenance
+from .monte_carlo_study.run_measures import (
     LARGEST_SCORE,
     VARIABLES,
     Block,
@@ -52,7 +57,7 @@ from .monte_carlo.run_measures import (
     measure_runs,
     write_failures,
 )
-from .monte_carlo.verdict import POSE_FREEDOM
+from .monte_carlo_study.verdict import POSE_FREEDOM
 from .run_and_replay.simulated_runs import SimulatedRuns
 from .trajectories.manifest import MANIFEST, TrajectoryDataset, load_trajectories
 from .trajectories.trajectory import Trajectory, array_of

@@ -42,8 +42,8 @@ from .run_and_replay.trace import (
 )
 
 if TYPE_CHECKING:
-    from .monte_carlo.figures import EstimatorLook
-    from .monte_carlo.verdict import EstimatorScores
+    from .monte_carlo_study.figures import EstimatorLook
+    from .monte_carlo_study.verdict import EstimatorScores
 
 _UNITS = dict(zip(SIGMAS, ("m", "m", "rad", "rad", "m"), strict=True))
 
@@ -263,8 +263,8 @@ def noise_effects(
     >>> len(effects), effects[1].sigma, effects[1].factor
     (11, 'σx', 10.0)
     """
-    from .monte_carlo import monte_carlo
-    from .monte_carlo.verdict import labels_of, scores_of
+    from .monte_carlo_study import monte_carlo
+    from .monte_carlo_study.verdict import labels_of, scores_of
 
     world = load_scenario(scenario)
     jobs_to_do = [("nothing", REFERENCE, world, world), *_changes(world, changed)]
@@ -370,7 +370,7 @@ def noise_effects_figure(effects: Sequence[NoiseEffect]) -> Figure:
     effects : sequence of NoiseEffect
         Of `noise_effects`.
     """
-    from .monte_carlo.figures import log_ticks, look_of, plain
+    from .monte_carlo_study.figures import log_ticks, look_of, plain
 
     places = list(dict.fromkeys(e.changed for e in effects if e.changed in _TITLES))
     labels = dict.fromkeys(effect.estimator for effect in effects)

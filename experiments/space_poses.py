@@ -43,7 +43,7 @@ from .estimate_files import (
     tum_row,
     tum_table,
 )
-from .monte_carlo import verdict
+from .monte_carlo_study import verdict
 from .run_and_replay.trace import finite
 
 if TYPE_CHECKING:
@@ -286,7 +286,7 @@ def nees_in_space_figure(found: Mapping[str, Any], width_mm: float = 85.0) -> Fi
         Width of the figure [mm].
     """
     from .figures.style import new_figure  # noqa: PLC0415
-    from .monte_carlo import figures  # noqa: PLC0415
+    from .monte_carlo_study import figures  # noqa: PLC0415
 
     figure = new_figure(width_mm / 25.4, 2.9)
     axes = figure.subplots()

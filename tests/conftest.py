@@ -203,7 +203,7 @@ def sb3(torch):
     return pytest.importorskip("stable_baselines3", reason="needs stable-baselines3")
 
 
-REPORT = "slamgym.experiments.monte_carlo.report"
+REPORT = "slamgym.experiments.monte_carlo_study.report"
 
 
 @pytest.fixture

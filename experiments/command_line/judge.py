@@ -78,9 +78,9 @@ def judge(files: FilesOfEstimates, *, given: JudgeOptions) -> int:
     """
     from ...estimator.models.rigid_motion import ERROR_FRAMES
     from .. import judging
-    from ..monte_carlo import summarise_monte_carlo
-    from ..monte_carlo.report import write_html_report
-    from ..monte_carlo.results import REPORT, RESULTS
+    from ..monte_carlo_study import summarise_monte_carlo
+    from ..monte_carlo_study.report import write_html_report
+    from ..monte_carlo_study.results import REPORT, RESULTS
     from .output_folder import default_folder, output_folder, write_summary
 
     if given.frame not in (None, *ERROR_FRAMES):

@@ -90,11 +90,11 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
     slamgym monte-carlo hidden_identities -e 'ekf[management={backdate=true}]'
     slamgym monte-carlo loop --runs 5000 --backend dask --scheduler tcp://b:8786
     """  # noqa: D400 (the list of commands shows the question)
-    from .. import monte_carlo
+    from .. import monte_carlo_study
     from ..job_folders import replace_own
-    from ..monte_carlo.report import write_figures, write_html_report
-    from ..monte_carlo.results import REPORT, RESULTS, SUMMARY
-    from ..monte_carlo.runner import SMALL_NOISE_SHARE
+    from ..monte_carlo_study.report import write_figures, write_html_report
+    from ..monte_carlo_study.results import REPORT, RESULTS, SUMMARY
+    from ..monte_carlo_study.runner import SMALL_NOISE_SHARE
     from .output_folder import as_json_text, default_folder
 
     world = given.scenario(scenario)
@@ -109,7 +109,7 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
     with reporter.note_if_compiling("the filters"):
         _compile(given.estimators, identities=world.sensor.identities)
     if given.merge:
-        monte_carlo.merge_blocks(given.merge, place)
+        monte_carlo_study.merge_blocks(given.merge, place)
     with (
         cluster,
         reporter.warnings(),
@@ -118,7 +118,7 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
             f"interrupted; the finished runs are in {place}, "
             "and the same command continues"
         ),
-        monte_carlo.monte_carlo(
+        monte_carlo_study.monte_carlo(
             world,
             given.estimators,
             given.runs,
@@ -137,7 +137,7 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
             small_noise=True,
         ) as results,
     ):
-        summary = monte_carlo.summarise_monte_carlo(results)
+        summary = monte_carlo_study.summarise_monte_carlo(results)
         summary["files"] = [RESULTS, SUMMARY, REPORT]
         _quote_checks(summary, world)
         if given.figures:
@@ -164,7 +164,7 @@ def _quote_checks(summary: dict[str, Any], world: Scenario) -> None:
     """
     from ...estimator.check_estimator import find_breaches
     from ...estimator.registry import find_estimator
-    from ..monte_carlo.verdict import KINDS, MAP
+    from ..monte_carlo_study.verdict import KINDS, MAP
 
     if world.sensor.kind != "bearing_range" or not world.sensor.identities:
         return
@@ -186,8 +186,8 @@ def show_study(
     reporter: Reporter, summary: dict[str, Any], place: Path, *more: str
 ) -> int:
     """Print what a study has found, with further sentences; return the exit code."""
-    from ..monte_carlo.report import monte_carlo_table
-    from ..monte_carlo.verdict import diagnosis_lines
+    from ..monte_carlo_study.report import monte_carlo_table
+    from ..monte_carlo_study.verdict import diagnosis_lines
     from .tables import written
 
     sentences = [
@@ -210,7 +210,7 @@ def show_study(
 
 def _compile(estimators: str, *, identities: bool) -> None:
     """Run all estimators for some steps, which compiles their kernels."""
-    from ..monte_carlo import monte_carlo
+    from ..monte_carlo_study import monte_carlo
 
     small = load_scenario("six_landmarks").with_changes(
         steps=8, sensor={"identities": identities}

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from .evaluation import assert_consistent as assert_consistent
     from .experiments.judging import judge as judge
     from .experiments.logs import read_log as read_log
-    from .experiments.monte_carlo import consistency_of as consistency_of
-    from .experiments.monte_carlo import monte_carlo as monte_carlo
+    from .experiments.monte_carlo_study import consistency_of as consistency_of
+    from .experiments.monte_carlo_study import monte_carlo as monte_carlo
     from .experiments.noise_fitting import fit_noise as fit_noise
     from .experiments.run_and_replay import replay as replay
     from .experiments.run_and_replay.log_smoothing import smooth as smooth

@@ -56,14 +56,14 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         run_and_replay
         figures job_folders
         viewers
-        monte_carlo
+        monte_carlo_study
         noise_study noise_fitting
         trajectories
         estimate_conventions estimate_files log_conventions
         judging space_poses
         command_line
     """,
-    "experiments.monte_carlo": """
+    "experiments.monte_carlo_study": """
         filtered_runs
         run_measures
         results

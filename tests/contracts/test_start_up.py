@@ -55,7 +55,7 @@ def test_importing_the_estimators_and_workers_loads_little():
 import sys
 from slamgym import EkfSlam
 print(*sys.modules)
-import slamgym.experiments.monte_carlo.runner
+import slamgym.experiments.monte_carlo_study.runner
 print(*sys.modules)
 """
     estimators, workers = map(str.split, run_python(code).splitlines())
@@ -84,7 +84,7 @@ def test_commands_load_optimisation_and_spatial_trees_only_to_match_landmarks():
     code = """
 import sys
 import slamgym.experiments.command_line.run_files
-import slamgym.experiments.monte_carlo.report
+import slamgym.experiments.monte_carlo_study.report
 print(*sys.modules)
 from slamgym.evaluation import gospa
 gospa([(0.0, 0.0)], [(0.0, 0.0)])

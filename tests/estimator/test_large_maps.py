@@ -13,7 +13,7 @@ from slamgym.estimator import make_estimator
 from slamgym.estimator.map_management.policy import LandmarkPolicy
 from slamgym.estimator.models.relative_geometry import largest_std, separation
 from slamgym.evaluation.nees import normalised_squared_error, state_nees
-from slamgym.experiments.monte_carlo import (
+from slamgym.experiments.monte_carlo_study import (
     consistency_of,
     monte_carlo,
     summarise_monte_carlo,

@@ -13,7 +13,7 @@ from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.experiments import replay
 from slamgym.experiments.command_line.commands import message_of
 from slamgym.experiments.logs.slamlog import Scan, SlamLog
-from slamgym.experiments.monte_carlo.filtered_runs import filter_runs
+from slamgym.experiments.monte_carlo_study.filtered_runs import filter_runs
 from slamgym.experiments.run_and_replay.filter_settings import (
     FilterSettings,
     refuse_large_map,

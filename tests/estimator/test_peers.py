@@ -19,7 +19,7 @@ from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.motions import predict_pose
 from slamgym.estimator.registry import find_estimator
 from slamgym.estimator.smoother import RecordedSlam
-from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo_study import monte_carlo
 from slamgym.sim_configs import load_scenario
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))

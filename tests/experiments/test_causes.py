@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from slamgym.estimator import EkfSlam
-from slamgym.experiments.monte_carlo import (
+from slamgym.experiments.monte_carlo_study import (
     load_results,
     monte_carlo,
     summarise_monte_carlo,
 )
-from slamgym.experiments.monte_carlo.filtered_runs import noise_of_runs
-from slamgym.experiments.monte_carlo.report import escaped as escape
-from slamgym.experiments.monte_carlo.report import html_report
-from slamgym.experiments.monte_carlo.verdict import diagnosis_lines
+from slamgym.experiments.monte_carlo_study.filtered_runs import noise_of_runs
+from slamgym.experiments.monte_carlo_study.report import escaped as escape
+from slamgym.experiments.monte_carlo_study.report import html_report
+from slamgym.experiments.monte_carlo_study.verdict import diagnosis_lines
 from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from slamgym.evaluation.error_bound import posterior_bound
-from slamgym.experiments.monte_carlo import monte_carlo, summarise_monte_carlo
-from slamgym.experiments.monte_carlo.report import (
+from slamgym.experiments.monte_carlo_study import monte_carlo, summarise_monte_carlo
+from slamgym.experiments.monte_carlo_study.report import (
     html_report,
     measures,
     monte_carlo_table,

@@ -28,7 +28,7 @@ from slamgym.experiments.job_folders import MANIFEST as OWN_FILES
 from slamgym.experiments.job_folders import files_below
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.importers.utias import read_utias
-from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo_study import monte_carlo
 from slamgym.experiments.trajectories import generate_trajectories
 from slamgym.experiments.trajectories.manifest import MANIFEST, read_manifest
 from slamgym.sim_configs import load_scenario

@@ -14,14 +14,14 @@ import xarray as xr
 from monte_carlo_dataset import typical, with_failures
 from PIL import Image
 
-from slamgym.experiments.monte_carlo import monte_carlo
-from slamgym.experiments.monte_carlo import report as module
-from slamgym.experiments.monte_carlo.report import (
+from slamgym.experiments.monte_carlo_study import monte_carlo
+from slamgym.experiments.monte_carlo_study import report as module
+from slamgym.experiments.monte_carlo_study.report import (
     headline,
     html_report,
     write_html_report,
 )
-from slamgym.experiments.monte_carlo.summary import summarise_monte_carlo
+from slamgym.experiments.monte_carlo_study.summary import summarise_monte_carlo
 from slamgym.experiments.noise_study import scaled_scenario
 from slamgym.sim_configs import load_scenario
 

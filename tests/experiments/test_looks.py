@@ -9,14 +9,14 @@ from monte_carlo_dataset import simulated
 from scipy import stats
 
 from slamgym.evaluation.hypothesis_tests import EQUIVALENCE_MARGIN
-from slamgym.experiments.monte_carlo import (
+from slamgym.experiments.monte_carlo_study import (
     load_results,
     monte_carlo,
     summarise_monte_carlo,
 )
-from slamgym.experiments.monte_carlo.looks import Look, Watch, verdict_of, watched
-from slamgym.experiments.monte_carlo.runner import python_call
-from slamgym.experiments.monte_carlo.verdict import scores_of
+from slamgym.experiments.monte_carlo_study.looks import Look, Watch, verdict_of, watched
+from slamgym.experiments.monte_carlo_study.runner import python_call
+from slamgym.experiments.monte_carlo_study.verdict import scores_of
 
 JOB = {"scenario": "six_landmarks", "estimators": "ekf,invariant", "block_size": 16}
 MOST = 160

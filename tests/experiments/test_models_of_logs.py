@@ -10,7 +10,7 @@ from slamgym.estimator.registry import register_estimator
 from slamgym.experiments import replay, settings_for
 from slamgym.experiments.logs import read_slamlog, write_slamlog
 from slamgym.experiments.logs.slamlog import LogError
-from slamgym.experiments.monte_carlo.filtered_runs import (
+from slamgym.experiments.monte_carlo_study.filtered_runs import (
     bound_runs,
     filter_runs,
     noise_of_runs,

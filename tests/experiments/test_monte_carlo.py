@@ -24,20 +24,24 @@ from slamgym.estimator import Belief, EkfSlam, make_estimator
 from slamgym.evaluation import AssociationScores, Gospa, oracle_errors
 from slamgym.evaluation.nees import pose_nees, state_nees
 from slamgym.experiments.command_line.monte_carlo import connected
-from slamgym.experiments.monte_carlo import monte_carlo, runner, summarise_monte_carlo
-from slamgym.experiments.monte_carlo.filtered_runs import (
+from slamgym.experiments.monte_carlo_study import (
+    monte_carlo,
+    runner,
+    summarise_monte_carlo,
+)
+from slamgym.experiments.monte_carlo_study.filtered_runs import (
     bound_runs,
     filter_runs,
     noise_of_runs,
 )
-from slamgym.experiments.monte_carlo.report import html_report, measures
-from slamgym.experiments.monte_carlo.results import load_results, merge_blocks
-from slamgym.experiments.monte_carlo.run_measures import (
+from slamgym.experiments.monte_carlo_study.report import html_report, measures
+from slamgym.experiments.monte_carlo_study.results import load_results, merge_blocks
+from slamgym.experiments.monte_carlo_study.run_measures import (
     HIDDEN_VARIABLES,
     VARIABLES,
     measure_runs,
 )
-from slamgym.experiments.monte_carlo.runner import python_call
+from slamgym.experiments.monte_carlo_study.runner import python_call
 from slamgym.experiments.run_and_replay.filter_settings import (
     estimator_choices,
     settings_for,

@@ -10,8 +10,8 @@ import pytest
 import xarray as xr
 from commands import slamgym
 
-from slamgym.experiments.monte_carlo import monte_carlo
-from slamgym.experiments.monte_carlo.results import load_results
+from slamgym.experiments.monte_carlo_study import monte_carlo
+from slamgym.experiments.monte_carlo_study.results import load_results
 
 pytestmark = pytest.mark.usefixtures("here")
 FRAGILE = '''

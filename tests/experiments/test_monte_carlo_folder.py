@@ -18,7 +18,7 @@ from slamgym.experiments.command_line.app import main
 from slamgym.experiments.command_line.commands import Reporter
 from slamgym.experiments.command_line.run_files import warm_up
 from slamgym.experiments.job_folders import MANIFEST, WRITER, replace_own
-from slamgym.experiments.monte_carlo import merge_blocks, monte_carlo
+from slamgym.experiments.monte_carlo_study import merge_blocks, monte_carlo
 from slamgym.experiments.run_and_replay.filter_settings import FilterSettings
 
 RUNS = 12
@@ -334,7 +334,7 @@ def test_a_folder_of_submaps_is_refused_for_many_runs(tmp_path):
 THREADS = """
 from threadpoolctl import threadpool_info
 from slamgym.experiments.run_and_replay.filter_settings import one_blas_thread
-from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo_study import monte_carlo
 
 
 def threads():

@@ -20,15 +20,15 @@ from slamgym.evaluation.hypothesis_tests import equivalence_test, family_band
 from slamgym.experiments import nees_figure
 from slamgym.experiments.command_line.commands import Reporter
 from slamgym.experiments.command_line.monte_carlo import show_study
-from slamgym.experiments.monte_carlo import figures, monte_carlo
-from slamgym.experiments.monte_carlo.figures import report_figures, thinned
-from slamgym.experiments.monte_carlo.report import (
+from slamgym.experiments.monte_carlo_study import figures, monte_carlo
+from slamgym.experiments.monte_carlo_study.figures import report_figures, thinned
+from slamgym.experiments.monte_carlo_study.report import (
     html_report,
     measures,
     monte_carlo_table,
 )
-from slamgym.experiments.monte_carlo.summary import summarise_monte_carlo
-from slamgym.experiments.monte_carlo.verdict import (
+from slamgym.experiments.monte_carlo_study.summary import summarise_monte_carlo
+from slamgym.experiments.monte_carlo_study.verdict import (
     KINDS,
     coarse_bearings,
     diagnosis_lines,

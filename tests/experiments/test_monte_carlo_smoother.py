@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from slamgym.estimator.smoother import Drive, smooth
-from slamgym.experiments.monte_carlo import monte_carlo
-from slamgym.experiments.monte_carlo.report import write_html_report
-from slamgym.experiments.monte_carlo.summary import (
+from slamgym.experiments.monte_carlo_study import monte_carlo
+from slamgym.experiments.monte_carlo_study.report import write_html_report
+from slamgym.experiments.monte_carlo_study.summary import (
     consistency_of,
     summarise_monte_carlo,
 )

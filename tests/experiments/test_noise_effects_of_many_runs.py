@@ -6,15 +6,15 @@ import json
 import numpy as np
 import pytest
 
-from slamgym.experiments import monte_carlo as package
+from slamgym.experiments import monte_carlo_study as package
 from slamgym.experiments.command_line.commands import Reporter
 from slamgym.experiments.command_line.noise_study import (
     NoiseStudyOptions,
     effects_study,
     write_study,
 )
-from slamgym.experiments.monte_carlo import monte_carlo
-from slamgym.experiments.monte_carlo.verdict import scores_of
+from slamgym.experiments.monte_carlo_study import monte_carlo
+from slamgym.experiments.monte_carlo_study.verdict import scores_of
 from slamgym.experiments.noise_study import (
     noise_effects,
     noise_effects_figure,

@@ -14,7 +14,7 @@ from slamgym.experiments.logs.slamlog import (
     read_slamlog,
     write_slamlog,
 )
-from slamgym.experiments.monte_carlo import filtered_runs
+from slamgym.experiments.monte_carlo_study import filtered_runs
 from slamgym.experiments.run_and_replay.filter_settings import settings_for
 from slamgym.experiments.run_and_replay.log_replay import replay
 from slamgym.experiments.run_and_replay.log_smoothing import smooth_log

@@ -9,7 +9,11 @@ from fuzzing import edited, edits, replaced, strange_values
 from hypothesis import strategies as st
 
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.experiments.monte_carlo import load_results, merge_blocks, monte_carlo
+from slamgym.experiments.monte_carlo_study import (
+    load_results,
+    merge_blocks,
+    monte_carlo,
+)
 from slamgym.experiments.trajectories import generate_trajectories, load_trajectories
 from slamgym.sim_configs import ScenarioError, list_presets, load_scenario
 from slamgym.sim_configs.scenario_files import scenario_text

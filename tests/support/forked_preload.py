@@ -3,6 +3,6 @@
 import jobs_to_kill  # noqa: F401
 
 import slamgym.experiments.trajectories.generate  # noqa: F401
-from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo_study import monte_carlo
 
 monte_carlo("six_landmarks", "ekf,invariant", 1)

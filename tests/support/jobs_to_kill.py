@@ -17,8 +17,8 @@ from slamgym.estimator.filters.ekf import EkfSlam
 from slamgym.experiments.command_line.app import main
 from slamgym.experiments.command_line.monte_carlo import connected
 from slamgym.experiments.command_line.output_folder import output_folder
-from slamgym.experiments.monte_carlo import monte_carlo, runner
-from slamgym.experiments.monte_carlo import results as job_folder
+from slamgym.experiments.monte_carlo_study import monte_carlo, runner
+from slamgym.experiments.monte_carlo_study import results as job_folder
 from slamgym.experiments.trajectories.generate import generate_trajectories
 from slamgym.sim_configs import load_scenario
 
@@ -68,7 +68,7 @@ def command_that_loses_a_worker(folder, *arguments):
         write(file, **arrays)
 
     # Only this job needs the module, and it loads matplotlib.
-    from slamgym.experiments.monte_carlo import report as html_report
+    from slamgym.experiments.monte_carlo_study import report as html_report
 
     write, np.savez = np.savez, savez
     html_report.report_figures = lambda *_: {}

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import xarray as xr
 
-from slamgym.experiments.monte_carlo import monte_carlo
+from slamgym.experiments.monte_carlo_study import monte_carlo
 from slamgym.sim_configs import load_scenario
 
 

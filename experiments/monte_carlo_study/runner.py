@@ -491,10 +491,7 @@ def python_call(summary: dict[str, Any]) -> str:
         f"# first save {' and '.join(map(repr, files))}, see below\n" if files else ""
     )
     listed = "".join(f"    {argument},\n" for argument in arguments)
-    return (
-        "from slamgym.experiments.monte_carlo import monte_carlo\n\n"
-        f"{note}monte_carlo(\n{listed})"
-    )
+    return f"from slamgym import monte_carlo\n\n{note}monte_carlo(\n{listed})"
 
 
 def _is_preset(summary: dict[str, Any]) -> bool:

@@ -227,7 +227,7 @@ def consistency_of(
 
     Examples
     --------
-    >>> from slamgym.experiments.monte_carlo import monte_carlo
+    >>> from slamgym.experiments.monte_carlo_study import monte_carlo
     >>> results = monte_carlo("six_landmarks", "ekf,invariant", runs=60)
     >>> [consistency_of(results, label).accepted for label in ("ekf", "invariant")]
     [False, True]
