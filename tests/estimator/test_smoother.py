@@ -559,7 +559,7 @@ def test_management_gives_its_associations_to_the_drive(backdate):
         slam.update(readings)
         plain.predict(odometry)
         plain.update(readings, range(6))
-    smoothed, expected = slam.smoothed(), smooth(plain)
+    smoothed, expected = slam.filter.smoothed(), smooth(plain)
     gaps = np.linalg.norm(smoothed.landmarks[:, None] - expected.landmarks, axis=2)
     assert sorted(gaps.argmin(axis=1)) == [0, 1, 2, 3, 4, 5]
     made = slam.filter.recorded()
