@@ -240,7 +240,7 @@ def noise_effects(
     scenario : Scenario, mapping, str or Path
         The reference.
     estimators, runs, seed, jobs, backend
-        As in :func:`~slamgym.monte_carlo`.
+        As in :func:`~slamgym.experiments.monte_carlo`.
     changed : iterable of {"both", "world", "filter"}
         Where a noise changes.
     progress : callable, optional
