@@ -15,6 +15,7 @@ from gymnasium.spaces.utils import flatten_space
 from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array, BoolArray, IntArray
+from ..envs.vector.landmark_world_vector import KEYWORDS
 from ..estimator.filters.batch import BatchStorage
 from ..estimator.map_management.policy import policy_of
 from ..evaluation.association_scores import score_association
@@ -224,23 +225,17 @@ class ActiveSlamTask(Restorable):
         return {key: np.empty(*form) for key, form in self._forms.items()}
 
 
-#: Arguments of the environments besides these settings.
-KEYWORDS = (
-    *("scenario", "estimator", "estimator_options", "render_mode"),
-    *("num_envs", "max_episode_steps", "autoreset_mode"),
-)
-
-
 def split_settings(
     settings: Mapping[str, Any],
 ) -> tuple[RewardWeights, ObservationForm, dict[str, Any]]:
     """Split settings into weights, form of observation and changes of the scenario."""
-    own = [*fields(RewardWeights), *fields(ObservationForm)]
-    known = [field.name for field in own]
-    refuse_unknown_keywords(settings, [*known, *KEYWORDS], where="of the task")
     rest = dict(settings)
     weights = RewardWeights(**_taken(RewardWeights, rest))
-    return weights, ObservationForm(**_taken(ObservationForm, rest)), rest
+    form = ObservationForm(**_taken(ObservationForm, rest))
+    own = [field.name for field in (*fields(weights), *fields(form))]
+    others = [*own, *KEYWORDS, "estimator", "estimator_options"]
+    refuse_unknown_keywords(rest, others, where="of the task")
+    return weights, form, rest
 
 
 def _taken(

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from ..arrays import AnyArray, Array, ComplexArray, ImageArray, WordArray
 from ..restorable import Restorable, State, refuse_other_state
 from ..sim_configs import Scenario, load_scenario
-from ..sim_configs.scenario import refuse_unknown_keywords
+from ..sim_configs.scenario import plain, refuse_unknown_keywords
 from .bearing_range import BearingRangeSensor, hide_identities
 from .drives import drive_of
 from .noise_streams import NoiseRows, PoseSensors, WorldNoise, row_of
@@ -340,21 +340,10 @@ def plain_spec(spec: EnvSpec, steps: int) -> EnvSpec:
     A scenario becomes its fields, a path its text, an array a list.
     """
     length = spec.max_episode_steps or steps
-    return replace(spec, kwargs=_plain(spec.kwargs), max_episode_steps=length)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Scenario):
-        value = value.model_dump()
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    return value
+    kwargs = plain(spec.kwargs)
+    if isinstance(path := kwargs.get("scenario"), Path):
+        kwargs["scenario"] = str(path)
+    return replace(spec, kwargs=kwargs, max_episode_steps=length)
 
 
 def refuse_other_world(own: Scenario, other: Scenario) -> None:

@@ -172,27 +172,25 @@ def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
         )
 
     def workers(calls: Iterable[Call]) -> Iterator[Any]:
-        with _safe_path():
+        # Else a file of the user named like a module of Python, such as random.py,
+        # would replace it in the workers.
+        with environment("PYTHONSAFEPATH", "1"):
             yield from compute(calls)
 
     return workers
 
 
 @contextlib.contextmanager
-def _safe_path() -> Iterator[None]:
-    """Let processes that begin during the block import nothing from this folder.
-
-    Else a file of the user named like a module of Python, such as ``random.py``, would
-    replace it in the workers.
-    """
-    name = "PYTHONSAFEPATH"
+def environment(name: str, value: str) -> Iterator[None]:
+    """Set a variable of the environment during the block, for processes begun in it."""
     before = os.environ.get(name)
-    os.environ[name] = "1"
+    os.environ[name] = value
     try:
         yield
     finally:
-        del os.environ[name]
-        if before is not None:
+        if before is None:
+            del os.environ[name]
+        else:
             os.environ[name] = before
 
 

@@ -555,15 +555,15 @@ class Scenario(ScenarioTable):
             With one line per mistake.
         """
         try:
-            return cls.model_validate(_plain(table))
+            return cls.model_validate(plain(table))
         except ValidationError as error:
             raise ScenarioError("\n".join(error_lines(error))) from None
 
 
 def refuse_unknown_keywords(
-    given: Iterable[str], known: Sequence[str] = (), *, where: str = "in the scenario"
+    given: Iterable[str], others: Sequence[str] = (), *, where: str = "in the scenario"
 ) -> None:
-    """Refuse keywords that are neither known nor a field of a scenario.
+    """Refuse keywords that are no field of a scenario; suggest one, or one of others.
 
     Raises
     ------
@@ -572,10 +572,10 @@ def refuse_unknown_keywords(
     """
     fields = Scenario.model_fields
     for key in given:
-        if key not in fields and key not in known:
+        if key not in fields:
             raise UnknownKeywordError(
                 f"unknown key '{key}' {where}"
-                f"{closest(key, [*known, *fields], else_all=True)} "
+                f"{closest(key, [*others, *fields], else_all=True)} "
                 f"(unexpected keyword argument '{key}')"
             )
 
@@ -631,16 +631,16 @@ def _is_foreign(change: Mapping[str, object], old: Mapping[str, object]) -> bool
     return ":" in str(kind) and kind != old["kind"]
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Replace arrays, models and other mappings by lists and dicts."""
     if isinstance(value, ScenarioTable):
         return value.model_dump()
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     return value
 
 

@@ -161,16 +161,17 @@ def _syntax_message(path: Path, message: str) -> str:
 
 def assignment(key: str, value: object) -> str:
     """Format a value as a line of TOML."""
-    return f"{key} = {_toml(value)}"
+    return f"{key} = {toml_value(value)}"
 
 
-def _toml(value: Any) -> str:
+def toml_value(value: Any) -> str:
+    """Format a value as TOML."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, tuple):
-        return f"[{', '.join(map(_toml, value))}]"
+        return f"[{', '.join(map(toml_value, value))}]"
     return repr(value)
 
 

@@ -36,6 +36,7 @@ from .world_batch import WorldBatch
 
 Observations = dict[str, Any]
 Infos = dict[str, Any]
+#: Arguments besides the changes of a scenario.
 KEYWORDS = "num_envs", "scenario", "render_mode", "max_episode_steps", "autoreset_mode"
 
 

@@ -500,6 +500,11 @@ class ManagedSlam:
             raise
 
 
+def filter_in(slam: SlamEstimator) -> SlamEstimator:
+    """Return the filter of the most probable hypothesis; else the estimator itself."""
+    return slam.filter if isinstance(slam, ManagedSlam) else slam
+
+
 class SharedSettings(NamedTuple):
     """What all hypotheses of a filter have in common."""
 

@@ -18,7 +18,7 @@ from ...arrays import Array, IntArray
 from ..guards import argument_checks
 from ..guards.argument_checks import LandmarkIds
 from ..interface import Belief, SlamEstimator
-from ..map_management.managed_slam import ManagedSlam
+from ..map_management.managed_slam import filter_in
 from ..models.bearing_range import locate_landmark, wrap_angle
 from ..models.rigid_motion import seen_from
 from ..models.sensors import BEARING_RANGE
@@ -477,5 +477,5 @@ class SmoothedDrive:
 
 def smoother_in(slam: SlamEstimator) -> Any:
     """Return the smoother, that of the most probable hypothesis; None without one."""
-    inner = slam.filter if isinstance(slam, ManagedSlam) else slam
+    inner = filter_in(slam)
     return inner if hasattr(inner, "smoothed") else None

@@ -7,7 +7,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from ...sim_configs import Scenario
-from ...sim_configs.scenario_files import assignment
+from ...sim_configs.scenario_files import assignment, toml_value
 
 _WIDTH = 100  # of a line, unless its value is longer
 
@@ -62,7 +62,7 @@ def _lines(name: str, field: FieldInfo, value: object) -> Iterator[str]:
     if field.is_required():
         meaning += "; required"
     elif default is not None and "default" not in meaning:
-        meaning += f"; default {assignment('', default).removeprefix(' = ')}"
+        meaning += f"; default {toml_value(default)}"
     line = f"# {name} =" if value is None else assignment(name, value)
     if len(line) + len(meaning) < _WIDTH:
         yield f"{line}  # {meaning}"

@@ -18,7 +18,7 @@ from ...estimator import interface
 from ...estimator.filters.batch import BatchSlam, BatchTrace, can_batch
 from ...estimator.filters.ekf import EkfSlam
 from ...estimator.guards.saved_states import is_semidefinite
-from ...estimator.map_management.managed_slam import ManagedSlam
+from ...estimator.map_management.managed_slam import filter_in
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.motions import find_motion
 from ...estimator.models.sensors import Sensor, find_sensor
@@ -179,8 +179,7 @@ def _one_by_one(
             belief = _step(slam, runs, run, step, trace, recorder)
             if not _finite(trace, (run, step)):
                 return Failure(step, _NOT_FINITE)
-        filtered = slam.filter if isinstance(slam, ManagedSlam) else slam
-        smoothed = getattr(filtered, "smoothed", None)
+        smoothed = getattr(filter_in(slam), "smoothed", None)
         if callable(smoothed):  # without innovations, and so without NIS
             path = smoothed()
             belief, covariances = path.belief(), path.pose_covariances

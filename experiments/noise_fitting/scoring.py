@@ -23,7 +23,7 @@ import numpy as np
 from ...arrays import Array, BoolArray, IntArray
 from ...estimator.filters.drive_likelihood import DriveEvents
 from ...estimator.interface import SlamEstimator
-from ...estimator.map_management.managed_slam import ManagedSlam
+from ...estimator.map_management.managed_slam import filter_in
 from ...estimator.smoother import Drive, RecordedSlam
 from ...estimator.smoother.drive import Sightings
 from ..logs.recording import predictions, predictions_until, steps_of
@@ -254,7 +254,7 @@ def associated_log(
 
 def _recorded(slam: SlamEstimator) -> Drive:
     """Return the drive that a managed smoother has recorded."""
-    inner = slam.filter if isinstance(slam, ManagedSlam) else slam
+    inner = filter_in(slam)
     if not isinstance(inner, RecordedSlam):
         raise ValueError(f"{type(inner).__name__} records no associations")
     return inner.recorded()

@@ -8,11 +8,10 @@ float64, wider than the environment's action space, so that they keep every bit.
 """
 
 import json
-import os
 import tomllib
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, cast
 
@@ -25,6 +24,7 @@ from minari.data_collector import EpisodeBuffer
 from ...envs.spaces import action_space, observation_space
 from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import scenario_text
+from ..job_folders import environment
 from .trajectory import (
     Trajectory,
     array_of,
@@ -66,18 +66,9 @@ def read(path: Path) -> Iterator[Trajectory]:
         yield _trajectory(episode, about)
 
 
-@contextmanager
-def _datasets_in(folder: Path) -> Iterator[None]:
+def _datasets_in(folder: Path) -> AbstractContextManager[None]:
     """Make Minari keep its data sets in a folder during the block."""
-    before = os.environ.get(_ROOT)
-    os.environ[_ROOT] = str(folder.resolve())  # Minari joins a relative path to itself
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[_ROOT]
-        else:
-            os.environ[_ROOT] = before
+    return environment(_ROOT, str(folder.resolve()))  # Minari joins a relative path
 
 
 def _spec(scenario: Scenario) -> EnvSpec:
