@@ -101,10 +101,11 @@ class MapReport(NamedTuple):
         if len(self.landmarks):
             worst = farthest(self.ratios)
             biased = int((self.means**2).sum(axis=1).argmax())
+            size = np.hypot(*self.means[biased])
             text += (
-                f"; landmark {self.landmarks[worst]} has {self.ratios[worst]:.3g}; the "
-                f"largest mean error is {np.hypot(*self.means[biased]):.2f} deviations "
-                f"(landmark {self.landmarks[biased]})"
+                f"; landmark {self.landmarks[worst]} seen from the robot has "
+                f"{self.ratios[worst]:.3g}; the largest mean error is {size:.2f} "
+                f"deviations (landmark {self.landmarks[biased]})"
             )
         if self.undefined or self.indefinite:
             missing = self.undefined + self.indefinite

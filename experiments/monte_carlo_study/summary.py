@@ -374,7 +374,7 @@ def _declared(frame: ErrorFrame) -> list[Measure]:
             _by_freedom("relative_map_nees", "relative_map_dof"),
             "NEES of the map at the end", "1"),
         row("nees_end.worst_landmark", _worst_landmark(frame),
-            "… of the worst landmark", "≈ 1"),
+            "… worst landmark, from the robot", "≈ 1"),
         row("nis", lambda scores: scores.nis_per_degree,
             "NIS / degrees of freedom", "1"),
         row("heading_std_end.claimed", _end(root, "heading_std"),

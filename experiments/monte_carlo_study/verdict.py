@@ -241,9 +241,9 @@ def map_refusal(maps: MapReport, evidence: str = "") -> str:
     else:
         from_robot = each[worst] == maps.p_values[worst]
         ratios = maps.ratios if from_robot else maps.map_ratios
-        seen = " seen from the robot" if from_robot else ""
+        seen = "seen from the robot" if from_robot else "in the frame of the map"
         what = (
-            f"the squared errors of landmark {name}{seen} are "
+            f"the squared errors of landmark {name} {seen} are "
             f"{_number(ratios[worst])} times what its covariances state"
         )
     return f"{what}{others} ({evidence})"

@@ -215,7 +215,7 @@ def test_an_offset_of_all_landmarks_is_told_from_a_scale():
 def test_the_table_has_a_row_of_the_map_and_of_its_worst_landmark():
     text = table_text(summarise_monte_carlo(typical()))
     assert "NEES of the map at the end" in text
-    assert "… of the worst landmark" in text
+    assert "… worst landmark, from the robot" in text
 
 
 def test_the_page_holds_the_decision_on_the_map_and_the_rate_of_the_others():
