@@ -131,6 +131,8 @@ def _load_file(path: Path) -> Scenario:
     except ScenarioError as error:
         lines = str(error).splitlines()
         raise ScenarioError("\n".join(f"{path}: {line}" for line in lines)) from None
+    except ValueError as error:  # a number of thousands of digits
+        raise ScenarioError(f"{path}: {error}") from None
 
 
 # a key, not numbers in a list; from the start of a word, else a long one takes hours

@@ -489,7 +489,7 @@ def changes(option: str, texts: Iterable[str] | None) -> dict[str, Any]:
 
 def _toml_value(text: str) -> Any:
     for written in (text, _BARE_POINT.sub("0.", text)):  # TOML wants 0.1 for .1
-        with contextlib.suppress(tomllib.TOMLDecodeError, RecursionError):
+        with contextlib.suppress(ValueError, RecursionError):
             table = tomllib.loads(f"value = {written}")
             return table["value"] if len(table) == 1 else text
     return text

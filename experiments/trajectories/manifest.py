@@ -9,6 +9,7 @@ bytes. `load_trajectories` reads the trajectories one after the other.
 import hashlib
 import json
 import warnings
+import zipfile
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from os import PathLike
@@ -195,6 +196,9 @@ def digest(path: Path) -> str:
 
 _DAMAGED = ("raise", "skip")
 
+#: What the readers raise for a file of anything else.
+_NO_SHARD = (ValueError, TypeError, LookupError, MemoryError, zipfile.BadZipFile)
+
 
 class DamagedShardError(ValueError):
     """A shard is missing, or its bytes differ from the manifest."""
@@ -247,7 +251,7 @@ class TrajectoryDataset:
         Raises
         ------
         DamagedShardError
-            If the shard is damaged, even where iteration skips such shards.
+            If the file is damaged or is no shard, even where iteration skips it.
         """
         shard = self.manifest.shards[number]
         if not is_whole(self.folder, shard):
@@ -256,7 +260,12 @@ class TrajectoryDataset:
                 f"{self.folder / shard.name} does not match its checksum (episodes "
                 f"{shard.first_episode} to {last})"
             )
-        yield from self._format.read(self.folder / shard.name)
+        path = self.folder / shard.name
+        try:
+            yield from self._format.read(path)
+        except _NO_SHARD as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise DamagedShardError(f"{path} is no shard ({reason})") from None
 
     def damaged_shards(self) -> list[str]:
         """Return the names of the shards that are missing or damaged."""

@@ -2,21 +2,26 @@
 
 import contextlib
 import errno
+import io
 import json
 import os
 import re
 import shutil
 import threading
+import zipfile
 from pathlib import Path
 
 import forked
 import jobs_to_kill
 import matplotlib as mpl
+import numpy as np
 import pytest
 from comparison import tree
+from typer.testing import CliRunner
 
 from slamgym.envs.rendering.scene import add_axes
 from slamgym.estimator import make_estimator
+from slamgym.experiments.command_line.app import main
 from slamgym.experiments.command_line.commands import BadInputError
 from slamgym.experiments.command_line.output_folder import (
     STAGING,
@@ -25,11 +30,11 @@ from slamgym.experiments.command_line.output_folder import (
 )
 from slamgym.experiments.figures.style import lay_out, new_figure
 from slamgym.experiments.job_folders import MANIFEST as OWN_FILES
-from slamgym.experiments.job_folders import files_below
+from slamgym.experiments.job_folders import files_below, sha256_of
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.importers.utias import read_utias
 from slamgym.experiments.monte_carlo_study import monte_carlo
-from slamgym.experiments.trajectories import generate_trajectories
+from slamgym.experiments.trajectories import generate_trajectories, load_trajectories
 from slamgym.experiments.trajectories.manifest import MANIFEST, read_manifest
 from slamgym.sim_configs import load_scenario
 from slamgym.sim_configs.field_types import ScenarioError
@@ -75,6 +80,45 @@ def test_a_manifest_of_an_impossible_job_is_refused(name, value, tmp_path):
     (tmp_path / MANIFEST).write_text(json.dumps(table | {"job": job | {name: value}}))
     with pytest.raises(ValueError, match=f"{name} must be"):
         read_manifest(tmp_path)
+
+
+def hostile_shard(path, kind):
+    with np.load(path) as archive:
+        columns = dict(archive)
+    if kind == "objects":
+        columns["poses"] = np.array([path], dtype=object)
+    elif kind == "missing":
+        del columns["poses"]
+    np.savez(path, **columns)
+    if kind == "huge":  # the header of one array promises 16 TB
+        head = io.BytesIO()
+        shape = {"descr": "<f8", "fortran_order": False, "shape": (2 << 40,)}
+        np.lib.format.write_array_header_1_0(head, shape)
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("poses.npy", head.getvalue())
+
+
+@pytest.mark.parametrize("kind", ["objects", "missing", "huge"])
+def test_a_shard_of_anything_else_is_refused_by_name(kind, tmp_path):
+    generate_trajectories("six_landmarks", tmp_path, episodes=1)
+    shard = tmp_path / "shard_00000.npz"
+    hostile_shard(shard, kind)
+    table = json.loads((tmp_path / MANIFEST).read_text())
+    table["shards"][0]["sha256"] = sha256_of(shard)
+    (tmp_path / MANIFEST).write_text(json.dumps(table))
+    with pytest.raises(ValueError, match=r"shard_00000\.npz is no shard \("):
+        list(load_trajectories(tmp_path))
+    with pytest.warns(UserWarning, match="is no shard"):
+        assert not list(load_trajectories(tmp_path, damaged="skip"))
+
+
+def test_a_number_of_too_many_digits_is_refused_by_file_and_name(tmp_path):
+    file, digits = tmp_path / "digits.toml", "9" * 5000
+    file.write_text(f"steps = {digits}")
+    with pytest.raises(ScenarioError, match=r"digits\.toml: Exceeds the limit"):
+        load_scenario(file)
+    done = CliRunner().invoke(main, ["run", "loop", "--set", f"steps={digits}"])
+    assert "steps must be an integer >= 2, got '999" in done.output
 
 
 @pytest.mark.parametrize("path", ["..:x", ":x", ".:x"])
