@@ -472,8 +472,8 @@ def normal_scores(chi_squares: ArrayLike, degrees_of_freedom: ArrayLike) -> Arra
 
 
 def to_band(ends: ArrayLike) -> Band:
-    """Return two ends, shape (2,), as a band."""
-    low, high = np.asarray(ends)
+    """Return two ends, shape (2,), as a band of ratios, which are >= 0."""
+    low, high = np.maximum(ends, 0.0)
     return Band(float(low), float(high))
 
 

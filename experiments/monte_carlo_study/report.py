@@ -162,8 +162,8 @@ def _p_value(p_value: float | None) -> str:
 
 
 def _interval(ends: Iterable[float | None]) -> str:
-    """Write an interval of numbers >= 0; a dash where unknown."""
-    known = [max(end, 0.0) for end in ends if end is not None]
+    """Write an interval; a dash where unknown."""
+    known = [end for end in ends if end is not None]
     if len(known) < 2:
         return NOTHING
     written = [f"{end:.3f}" if end < _LARGE else number(end) for end in known]

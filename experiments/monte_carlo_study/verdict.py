@@ -198,7 +198,7 @@ def _verdict_on_successes(report: ConsistencyReport) -> Verdict:
     if pose.word in (NOT_CONSISTENT, NOT_SHOWN):
         return pose
     if maps.shown:
-        low, high = _interval(maps.equivalence)
+        low, high = maps.equivalence.interval
         both = f"that of the map, [{low:.3f}, {high:.3f}]"
         return Verdict(pose.word, f"{pose.reason}, as does {both}")
     return Verdict(NOT_SHOWN, f"{pose.reason}; {map_not_shown(maps)}")
@@ -210,7 +210,7 @@ def map_not_shown(maps: MapReport) -> str:
         singular = "its covariance is singular or no covariance"
         runs = counted(maps.undefined, "run")
         return f"the map has no NEES at the end of {runs}: {singular}"
-    low, high = _interval(maps.equivalence)
+    low, high = maps.equivalence.interval
     needed = _runs_needed(maps.equivalence, maps.runs)
     many = f", about {needed:,} in total if its ratio is 1" if needed else ""
     return (
@@ -249,13 +249,9 @@ def map_refusal(maps: MapReport, evidence: str = "") -> str:
     return f"{what}{others} ({evidence})"
 
 
-def _interval(verdict: EquivalenceTest) -> tuple[float, float]:
-    return max(verdict.interval[0], 0.0), verdict.interval[1]  # of a ratio >= 0
-
-
 def _verdict_on_poses(report: ConsistencyReport) -> Verdict:
     verdict = report.equivalence
-    low, high = _interval(verdict)
+    low, high = verdict.interval
     interval = f"the 90 % interval of the ratio, [{low:.3f}, {high:.3f}]"
     refusal = _refusal(report)
     if refusal and _is_near_everywhere(report):

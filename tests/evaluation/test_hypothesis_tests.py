@@ -201,6 +201,13 @@ def test_normal_scores_have_the_quantiles_of_a_normal():
     assert np.isnan(normal_scores([1.0], [0]))
 
 
+@pytest.mark.parametrize("averages", [[0.1, 30.0], [0.1, 0.1, 90.0]])
+def test_no_interval_of_a_ratio_holds_negative_numbers(averages):
+    for test in (time_average_test, equivalence_test):
+        low, high = test(np.array(averages), 3).interval
+        assert 0 == low < high
+
+
 def test_equivalence_has_three_verdicts():
     rng = np.random.default_rng(6)
     averages = rng.chisquare(DOF, 400)
