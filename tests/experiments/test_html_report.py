@@ -330,16 +330,31 @@ def test_the_page_does_not_scroll_sideways(report, width, browser):
 def test_two_estimators_fit_a_telephone_and_more_of_them_show_that_they_scroll(
     report, tmp_path, browser
 ):
-    four = typical().isel(estimator=[0, 1, 0, 1]).assign_coords(estimator=list("abcd"))
-    four.attrs["estimators"] = "{}"
-    path = tmp_path / "four.html"
-    path.write_text(page_of(four), encoding="utf-8")
+    path = page_of_several(list("abcd"), tmp_path)
     browser.open(report, size=(390, 900))
     assert hidden_width_of_the_table(browser) <= 0
     assert shade_beside_the_table(browser, tmp_path) < 20
     browser.open(path, size=(390, 900))
     assert hidden_width_of_the_table(browser) > 0
     assert shade_beside_the_table(browser, tmp_path) > 60
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_no_figures_in_reports")
+def test_seven_estimators_fit_a_wide_screen(tmp_path, browser):
+    names = "ekf invariant first_estimates observability_constrained iterated unscented"
+    path = page_of_several([*names.split(), "robocentric"], tmp_path)
+    browser.open(path, size=(1280, 900))
+    assert hidden_width_of_the_table(browser) <= 0
+
+
+def page_of_several(names, folder):
+    which = [k % 2 for k in range(len(names))]
+    several = typical().isel(estimator=which).assign_coords(estimator=names)
+    several.attrs["estimators"] = "{}"
+    path = folder / "several.html"
+    path.write_text(page_of(several), encoding="utf-8")
+    return path
 
 
 TABLE = "document.querySelector('.wide')"
