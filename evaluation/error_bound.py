@@ -170,21 +170,17 @@ def efficiency(bound: Array, squared_error: Array) -> Efficiency:
     return Efficiency(value, (value - reach, value + reach))
 
 
-def invariant_squares(error: Array) -> tuple[Array, float]:
-    """Return the squares of an invariant error (3 + 2n,) that the bound is about.
+def map_error_squared(error: Array) -> Array:
+    """Return the square of invariant errors (..., 3 + 2n) that the bound is about.
 
     Returns
     -------
-    squares : ndarray, shape (2,)
-        Of position and heading [m², rad²].
-    map
-        Mean over the landmarks about the centre of the map [m²]; nan without any.
+    ndarray, shape (...)
+        Mean over the n > 0 landmarks about the centre of the map [m²].
     """
-    points = error[3:].reshape(-1, 2)
-    squares = np.array([error[0] ** 2 + error[1] ** 2, error[2] ** 2])
-    if not len(points):
-        return squares, float("nan")
-    return squares, float(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())
+    points = error[..., 3:].reshape(*error.shape[:-1], -1, 2)
+    apart = points - points.mean(axis=-2, keepdims=True)
+    return np.asarray((apart**2).sum(axis=-1).mean(axis=-1))
 
 
 def _invariant_start(first: Array, std: Array) -> Array:

@@ -20,6 +20,7 @@ from ..estimator.models.rigid_motion import (
     additive_error,
     invariant_covariance,
     invariant_error,
+    rotations,
     seen_from,
 )
 
@@ -96,7 +97,7 @@ def pose_nees(
     -------
     ndarray, shape (...)
     """
-    return normalised_squared_error(*_in_frame(true_poses, poses, covariances, frame))
+    return normalised_squared_error(*in_frame(true_poses, poses, covariances, frame))
 
 
 def heading_nees(true_poses: Array, poses: Array, covariances: Array) -> Array:
@@ -121,7 +122,7 @@ def position_nees(
     true_poses, poses, covariances, frame
         As in :func:`pose_nees`.
     """
-    errors, claimed = _in_frame(true_poses, poses, covariances, frame)
+    errors, claimed = in_frame(true_poses, poses, covariances, frame)
     return normalised_squared_error(errors[..., :2], claimed[..., :2, :2])
 
 
@@ -143,7 +144,7 @@ def state_nees(
     -------
     ndarray, shape (...)
     """
-    return normalised_squared_error(*_in_frame(true_states, means, covariances, frame))
+    return normalised_squared_error(*in_frame(true_states, means, covariances, frame))
 
 
 def landmark_nees(
@@ -160,10 +161,26 @@ def landmark_nees(
     -------
     ndarray, shape (..., n)
     """
-    errors, claimed = _in_frame(true_states, means, covariances, frame)
+    states = in_frame(true_states, means, covariances, frame)
+    return normalised_squared_error(*parts_of_landmarks(*states))
+
+
+def parts_of_landmarks(errors: Array, covariances: Array) -> tuple[Array, Array]:
+    """Return the errors (..., n, 2) of landmarks, and their own covariances.
+
+    Parameters
+    ----------
+    errors : ndarray, shape (..., 3 + 2n)
+    covariances : ndarray, shape (..., 3 + 2n, 3 + 2n)
+
+    Returns
+    -------
+    errors : ndarray, shape (..., n, 2)
+    covariances : ndarray, shape (..., n, 2, 2)
+    """
     rows = np.arange(3, errors.shape[-1]).reshape(-1, 2)
-    blocks = claimed[..., rows[:, :, None], rows[:, None, :]]
-    return normalised_squared_error(errors[..., rows], blocks)
+    blocks = covariances[..., rows[:, :, None], rows[:, None, :]]
+    return errors[..., rows], np.ascontiguousarray(blocks)
 
 
 def relative_map_nees(true_states: Array, means: Array, covariances: Array) -> Array:
@@ -212,7 +229,7 @@ def relative_landmark_deviations(
     """
     errors, claimed = _relative_map(true_states, means, covariances)
     rows = np.arange(errors.shape[-1]).reshape(-1, 2)
-    turn = np.swapaxes(_rotations(-means[..., 2]), -1, -2)[..., None, :, :]
+    turn = np.swapaxes(rotations(-means[..., 2]), -1, -2)[..., None, :, :]
     blocks = turn @ claimed[..., rows[:, :, None], rows[:, None, :]]
     blocks = blocks @ np.swapaxes(turn, -1, -2)
     return whitened(np.einsum("...ij,...j->...i", turn, errors[..., rows]), blocks)
@@ -241,7 +258,7 @@ def _relative_map(
     local = _landmarks_from_robot(means)
     errors = _landmarks_from_robot(true_states) - local
     n = errors.shape[-1] // 2
-    turn = _rotations(-means[..., 2])
+    turn = rotations(-means[..., 2])
     jacobian = np.zeros((*turn.shape[:-2], 2 * n, 3 + 2 * n))
     for row in range(0, 2 * n, 2):
         jacobian[..., row : row + 2, :2] = -turn
@@ -250,12 +267,6 @@ def _relative_map(
     jacobian[..., 1::2, 2] = -local[..., 0::2]
     claimed = jacobian @ covariances @ np.swapaxes(jacobian, -1, -2)
     return errors, claimed
-
-
-def _rotations(angles: Array) -> Array:
-    """Return R(φ) = [cos φ, −sin φ; sin φ, cos φ], shape (..., 2, 2)."""
-    cos, sin = np.cos(angles), np.sin(angles)
-    return np.stack([cos, -sin, sin, cos], axis=-1).reshape(*cos.shape, 2, 2)
 
 
 def _whiten_few(errors: Array, correlations: Array) -> Array:
@@ -289,19 +300,22 @@ def _whiten_each(errors: Array, correlations: Array) -> Array:
 
     n = errors.shape[-1]
     white = np.full((errors[..., 0].size, n), np.nan)
-    pairs = zip(errors.reshape(-1, n), correlations.reshape(-1, n, n), strict=True)
-    for index, (error, correlation) in enumerate(pairs):
-        if np.isfinite(correlation).all() and np.isfinite(error).all():
-            factor, failed = dpotrf(correlation, lower=1)
-            if not failed and (np.diagonal(factor) ** 2 > SINGULAR).all():
-                white[index] = dtrtrs(factor, error, lower=1)[0]
+    pivots = np.full(white.shape, np.nan)
+    e, C = errors.reshape(-1, n), correlations.reshape(-1, n, n)
+    finite = np.isfinite(C).all(axis=(1, 2)) & np.isfinite(e).all(axis=1)
+    for index in np.flatnonzero(finite).tolist():
+        factor, failed = dpotrf(C[index], lower=1)
+        if not failed:
+            pivots[index] = factor.diagonal()
+            white[index] = dtrtrs(factor, e[index], lower=1)[0]
+    white[~(pivots**2 > SINGULAR).all(axis=1)] = np.nan
     return white.reshape(errors.shape)
 
 
-def _in_frame(
+def in_frame(
     true_states: Array, means: Array, covariances: Array, frame: ErrorFrame
 ) -> tuple[Array, Array]:
-    """Return errors and their claimed covariances in a named frame.
+    """Return errors and their claimed covariances in a named frame, as for `whitened`.
 
     The origin of the invariant frame is the estimated position, so that the NEES has
     the same digits wherever the world's origin lies.

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import Array, IntArray
 from ..estimator.guards.argument_checks import as_floats, shaped
 from ..estimator.models.bearing_range import wrap_angle
-from ..estimator.models.rigid_motion import rotation
+from ..estimator.models.rigid_motion import rotation, rotations
 
 _ROUNDING = 4 * np.finfo(np.float64).eps
 _LEAST_TO_EXCHANGE = 5  # positions, so that most of them are right
@@ -114,14 +114,31 @@ def align_positions(estimate: ArrayLike, truth: ArrayLike) -> Alignment:
     Alignment(angle=1.5707963267948966, translation=array([5., 5.]))
     """
     e, g = _paired(estimate=estimate, truth=truth)
-    e_mean, g_mean = e.mean(axis=0), g.mean(axis=0)
-    e_centred, g_centred = e - e_mean, g - g_mean
-    cross = e_centred[:, 0] @ g_centred[:, 1] - e_centred[:, 1] @ g_centred[:, 0]
-    dot = np.sum(e_centred * g_centred)
-    noise = _ROUNDING * len(e) * (np.abs(e).max() * np.abs(g_centred).max())
-    noise += _ROUNDING * len(e) * (np.abs(g).max() * np.abs(e_centred).max())
-    angle = float(np.arctan2(cross, dot)) if np.hypot(cross, dot) > noise else 0.0
-    return Alignment(angle, g_mean - e_mean @ rotation(angle).T)
+    angle, translation, _ = _aligned(e, g)
+    return Alignment(float(angle), translation)
+
+
+def _aligned(e: Array, g: Array) -> tuple[Array, Array, Array]:
+    """Return φ (...), c (..., 2) and the aligned e, for positions (..., n, 2)."""
+    e_mean, g_mean = e.mean(axis=-2), g.mean(axis=-2)
+    e_centred, g_centred = e - e_mean[..., None, :], g - g_mean[..., None, :]
+    cross = np.vecdot(e_centred[..., 0], g_centred[..., 1])
+    cross = cross - np.vecdot(e_centred[..., 1], g_centred[..., 0])
+    dot = _summed(e_centred * g_centred)
+    noise = _ROUNDING * e.shape[-2] * (_largest(e) * _largest(g_centred))
+    noise += _ROUNDING * e.shape[-2] * (_largest(g) * _largest(e_centred))
+    angle = np.where(np.hypot(cross, dot) > noise, np.arctan2(cross, dot), 0.0)
+    turn = rotations(angle).mT
+    translation = g_mean - (e_mean[..., None, :] @ turn)[..., 0, :]
+    return angle, translation, e @ turn + translation[..., None, :]
+
+
+def _summed(positions: Array) -> Array:
+    return np.asarray(positions.reshape(*positions.shape[:-2], -1).sum(axis=-1))
+
+
+def _largest(positions: Array) -> Array:
+    return np.asarray(np.abs(positions).max(axis=(-2, -1)))
 
 
 def position_accuracy(estimate: ArrayLike, truth: ArrayLike) -> PositionAccuracy:
@@ -152,12 +169,30 @@ def position_accuracy(estimate: ArrayLike, truth: ArrayLike) -> PositionAccuracy
     (2.0, 0.0)
     """
     e, g = _paired(estimate=estimate, truth=truth)
-    alignment = align_positions(e, g)
+    angle, translation, moved = _aligned(e, g)
     return PositionAccuracy(
         raw_errors=np.linalg.norm(e - g, axis=1),
-        aligned_errors=np.linalg.norm(alignment.apply(e) - g, axis=1),
-        alignment=alignment,
+        aligned_errors=np.linalg.norm(moved - g, axis=1),
+        alignment=Alignment(float(angle), translation),
     )
+
+
+def distances(estimate: Array, truth: Array) -> tuple[Array, Array]:
+    """Return the raw and the aligned distances of `position_accuracy`, unchecked.
+
+    Parameters
+    ----------
+    estimate, truth : ndarray, shape (..., n, 2)
+        Of each path or map [m]; n >= 1.
+
+    Returns
+    -------
+    raw, aligned : ndarray, shape (..., n)
+        [m]
+    """
+    *_, moved = _aligned(estimate, truth)
+    raw, aligned = estimate - truth, moved - truth
+    return np.linalg.norm(raw, axis=-1), np.linalg.norm(aligned, axis=-1)
 
 
 def exchanged_positions(estimate: ArrayLike, truth: ArrayLike) -> Exchange:

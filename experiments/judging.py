@@ -649,25 +649,30 @@ def _add_map(
     that it bends their errors, whose NEES then is not χ². An infinite variance stands
     for aligned estimates, whose landmarks are not aligned.
     """
-    ids, count = estimate.landmark_ids.tolist(), runs.landmarks.shape[1]
-    if not ids or not count:
+    ids, count = estimate.landmark_ids, runs.landmarks.shape[1]
+    if not len(ids) or not count:
         return ""
-    if max(ids) >= count:
-        return f"its map has landmark {max(ids)}, the world has {count} from 0 on"
+    if ids.max() >= count:
+        return f"its map has landmark {ids.max()}, the world has {count} from 0 on"
     truth, claims = runs.landmarks[run], estimate.landmark_covariances
     measured = measure_landmarks(
-        runs.true_poses[run, -1], truth, pose, ids, estimate.landmarks, claims
+        runs.true_poses[[run], -1],
+        truth[None],
+        pose[None],
+        ids[None],
+        estimate.landmarks[None],
+        claims[None],
     )
     squares = normalised_squared_error(truth[ids] - estimate.landmarks, claims)
-    measured["landmark_nees_additive"] = by_id(squares, ids, count)
+    measured["landmark_nees_additive"] = by_id(squares[None], ids[None], count)
     measured["landmark_mahalanobis"] = np.sqrt(measured["landmark_nees_additive"])
     bend = np.hypot(*(truth[ids] - estimate.poses[0, :2]).T) * heading_variance
     least = np.sqrt(np.maximum(np.linalg.eigvalsh(claims)[:, 0], 0.0))
     rows = np.flatnonzero(bend <= _BEND * least)
     deviations = whitened(truth[ids][rows] - estimate.landmarks[rows], claims[rows])
-    measured |= deviations_by_id(deviations, [ids[row] for row in rows], count)
+    measured |= deviations_by_id(deviations[None], ids[None, rows], count)
     for name, value in measured.items():
-        block[name][run] = value
+        block[name][run] = value[0]
     return ""
 
 

@@ -42,6 +42,12 @@ def rotation(angle: float) -> Array:
     return np.array([[cos, -sin], [sin, cos]])
 
 
+def rotations(angles: Array) -> Array:
+    """Return R(t) of angles of any shape (...), shape (..., 2, 2)."""
+    cos, sin = np.cos(angles), np.sin(angles)
+    return np.stack([cos, -sin, sin, cos], axis=-1).reshape(*cos.shape, 2, 2)
+
+
 def pose_rotation(angle: float) -> Array:
     """Return the rotation of a pose (x, y, θ), shape (3, 3), that keeps θ."""
     turn = np.eye(3)

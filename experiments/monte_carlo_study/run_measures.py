@@ -1,19 +1,19 @@
 """Measure the errors and the consistency of every run of a Monte Carlo: `measure_runs`.
 
-Each run is measured by itself, so its figures do not depend on the other runs. With
-hidden identities, a run is bad if it fails, or if its path error is more than `MARGIN`
-above that of the same filter with known identities on the same readings.
+Some runs are measured at once, but the figures of a run do not depend on the others.
+With hidden identities, a run is bad if it fails, or if its path error is more than
+`MARGIN` above that of the same filter with known identities on the same readings.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Array, BoolArray
+from ...arrays import Array, BoolArray, IntArray
 from ...estimator.interface import Belief
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.rigid_motion import ERROR_FRAMES, invariant_error, seen_from
@@ -24,9 +24,9 @@ from ...evaluation.association_scores import (
     oracle_errors,
     places_of,
 )
-from ...evaluation.error_bound import PosteriorBound, invariant_squares
+from ...evaluation.error_bound import PosteriorBound, map_error_squared
 from ...evaluation.noise_findings import CHANNELS, MOMENTS
-from ...evaluation.trajectory_error import ellipse_areas, position_accuracy
+from ...evaluation.trajectory_error import distances, ellipse_areas
 from ...sim_configs import Scenario
 from ..logs.ground_truth import TrueLandmarks
 from ..logs.slamlog import NO_LANDMARK
@@ -44,7 +44,7 @@ from .filtered_runs import (
 
 Block = dict[str, NDArray[np.generic]]
 
-Value = NDArray[np.generic] | float
+Value = Any  # an array over runs, or one number for all
 
 STEP, RUN, LANDMARK = ("run", "step"), ("run",), ("run", "landmark")
 NOISE = "run", "noise", "moment"
@@ -202,19 +202,15 @@ def measure_runs(
         The `VARIABLES`, or the `HIDDEN_VARIABLES`, shape (B,), (B, T) or (B, L) each;
         nan where undefined.
     """
-    block = _empty_block(runs)
-    failures = dict(filtered.failures)
-    for run in range(len(runs.visible)):
-        with np.errstate(all="ignore"):  # a diverged run may overflow
-            truth = runs.true_poses[run]
-            measured = _measure_path(truth, filtered, run, np.array(bound.origin))
-            map_measures = _try_to_measure_map(runs, run, filtered, resolution)
-        if isinstance(map_measures, Failure):
-            failures[run] = map_measures
-        else:
-            measured |= map_measures
-        for name, value in measured.items():
-            block[name][run] = value
+    block, failures = _empty_block(runs), dict(filtered.failures)
+    count, steps, _ = runs.visible.shape
+    with np.errstate(all="ignore"):  # a diverged run may overflow
+        for some in _pieces(range(count), 9 * steps):
+            measured = _measure_paths(runs.true_poses[some], filtered, some, bound)
+            _write(block, some, measured)
+        for name in ("ate", "ate_aligned", "pose_area"):
+            block[name][list(failures)] = np.nan
+        _measure_maps(block, runs, filtered, failures, resolution)
     block["position_bound"][:], block["heading_bound"][:] = bound[:2]
     block["position_bound_raw"][:], block["map_bound"][:] = bound[2:4]
     block["noise_sums"] = noise
@@ -222,6 +218,28 @@ def measure_runs(
     write_failures(block, failures)
     _explain_gaps(block, filtered)
     return block
+
+
+#: Numbers that are measured together: their temporaries fit into a processor's cache.
+_AT_ONCE = 2**16
+
+
+def _pieces(rows: Sequence[int], numbers: int) -> Iterator[list[int]]:
+    """Cut rows of so many numbers each into pieces of at most `_AT_ONCE` numbers.
+
+    Examples
+    --------
+    >>> list(_pieces(range(5), 30_000))
+    [[0, 1], [2, 3], [4]]
+    """
+    size = max(1, _AT_ONCE // numbers)
+    for begin in range(0, len(rows), size):
+        yield list(rows[begin : begin + size])
+
+
+def _write(block: Block, rows: list[int], measured: Mapping[str, Value]) -> None:
+    for name, values in measured.items():
+        block[name][rows] = values
 
 
 #: A NEES or NIS above counts as none: squares of larger numbers would overflow.
@@ -283,24 +301,56 @@ def explain_first_gap(
     block["message"] = np.array(messages)
 
 
-def _try_to_measure_map(
-    runs: SimulatedRuns, run: int, filtered: FilteredRuns, resolution: float
-) -> dict[str, Value] | Failure:
-    """Measure the final map; a malformed belief of a user's estimator is a failure."""
-    belief = filtered.beliefs[run]
-    if belief is None:
-        return {}
-    try:
-        if runs.true_ids is not None:
-            made = filtered.decisions.get(run)
-            belief = identified(belief, {} if made is None else made.identities())
-        return {
-            **_measure_map(runs.true_poses[run, -1], runs.landmarks[run], belief),
-            **measure_association(runs, filtered, run, resolution),
-        }
-    except Exception as error:
-        message = f"the final belief is no map of this world: {error}"
-        return Failure(runs.visible.shape[1] - 1, message)
+def _measure_maps(
+    block: Block,
+    runs: SimulatedRuns,
+    filtered: FilteredRuns,
+    failures: dict[int, Failure],
+    resolution: float,
+) -> None:
+    """Measure the final maps, those of one size together.
+
+    A malformed belief of a user's estimator is a failure of its run.
+    """
+
+    def attempt(some: list[int]) -> None:
+        try:
+            _write(block, some, _measured_maps(runs, filtered, some, resolution))
+        except Exception as error:
+            if len(some) > 1:
+                for run in some:
+                    attempt([run])
+                return
+            message = f"the final belief is no map of this world: {error}"
+            failures[some[0]] = Failure(runs.visible.shape[1] - 1, message)
+
+    for size, alike in _by_size(filtered.beliefs).items():
+        numbers = (3 + 2 * size) ** 2 if runs.true_ids is None else _AT_ONCE
+        for some in _pieces(alike, numbers):
+            attempt(some)
+
+
+def _by_size(beliefs: Sequence[Belief | None]) -> dict[int, list[int]]:
+    """Return which runs have a map, by its number of landmarks."""
+    sizes: dict[int, list[int]] = {}
+    for run, belief in enumerate(beliefs):
+        if belief is not None:
+            sizes.setdefault(len(belief.landmark_ids), []).append(run)
+    return sizes
+
+
+def _measured_maps(
+    runs: SimulatedRuns, filtered: FilteredRuns, some: list[int], resolution: float
+) -> Mapping[str, Value]:
+    """Measure the final maps of some runs; of one run where identities are hidden."""
+    beliefs = [belief for run in some if (belief := filtered.beliefs[run]) is not None]
+    truth = runs.true_poses[some, -1], runs.landmarks[some]
+    if runs.true_ids is None:
+        return _measure_map(*truth, beliefs)
+    made = filtered.decisions.get(some[0])
+    named = identified(beliefs[0], {} if made is None else made.identities())
+    scores = measure_association(runs, filtered, some[0], resolution)
+    return {**_measure_map(*truth, [named]), **scores}
 
 
 def write_failures(block: Block, failures: Mapping[int, Failure]) -> None:
@@ -324,121 +374,140 @@ def _empty_block(runs: SimulatedRuns) -> Block:
     }
 
 
-def _measure_path(
-    truth: Array, filtered: FilteredRuns, run: int, origin: Array
+def _measure_paths(
+    truth: Array, filtered: FilteredRuns, some: list[int], bound: PosteriorBound
 ) -> dict[str, Value]:
-    poses = filtered.trace.poses[run]
-    covariances = filtered.trace.pose_covariances[run]
-    posed = truth, poses, covariances
-    errors = truth - poses
-    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    """Measure the paths of some runs, whose true poses are given."""
+    poses = filtered.trace.poses[some]
+    covariances = filtered.trace.pose_covariances[some]
+    errors, origin = truth - poses, np.array(bound.origin)
+    variances = np.diagonal(covariances, axis1=-2, axis2=-1)
+    about = seen_from(origin, truth), seen_from(origin, poses)
+    raw, aligned = distances(poses[..., :2], truth[..., :2])
     measured: dict[str, Value] = {
-        "heading_nees": nees.heading_nees(*posed),
-        "nis": filtered.trace.nis[run],
-        "nis_dof": filtered.trace.degrees_of_freedom[run],
-        "position_error": np.hypot(errors[:, 0], errors[:, 1]),
+        "heading_nees": nees.heading_nees(truth, poses, covariances),
+        "nis": filtered.trace.nis[some],
+        "nis_dof": filtered.trace.degrees_of_freedom[some],
+        "position_error": np.hypot(errors[..., 0], errors[..., 1]),
         "position_error_invariant": np.linalg.norm(
-            invariant_error(seen_from(origin, truth), seen_from(origin, poses))[:, :2],
-            axis=1,
+            invariant_error(*about)[..., :2], axis=-1
         ),
-        "heading_error": wrap_angle(errors[:, 2]),
-        "heading_std": np.sqrt(variances[:, 2]),
-        "position_std": np.sqrt(variances[:, 0] + variances[:, 1]),
+        "heading_error": wrap_angle(errors[..., 2]),
+        "heading_std": np.sqrt(variances[..., 2]),
+        "position_std": np.sqrt(variances[..., 0] + variances[..., 1]),
         "failed_at": -1,
+        "ate": _rms(raw),
+        "ate_aligned": _rms(aligned),
+        "pose_area": ellipse_areas(covariances[:, -1, :2, :2]),
     }
     for frame in ERROR_FRAMES:
-        measured[f"pose_nees_{frame}"] = nees.pose_nees(*posed, frame=frame)
-        measured[f"position_nees_{frame}"] = nees.position_nees(*posed, frame=frame)
-    if run not in filtered.failures:
-        path = position_accuracy(poses[:, :2], truth[:, :2])
-        measured |= {
-            "ate": path.raw_rmse,
-            "ate_aligned": path.aligned_rmse,
-            "pose_area": float(ellipse_areas(covariances[-1:, :2, :2])[0]),
-        }
+        claimed = nees.in_frame(truth, poses, covariances, frame)
+        squares = nees.whitened(*claimed) ** 2
+        measured[f"pose_nees_{frame}"] = squares.sum(axis=-1)
+        measured[f"position_nees_{frame}"] = squares[..., :2].sum(axis=-1)
     return measured
 
 
-def _measure_map(true_pose: Array, truth: Array, belief: Belief) -> dict[str, Value]:
-    ids = list(belief.landmark_ids)
-    if len(set(ids)) < len(ids) or not set(ids) <= set(range(len(truth))):
-        raise ValueError(
-            f"landmark_ids must be distinct and from 0 to {len(truth) - 1}, "
-            f"got {tuple(ids)}"
-        )
-    true_state, size = np.append(true_pose, truth[ids].ravel()), 2 * len(ids)
-    states = true_state, belief.mean, belief.covariance
+def _rms(distances: Array) -> Array:
+    return np.asarray(np.sqrt(np.mean(distances**2, axis=-1)))
+
+
+def _measure_map(
+    true_poses: Array, truth: Array, beliefs: list[Belief]
+) -> dict[str, Value]:
+    """Measure the final maps of B runs, with n landmarks each."""
+    count, every = truth.shape[1], [list(belief.landmark_ids) for belief in beliefs]
+    for listed in every:
+        if len(set(listed)) < len(listed) or not set(listed) <= set(range(count)):
+            raise ValueError(
+                f"landmark_ids must be distinct and from 0 to {count - 1}, "
+                f"got {tuple(listed)}"
+            )
+    ids, size = np.array(every, dtype=np.int64), 2 * len(every[0])
+    true_landmarks = np.take_along_axis(truth, ids[..., None], axis=1)
+    states = (
+        np.hstack([true_poses, true_landmarks.reshape(len(ids), size)]),
+        np.stack([belief.mean for belief in beliefs]),
+        np.stack([belief.covariance for belief in beliefs]),
+    )
     measured: dict[str, Value] = {"state_dof": 3 + size, "relative_map_dof": size}
     for frame in ERROR_FRAMES:
-        measured[f"state_nees_{frame}"] = float(nees.state_nees(*states, frame=frame))
-    if not ids:
+        errors, claimed = nees.in_frame(*states, frame)
+        measured[f"state_nees_{frame}"] = nees.normalised_squared_error(errors, claimed)
+        values = nees.normalised_squared_error(
+            *nees.parts_of_landmarks(errors, claimed)
+        )
+        measured[f"landmark_nees_{frame}"] = by_id(values, ids, count)
+    if not size:
         return measured
-    for frame in ERROR_FRAMES:
-        values = nees.landmark_nees(*states, frame=frame)
-        measured[f"landmark_nees_{frame}"] = by_id(values, ids, len(truth))
     deviations = nees.relative_landmark_deviations(*states)
-    measured |= deviations_by_id(deviations, ids, len(truth))
-    estimated = ids, belief.landmarks, belief.landmark_covariances
-    relative = float(nees.relative_map_nees(*states))
-    if math.isnan(relative) and nees.is_indefinite(belief.covariance):
-        relative = math.inf
+    measured |= deviations_by_id(deviations, ids, count)
+    relative = nees.relative_map_nees(*states)
+    for row in np.flatnonzero(np.isnan(relative)).tolist():
+        if nees.is_indefinite(states[2][row]):
+            relative[row] = math.inf
+    landmarks, own = nees.parts_of_landmarks(*states[1:])
     return measured | {
         "relative_map_nees": relative,
-        **measure_landmarks(true_pose, truth, belief.pose, *estimated),
+        **measure_landmarks(true_poses, truth, states[1][:, :3], ids, landmarks, own),
         "landmark_mahalanobis": np.sqrt(measured["landmark_nees_additive"]),
     }
 
 
 def measure_landmarks(
-    true_pose: Array,
+    true_poses: Array,
     true_landmarks: Array,
-    pose: Array,
-    ids: list[int],
+    poses: Array,
+    ids: IntArray,
     landmarks: Array,
     covariances: Array,
 ) -> dict[str, Value]:
-    """Measure what the final map is worth without its correlations.
+    """Measure what final maps are worth without their correlations.
 
     Parameters
     ----------
-    true_pose, pose : ndarray, shape (3,)
-        The final pose and its estimate [m, m, rad].
-    true_landmarks : ndarray, shape (L, 2)
+    true_poses, poses : ndarray, shape (B, 3)
+        The final poses and their estimates [m, m, rad].
+    true_landmarks : ndarray, shape (B, L, 2)
         All of them [m].
-    ids : list of int
-        Which of them are in the map, n > 0 different ones.
-    landmarks : ndarray, shape (n, 2)
+    ids : ndarray of int, shape (B, n)
+        Which of them are in each map, n > 0 different ones.
+    landmarks : ndarray, shape (B, n, 2)
         Their estimated positions [m].
-    covariances : ndarray, shape (n, 2, 2)
+    covariances : ndarray, shape (B, n, 2, 2)
         Of these [m²].
     """
-    truth = true_landmarks[ids]
-    states = np.append(true_pose, truth.ravel()), np.append(pose, landmarks.ravel())
-    near = (seen_from(pose[:2], state) for state in states)
-    _, centred = invariant_squares(invariant_error(*near))
-    accuracy = position_accuracy(landmarks, truth)
+    count, truth = (
+        true_landmarks.shape[1],
+        np.take_along_axis(true_landmarks, ids[..., None], axis=1),
+    )
+    near = (
+        seen_from(poses[:, :2], np.hstack([pose, points.reshape(len(pose), -1)]))
+        for pose, points in ((true_poses, truth), (poses, landmarks))
+    )
+    raw, aligned = distances(landmarks, truth)
     return {
-        "map_error_centred": float(np.sqrt(centred)),
-        "landmark_rmse": accuracy.raw_rmse,
-        "landmark_rmse_aligned": accuracy.aligned_rmse,
-        "landmark_area": float(ellipse_areas(covariances).mean()),
-        "landmark_error": by_id(accuracy.raw_errors, ids, len(true_landmarks)),
+        "map_error_centred": np.sqrt(map_error_squared(invariant_error(*near))),
+        "landmark_rmse": _rms(raw),
+        "landmark_rmse_aligned": _rms(aligned),
+        "landmark_area": ellipse_areas(covariances).mean(axis=-1),
+        "landmark_error": by_id(raw, ids, count),
     }
 
 
-def deviations_by_id(deviations: Array, ids: list[int], count: int) -> dict[str, Array]:
-    """Return whitened errors (n, 2) for all landmarks, infinite where undefined."""
-    known = np.where(np.isnan(deviations), np.inf, deviations).T
+def deviations_by_id(deviations: Array, ids: IntArray, count: int) -> dict[str, Array]:
+    """Return whitened errors (B, n, 2) for all landmarks, infinite where undefined."""
+    known = np.where(np.isnan(deviations), np.inf, deviations)
     return {
-        name: by_id(values, ids, count)
-        for name, values in zip(DEVIATIONS, known, strict=True)
+        name: by_id(known[..., axis], ids, count)
+        for axis, name in enumerate(DEVIATIONS)
     }
 
 
-def by_id(values: Array, ids: list[int], count: int) -> Array:
-    """Return values for all landmarks, nan for those that are not in the map."""
-    rows = np.full(count, np.nan)
-    rows[ids] = values
+def by_id(values: Array, ids: IntArray, count: int) -> Array:
+    """Return values (B, n) for all landmarks, nan for those that are not in the map."""
+    rows = np.full((len(ids), count), np.nan)
+    np.put_along_axis(rows, ids, values, axis=1)
     return rows
 
 

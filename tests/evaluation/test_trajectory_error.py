@@ -9,6 +9,7 @@ from slamgym.estimator.models.rigid_motion import rotation
 from slamgym.evaluation.trajectory_error import (
     Alignment,
     align_positions,
+    distances,
     ellipse_areas,
     exchanged_positions,
     landmark_covariances,
@@ -298,3 +299,14 @@ def test_a_few_others_that_are_far_off_leave_an_exchange_in_doubt():
     assert exchanged_positions(estimate, truth).cycles == ((0, 5),)
     estimate[[1, 2, 3]] += [(9.0, 1.0), (-3.0, 9.0), (-6.0, -9.0)]
     assert exchanged_positions(estimate, truth).cycles == ()
+
+
+def test_many_maps_at_once_have_the_distances_of_each():
+    rng = np.random.default_rng(3)
+    truth = 10 * rng.standard_normal((4, 6, 2))
+    estimates = truth + rng.standard_normal((4, 6, 2))
+    raw, aligned = distances(estimates, truth)
+    for row in range(4):
+        one = position_accuracy(estimates[row], truth[row])
+        assert raw[row].tolist() == one.raw_errors.tolist()
+        assert aligned[row].tolist() == one.aligned_errors.tolist()
