@@ -7,7 +7,8 @@ read the map of any of them.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import lru_cache, partial
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -197,6 +198,17 @@ def resume(estimator: Any, before: Any) -> None:
         estimator.resume(before)
     else:
         restore(estimator, before)
+
+
+@contextmanager
+def returned_on_error(estimator: Any) -> Iterator[None]:
+    """Return an estimator to its present state if the block raises an error."""
+    before = snapshot(estimator)
+    try:
+        yield
+    except Exception:
+        resume(estimator, before)
+        raise
 
 
 # --------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from functools import partial
 from itertools import islice
 from math import log
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,17 +32,14 @@ from ..association.scan_association import (
 from ..filters.pose_readings import PoseReading, observe_relative_pose
 from ..guards import argument_checks, saved_states
 from ..guards.argument_checks import LandmarkIds
+from ..guards.interrupts import Interruptible, changing
 from ..guards.saved_states import with_prefix, without_prefix
-from ..guards.undo import Undo, attributes, to_the_end, undo_all, undone_on_error
 from ..interface import (
-    Answer,
     Belief,
     MapView,
     ScanDecisions,
     SlamEstimator,
     UpdateReport,
-    advance,
-    bookmark,
     mapped_ids,
     marginal,
     optional_members,
@@ -59,6 +56,8 @@ from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy
 from .pruning import LandmarkRecords, MapPruner
 from .recent_scans import FedScans, RecentScans
+
+Result = TypeVar("Result")
 
 # `benchmarks/association.py` counts the bad runs that these limits decide.
 
@@ -80,7 +79,7 @@ NIL = 1e-12
 OVERLAP = 0.5
 
 
-class ManagedSlam:
+class ManagedSlam(Interruptible):
     """A filter of any kind that associates, confirms, removes and merges landmarks.
 
     A :class:`LandmarkPolicy` decides which landmark each reading belongs to, when a new
@@ -150,10 +149,9 @@ class ManagedSlam:
         at_rest = options.get("noise_at_rest", True)
         noise_of_motion = MotionNoise.checked(motion_std, at_rest, motion)
         self._settings = SharedSettings(policy, sensor, noise_of_motion)
-        #: The hypotheses, the most probable first.
-        self.hypotheses = [Hypothesis(first, self._settings)]
+        self._hypotheses = [Hypothesis(first, self._settings)]
         #: All hypotheses made so far, and those of them that are not in use.
-        self._made = self.hypotheses
+        self._made = self._hypotheses
         self._spare: list[Hypothesis] = []
         #: Number of steps taken.
         self.steps = 0
@@ -162,6 +160,12 @@ class ManagedSlam:
                 setattr(self, name, member)
 
     # The results, which are those of the most probable hypothesis.
+
+    @property
+    def hypotheses(self) -> list[Hypothesis]:
+        """The hypotheses, the most probable first."""
+        self.refuse_interrupted()
+        return self._hypotheses
 
     @property
     def best(self) -> Hypothesis:
@@ -221,23 +225,24 @@ class ManagedSlam:
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
-        self._change_best(lambda best: best.reset(pose, pose_std))
+        self._change_best("reset", lambda best: best.reset(pose, pose_std), anew=True)
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad], dt multiplies its noise variance."""
         reading = argument_checks.pair("odometry", odometry)
         if type(dt) is not float or dt != 1.0:
             argument_checks.duration(dt)
-        every, noise = self.hypotheses, self._settings.motion_noise
-        step = reading, dt, noise.motion.moved(reading)
-        self._carry_out(every, lambda k: every[k].predict(*step), lambda: None)
+        displacement = self._settings.motion_noise.motion.moved(reading)
+        with changing(self, "predict"):
+            self._step(lambda h: h.predict(reading, dt, displacement))
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
     ) -> UpdateReport:
         """Associate one scan, correct the belief with it, then prune the map.
 
-        A hypothesis whose filter fails is discarded, as long as another one succeeds.
+        A hypothesis whose filter refuses the scan is discarded, as long as another one
+        takes it.
 
         Parameters
         ----------
@@ -258,14 +263,13 @@ class ManagedSlam:
             all is then as before.
         """
         readings = argument_checks.scan(measurements)
-        views = (h.editor.bookmark() for h in self.hypotheses)
-        with undone_on_error(undo_all(*views, attributes(self)), unless_moved=self):
+        with self._changing("update"):
             if landmark_ids is None:
                 return self._take(self._branches(readings))
             ids = argument_checks.identities(landmark_ids, len(readings))
             given = [
                 Branch(h.cost, h, partial(h.as_given, readings, ids))
-                for h in self.hypotheses
+                for h in self._hypotheses
             ]
             return self._take(given)
 
@@ -285,18 +289,15 @@ class ManagedSlam:
             all is then as before.
         """
         given = PoseReading.checked(reading, matrix, covariance)
-        every = self.hypotheses
-        costs = [h.cost for h in every]
-
-        def then() -> UpdateReport:
-            reports, after = [h.report for h in every], costs
+        with changing(self, "observe_pose"):
+            every = self._hypotheses
+            costs = [h.cost for h in every]
+            reports = self._step(lambda h: h.observe_pose(given))
             if reports[0].degrees_of_freedom:
                 pairs = zip(costs, reports, strict=True)
-                after = [cost + cost_of(report) for cost, report in pairs]
-            ranked = sorted(zip(after, every, strict=True), key=itemgetter(0))
+                costs = [cost + cost_of(report) for cost, report in pairs]
+            ranked = sorted(zip(costs, every, strict=True), key=itemgetter(0))
             return self._take_over(ranked)
-
-        return self._carry_out(every, lambda k: every[k].observe_pose(given), then)
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise mapped landmarks by hand, shape (n,); all else stays.
@@ -304,7 +305,7 @@ class ManagedSlam:
         Only the best hypothesis continues.
         """
         ids = argument_checks.mapped_identities(landmark_ids, {*self.landmark_ids})
-        self._change_best(lambda best: best.remove(ids))
+        self._change_best("remove", lambda best: best.remove(ids))
 
     def merge(self, kept: int, gone: int) -> None:
         """Merge two mapped landmarks by hand; both identities then name the first.
@@ -312,7 +313,7 @@ class ManagedSlam:
         Only the best hypothesis continues.
         """
         argument_checks.two_landmarks(kept, gone, self.landmark_ids)
-        self._change_best(lambda best: best.merge(kept, gone))
+        self._change_best("merge", lambda best: best.merge(kept, gone))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of every hypothesis, as arrays."""
@@ -338,13 +339,13 @@ class ManagedSlam:
         costs = saved_states.read(state, table)["costs"].tolist()
         if not costs or costs[0] < 0 or costs != sorted(costs):
             raise ValueError(f"state['costs'] must be >= 0 and ascend, got {costs}")
-        with undone_on_error(self.bookmark()):
-            # In place, as far as possible: members of the filter are passed on.
-            missing = len(costs) - len(self.hypotheses)
-            fresh = [self._fresh() for _ in range(missing)]
-            loaded = [*self.hypotheses, *fresh][: len(costs)]
-            for k, hypothesis in enumerate(loaded):
-                hypothesis.load_state_dict(without_prefix(state, str(k)))
+        with self._changing("load_state_dict", anew=True):
+            # In place where there is one: members of its filter are passed on.
+            best = self._hypotheses[0]
+            self._spare = [h for h in self._made if h not in self._hypotheses]
+            loaded = [best, *(self._fresh() for _ in costs[1:])]
+            for k in reversed(range(len(costs))):  # last the one in use
+                loaded[k].load_state_dict(without_prefix(state, str(k)))
             self._take_over([*zip(costs, loaded, strict=True)])
 
     def snapshot(self) -> tuple[Any, ...]:
@@ -353,16 +354,13 @@ class ManagedSlam:
 
     def resume(self, before: tuple[Any, ...]) -> None:
         """Return to a :meth:`snapshot` of a filter with the same settings."""
-        kept, self.steps = before
-        for hypothesis in self.hypotheses:
-            hypothesis.recent.forget()
-        self._spare = self._made
-        self._take_over([(cost, self._resumed(own)) for cost, own in kept])
-
-    def bookmark(self) -> Undo:
-        """Return what takes back later calls, as far as no kernel has run."""
-        parts = (h.bookmark() for h in self.hypotheses)
-        return undo_all(*parts, attributes(self))
+        kept, steps = before
+        with changing(self, "resume", anew=True):
+            for hypothesis in self._hypotheses:
+                hypothesis.recent.forget()
+            self._spare = self._made
+            self._take_over([(cost, self._resumed(own)) for cost, own in kept])
+            self.steps = steps
 
     def __repr__(self) -> str:
         count = len(self.hypotheses)
@@ -373,7 +371,7 @@ class ManagedSlam:
 
     def _branches(self, readings: Array) -> list[Branch]:
         """Return the best associations of a scan, the cheapest first."""
-        every, policy = self.hypotheses, self.policy
+        every, policy = self._hypotheses, self.policy
         if policy.association != "hypotheses":
             return [Branch(h.cost, h, h.alternatives(readings)[0][1]) for h in every]
         astray = [h for h in every if h.is_astray(readings)]
@@ -415,28 +413,27 @@ class ManagedSlam:
 
     def _take(self, branches: Sequence[Branch]) -> UpdateReport:
         """Update filters by their associations, and continue with the best of them."""
-        errors: dict[int, Exception] = {}
         plans = [branch.complete() for branch in branches]
         every: list[Hypothesis] = []
         for _, h, _ in branches:  # copied where a hypothesis splits
             every.append(self._resumed(h.snapshot()) if h in every else h)
-
-        def take(k: int) -> None:
+        taken: list[tuple[float, Hypothesis, FedScans, UpdateReport]] = []
+        errors: list[Exception] = []
+        for branch, h, plan in zip(branches, every, plans, strict=True):
             try:
-                every[k].take(plans[k])
-            except (np.linalg.LinAlgError, MemoryError) as error:
-                errors[k] = error
-
-        def then() -> UpdateReport:
-            taken = [k for k in range(len(every)) if k not in errors]
-            if not taken:
-                raise errors[0]
-            kept = [(branches[k].cost + plans[k].price, every[k]) for k in taken]
-            kept.sort(key=itemgetter(0))
-            chosen = distinct([h for _, h in kept], self.policy.hypotheses)
-            return self._take_over([pair for pair in kept if pair[1] in chosen])
-
-        return self._carry_out(every, take, then)
+                taken.append((branch.cost, h, *h.feed(plan)))
+            except Exception as error:
+                errors.append(error)
+        if not taken:
+            raise errors[0]
+        self.steps += 1
+        kept: list[tuple[float, Hypothesis]] = []
+        for cost, h, fed, report in taken:
+            h.follow(fed, report)
+            kept.append((cost + fed.plan.price, h))
+        kept.sort(key=itemgetter(0))
+        chosen = distinct([h for _, h in kept], self.policy.hypotheses)
+        return self._take_over([pair for pair in kept if pair[1] in chosen])
 
     def _take_over(self, ranked: Sequence[tuple[float, Hypothesis]]) -> UpdateReport:
         """Continue with hypotheses and their costs, the best first; return its report.
@@ -449,8 +446,8 @@ class ManagedSlam:
         spare = [h for h in self._made if h not in used]
         for hypothesis in {*spare}.difference(self._spare):
             hypothesis.recent.forget()
-        self.hypotheses, self._spare = used, spare
-        return self.report()
+        self._hypotheses, self._spare = used, spare
+        return used[0].report
 
     def _fresh(self) -> Hypothesis:
         """Return a hypothesis that is not in use, in any state."""
@@ -466,38 +463,33 @@ class ManagedSlam:
         hypothesis.resume(before)
         return hypothesis
 
-    def _change_best(self, change: Callable[[Hypothesis], None]) -> None:
+    def _change_best(
+        self, call: str, change: Callable[[Hypothesis], None], *, anew: bool = False
+    ) -> None:
         """Change the best hypothesis; only this one continues."""
-        with undone_on_error(self.bookmark()):
-            change(self.best)
-            self._take_over([(0.0, self.best)])
+        with self._changing(call, anew=anew):
+            best = self._hypotheses[0]
+            change(best)
+            self._take_over([(0.0, best)])
 
-    def _carry_out(
-        self,
-        every: Sequence[Hypothesis],
-        step: Callable[[int], object],
-        then: Callable[[], Answer],
-    ) -> Answer:
-        """Take one step with each hypothesis; return what follows from all steps.
+    def _step(self, step: Callable[[Hypothesis], Result]) -> list[Result]:
+        """Take a step with every hypothesis; the first one refuses what all would."""
+        first, *others = self._hypotheses
+        results = [step(first)]
+        self.steps += 1
+        return results + [step(h) for h in others]
 
-        An interrupt finds no filter moved, or lets the others follow.
-        """
-        begun, steps = [h.steps for h in every], self.steps + 1
+    def _changing(self, call: str, *, anew: bool = False) -> changing:
+        """Return a block of changes; a refusal takes back what was viewed before it."""
+        every = self._hypotheses
+        views = [h.editor.viewed for h in every]
 
-        def finish() -> Answer:
-            for k, hypothesis in enumerate(every):
-                if hypothesis.steps == begun[k]:
-                    step(k)
-            answer = then()
-            self.steps = steps
-            return answer
+        def undo() -> None:
+            for hypothesis, viewed in zip(every, views, strict=True):
+                hypothesis.editor.viewed = viewed
+            self._spare = [h for h in self._made if h not in every]
 
-        try:
-            return finish()
-        except BaseException:
-            if begun != [h.steps for h in every]:
-                to_the_end(finish)
-            raise
+        return changing(self, call, undo, anew=anew)
 
 
 def filter_in(slam: SlamEstimator) -> SlamEstimator:
@@ -557,8 +549,6 @@ class Hypothesis:
         self.candidates = Candidates()
         #: The report of the last update.
         self.report = UpdateReport()
-        #: Number of steps taken.
-        self.steps = 0
 
     def map_view(self) -> MapView:
         """Return pose and map, without a copy where possible, until the next step."""
@@ -579,35 +569,21 @@ class Hypothesis:
         displacement: tuple[float, float, float],
     ) -> None:
         """Move by odometry (d, α), which is a displacement in the robot's frame."""
-        candidates = self.candidates
-        if len(candidates.tentative.seen):
+        self.filter.predict(reading, dt)
+        self.editor.expire()
+        tentative = self.candidates.tentative
+        if len(tentative.seen):
             variance = self.motion_noise.over(displacement, dt)
-            moved = candidates.tentative.moved(displacement, variance)
-            candidates = candidates._replace(tentative=moved)
-
-        def follow(_: object) -> None:
-            self.editor.expire()
-            self.candidates = candidates
-            self.recent.note_motions((*reading, dt))
-            self.steps += 1
-
-        step = partial(self.filter.predict, reading, dt)
-        undo = attributes(self, self.recent)
-        advance(self.filter, step, follow, undo, lambda: undo)
+            moved = tentative.moved(displacement, variance)
+            self.candidates = self.candidates._replace(tentative=moved)
+        self.recent.note_motions((*reading, dt))
 
     def observe_pose(self, given: PoseReading) -> UpdateReport:
         """Correct the belief with a reading of the pose."""
-
-        def follow(report: UpdateReport) -> UpdateReport:
-            self.editor.expire()
-            self.recent.note_motions(*given.rows())
-            self.report = report
-            self.steps += 1
-            return report
-
-        step = partial(taking_poses(self.filter).observe_pose, *given)
-        undo = attributes(self, self.recent)
-        return advance(self.filter, step, follow, undo, lambda: undo)
+        self.report = taking_poses(self.filter).observe_pose(*given)
+        self.editor.expire()
+        self.recent.note_motions(*given.rows())
+        return self.report
 
     def as_given(self, readings: Array, ids: Sequence[int]) -> ScanAssociation:
         """Associate readings (m, 2) by their identities, which must differ."""
@@ -677,19 +653,14 @@ class Hypothesis:
         self.recent.scans, self.recent.motions = [], ()
         return [part.report()]
 
-    def take(self, plan: ScanAssociation) -> UpdateReport:
-        """Correct the belief with a scan as associated, then prune the map."""
+    def feed(self, plan: ScanAssociation) -> tuple[FedScans, UpdateReport]:
+        """Correct the belief with a scan as associated; the filter may refuse it."""
         plan.missed = self.pruner.expected(plan.readings) - plan.explained
         fed = self.recent.with_scan(plan)
-        step, follow = partial(self.recent.feed, fed), partial(self._follow, fed)
-        if fed.first is None:
-            return advance(self.filter, step, follow, undo_all(), self.bookmark)
-        # The filter repeats its steps since a saved state, in new arrays.
-        with undone_on_error(self.bookmark()):
-            return follow(step())
+        return fed, self.recent.feed(fed)
 
-    def _follow(self, fed: FedScans, report: UpdateReport) -> UpdateReport:
-        """Do what follows an update of the filter; return the whole report."""
+    def follow(self, fed: FedScans, report: UpdateReport) -> UpdateReport:
+        """Do what follows :meth:`feed`, and prune the map; return the whole report."""
         plan = fed.plan
         self.recent.note_scan(fed, report)
         self.editor.expire()
@@ -709,7 +680,6 @@ class Hypothesis:
             tentative_rows=tuple(plan.tentative_rows),
             ambiguous_rows=tuple(plan.ambiguous_rows),
         )
-        self.steps += 1
         return self.report
 
     def remove(self, ids: list[int]) -> None:
@@ -731,29 +701,26 @@ class Hypothesis:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved state; an error leaves the hypothesis in any state."""
+        """Continue from a saved state; a refusal changes nothing."""
         candidates = Candidates.from_state_dict(without_prefix(state, "tentative"))
-        self.pruner.records.load_state_dict(without_prefix(state, "landmarks"))
-        self.recent.load_state_dict(without_prefix(state, "recent"))
+        records = LandmarkRecords()
+        records.load_state_dict(without_prefix(state, "landmarks"))
+        recent = self.recent.checked(without_prefix(state, "recent"))
         self.filter.load_state_dict(without_prefix(state, "filter"))
         self.editor.expire()
-        self.candidates, self.report = candidates, UpdateReport()
-
-    def bookmark(self) -> Undo:
-        """Return what takes back later calls, as far as no kernel has run."""
-        parts = self.recent.bookmark(), self.editor.bookmark()
-        own = attributes(self, self.pruner, self.pruner.records)
-        return undo_all(*parts, bookmark(self.filter), own)
+        self.candidates, self.pruner.records = candidates, records
+        self.recent.restore(recent)
+        self.report = UpdateReport()
 
     def snapshot(self) -> tuple[Any, ...]:
         """Return the present state, decisions included, for :meth:`resume`."""
-        kept = self.candidates, self.steps, self.report
+        kept = self.candidates, self.report
         parts = self.pruner.records.state(), self.recent.state()
         return snapshot(self.filter), *parts, *kept
 
     def resume(self, before: tuple[Any, ...]) -> None:
         """Return to a :meth:`snapshot` of another hypothesis of the same settings."""
-        inside, records, recent, self.candidates, self.steps, self.report = before
+        inside, records, recent, self.candidates, self.report = before
         resume(self.filter, inside)
         self.pruner.records.restore(records)
         self.recent.restore(recent)

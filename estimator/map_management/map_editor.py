@@ -10,7 +10,8 @@ Others may support some of these, each by itself:
 * ``merge(kept, gone)`` conditions on two landmarks being one, and removes the second;
 * ``merge_pairs(pairs)`` does so with several pairs by one measurement;
 * ``local_view(within)`` returns the pose and at least those landmarks that are within
-  this many metres of it, where a view of all of them takes long.
+  this many metres of it, where a view of all of them takes long;
+* ``viewed``, beside it, is what such views change, and takes an earlier value back.
 
 What a filter lacks goes through ``belief()``, ``state_dict()`` and
 ``load_state_dict()``.
@@ -27,13 +28,12 @@ import numpy as np
 from ...arrays import Array
 from ..filters.gaussian_map import without_landmarks
 from ..filters.pose_readings import coincide
-from ..guards.undo import Undo
 from ..interface import (
     MapView,
     SlamEstimator,
-    bookmark,
     hides_its_belief,
     restore,
+    returned_on_error,
     view_map,
 )
 
@@ -64,6 +64,8 @@ class MapEditor:
         self._within = 0.0
         #: Whether the filter can show only the landmarks around the robot.
         self.is_local = hasattr(slam, "local_view")
+        # That of a wrapper is a method of the filter inside.
+        self._viewer: Any = getattr(getattr(slam, "local_view", None), "__self__", None)
         wanted = ("remove", "merge") if merging else ("remove",)
         has_all = all(hasattr(slam, name) for name in wanted)
         self._has_methods = has_all and not hides_its_belief(slam)
@@ -93,17 +95,16 @@ class MapEditor:
         self._within = reach
         return self._view
 
-    def bookmark(self) -> Undo:
-        """Return what takes back later views, also where the filter notes them."""
-        if not self.is_local:
-            return self.expire
-        within, undo_slam = self._within, bookmark(self._slam)
+    @property
+    def viewed(self) -> tuple[float, Any]:
+        """What views change here, and in a filter that notes them."""
+        return self._within, getattr(self._viewer, "viewed", None)
 
-        def undo() -> None:
-            self._view, self._within = None, within
-            undo_slam()
-
-        return undo
+    @viewed.setter
+    def viewed(self, before: tuple[float, Any]) -> None:
+        self._view, (self._within, noted) = None, before
+        if noted is not None:
+            self._viewer.viewed = noted
 
     def expire(self) -> None:
         """Forget the view, since the filter has taken a step."""
@@ -124,9 +125,12 @@ class MapEditor:
             self._merge_in_state(pairs)
         elif hasattr(self._slam, "merge_pairs"):
             self._slam.merge_pairs(pairs)
+        elif len(pairs) == 1:
+            self._slam.merge(*pairs[0])
         else:
-            for kept, gone in pairs:
-                self._slam.merge(kept, gone)
+            with returned_on_error(self._slam):
+                for kept, gone in pairs:
+                    self._slam.merge(kept, gone)
 
     @cached_property
     def can_move(self) -> bool:

@@ -16,13 +16,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import Array
-from ...restorable import Restorable
+from ...restorable import Restorable, State
 from ..association.scan_association import LABEL_BITS, NO_LABEL, ScanAssociation
 from ..filters.pose_readings import PoseReading
 from ..guards import saved_states
 from ..guards.saved_states import with_prefix, without_prefix
-from ..guards.undo import Undo, attributes
-from ..interface import ScanDecisions, SlamEstimator, UpdateReport, restore
+from ..interface import (
+    ScanDecisions,
+    SlamEstimator,
+    UpdateReport,
+    restore,
+    returned_on_error,
+)
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy
 
@@ -63,17 +68,6 @@ class RecentScans(Restorable):
         #: About every scan since the start, or since a saved state was loaded.
         self.decisions: list[ScanDecisions] = []
 
-    def bookmark(self) -> Undo:
-        """Return what takes back later changes of what is remembered."""
-        undo_attributes, decisions = attributes(self), self.decisions
-        count, newest = len(decisions), decisions[-self._window - 1 :]
-
-        def undo() -> None:
-            decisions[count - len(newest) :] = newest
-            undo_attributes()
-
-        return undo
-
     def note_motions(self, *motions: Motion) -> None:
         """Remember odometry since the last scan, or rows of a reading of the pose."""
         if self._window:
@@ -108,14 +102,16 @@ class RecentScans(Restorable):
     def feed(self, fed: FedScans) -> UpdateReport:
         """Update the filter with the last scan, and with earlier sightings if any.
 
-        The scans are repeated until no sighting contradicts those before it.
+        The scans are repeated until no sighting contradicts those before it.  A refusal
+        changes nothing.
         """
         _, scans, first = fed
         if first is None:
             return scans[-1].feed(self._slam)
-        reports = self._repeat(scans, first)
-        while _drop_contradicted(fed, reports, self._gate):
+        with returned_on_error(self._slam):
             reports = self._repeat(scans, first)
+            while _drop_contradicted(fed, reports, self._gate):
+                reports = self._repeat(scans, first)
         return reports[-1]
 
     def note_scan(self, fed: FedScans, report: UpdateReport) -> None:
@@ -156,16 +152,15 @@ class RecentScans(Restorable):
             state |= with_prefix(str(k), scan.state_dict())
         return state
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
+    def checked(self, state: Mapping[str, Any]) -> State:
+        """Return what :meth:`state_dict` returned for `restore`, or refuse it."""
         saved = saved_states.read(state, WINDOW, "recent.")
         n, most = int(saved["count"]), self._window + 1
         if n > most:
             raise ValueError(f"state['recent.count'] must be at most {most}, got {n}")
         parts = [without_prefix(state, str(k)) for k in range(n)]
-        self.scans = [*map(RecentScan.from_state_dict, parts)]
-        self.motions = _as_tuples(saved["motions"].tolist())
-        self.decisions = []
+        scans = [*map(RecentScan.from_state_dict, parts)]
+        return [], scans, _as_tuples(saved["motions"].tolist())
 
 
 class FedScans(NamedTuple):

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,8 +11,7 @@ from numpy.typing import ArrayLike
 from .. import interface
 from ..filters.pose_readings import PoseReading
 from ..guards import argument_checks, saved_states
-from ..guards.undo import Undo, attributes, undo_all, undone_on_error
-from ..interface import bookmark
+from ..guards.interrupts import Interruptible, changing
 from ..map_management.map_editor import MapEditor
 from ..models.motions import UNICYCLE, Motion
 from ..models.sensors import Sensor
@@ -32,7 +30,7 @@ class Event(NamedTuple):
     arguments: tuple[Any, ...]
 
 
-class RecordedSlam:
+class RecordedSlam(Interruptible):
     """A filter that also records its drive, for the smoother.
 
     The drive receives the readings that the filter used.  Landmarks that the filter
@@ -81,7 +79,7 @@ class RecordedSlam:
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run and a new drive, at a pose (3,) known to (3,) [m, m, rad]."""
-        with undone_on_error(self.bookmark()):
+        with changing(self, "reset", anew=True):
             self._slam.reset(pose, pose_std)
             first, std = np.array(pose, dtype=float), np.array(pose_std, dtype=float)
             self._last = Event(None, "start_at", (first, std))
@@ -90,62 +88,46 @@ class RecordedSlam:
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move by odometry (d, α) [m, rad]; dt multiplies the noise variance."""
         motion = argument_checks.pair("odometry", odometry)
-        step = partial(self._slam.predict, motion, dt)
-
-        def record(_: object) -> None:
-            self._record("predict", motion, dt)
+        with changing(self, "predict"):
+            self._slam.predict(motion, dt)
             self.steps += 1
-
-        interface.advance(self._slam, step, record, undo_all(), self.bookmark)
+            self._record("predict", motion, dt)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: Sequence[int] | None = None
     ) -> interface.UpdateReport:
         """Update the filter with one scan, and record the readings that it used."""
-        step = partial(self._slam.update, measurements, landmark_ids)
-        then = partial(self._record_scan, measurements, landmark_ids)
-        return interface.advance(self._slam, step, then, undo_all(), self.bookmark)
+        with changing(self, "update"):
+            report = self._slam.update(measurements, landmark_ids)
+            self.steps += 1
+            decided = report.row_ids or (() if landmark_ids is None else landmark_ids)
+            unused = {*report.rejected_ids, *report.skipped_ids, None}
+            used = {row: i for row, i in enumerate(decided) if i not in unused}
+            readings = argument_checks.scan(measurements, self._columns)
+            self._record("update", readings[list(used)], list(used.values()))
+            for kept, gone in report.merged_ids:
+                self._record("merge", kept, gone)
+            if report.removed_ids:
+                self._record("forget", report.removed_ids)
+            self._report = report
+        return report
 
     def observe_pose(
         self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
     ) -> interface.UpdateReport:
         """Update the filter with a reading of the pose, and record it if it is used."""
         given = PoseReading.checked(reading, matrix, covariance)
-
-        def record(report: interface.UpdateReport) -> interface.UpdateReport:
+        with changing(self, "observe_pose"):
+            report = interface.taking_poses(self._slam).observe_pose(*given)
+            self.steps += 1
             if report.degrees_of_freedom:
                 self._record("observe_pose", *given)
             self._report = report
-            self.steps += 1
-            return report
-
-        step = partial(interface.taking_poses(self._slam).observe_pose, *given)
-        return interface.advance(self._slam, step, record, undo_all(), self.bookmark)
-
-    def _record_scan(
-        self,
-        measurements: ArrayLike,
-        landmark_ids: Sequence[int] | None,
-        report: interface.UpdateReport,
-    ) -> interface.UpdateReport:
-        decided = report.row_ids or (() if landmark_ids is None else landmark_ids)
-        unused = {*report.rejected_ids, *report.skipped_ids}
-        used = {
-            row: i for row, i in enumerate(decided) if i is not None and i not in unused
-        }
-        readings = argument_checks.scan(measurements, self._columns)
-        self._record("update", readings[list(used)], list(used.values()))
-        for kept, gone in report.merged_ids:
-            self._record("merge", kept, gone)
-        if report.removed_ids:
-            self._record("forget", report.removed_ids)
-        self._report = report
-        self.steps += 1
-        return report
+        return cast(interface.UpdateReport, report)
 
     def remove(self, landmark_ids: Sequence[int]) -> None:
         """Marginalise landmarks, and drop their readings from the drive."""
-        with undone_on_error(self.bookmark()):
+        with changing(self, "remove"):
             self._editor.remove(landmark_ids)
             self._record("forget", tuple(landmark_ids))
 
@@ -155,24 +137,27 @@ class RecordedSlam:
 
     def merge_pairs(self, pairs: Sequence[tuple[int, int]]) -> None:
         """Merge pairs (kept, gone) of landmarks, in the filter and in the drive."""
-        with undone_on_error(self.bookmark()):
+        with changing(self, "merge"):
             self._editor.merge_pairs(pairs)
             for kept, gone in pairs:
                 self._record("merge", kept, gone)
 
     def belief(self, landmark_ids: Sequence[int] | None = None) -> interface.Belief:
         """Return the filter's belief."""
+        self.refuse_interrupted()
         if landmark_ids is None:
             return self._slam.belief()
         return interface.marginal(self._slam, landmark_ids)
 
     def map_view(self) -> interface.MapView:
         """Return pose and map of the filter, until the next step."""
+        self.refuse_interrupted()
         return interface.view_map(self._slam)
 
     @property
     def landmark_ids(self) -> tuple[int, ...]:
         """The filter's landmarks, in the order of its belief."""
+        self.refuse_interrupted()
         return interface.mapped_ids(self._slam)
 
     def state_dict(self) -> dict[str, Any]:
@@ -181,6 +166,7 @@ class RecordedSlam:
         The object is of this process, so that a state takes no time that grows with the
         drive; `numpy.load` refuses it.
         """
+        self.refuse_interrupted()
         history = np.empty((), dtype=object)
         history[()] = self._last
         return self._slam.state_dict() | {HISTORY: history}
@@ -199,16 +185,13 @@ class RecordedSlam:
             raise ValueError(
                 f"state['{HISTORY}'] must be the events of a drive, got {history!r}"
             )
-        with undone_on_error(self.bookmark()):
+        with changing(self, "load_state_dict", anew=True):
             self._slam.load_state_dict(state)
             self._last, self._report = history.item(), interface.UpdateReport()
 
-    def bookmark(self) -> Undo:
-        """Return what takes back later calls, as far as no kernel has run."""
-        return undo_all(bookmark(self._slam), attributes(self))
-
     def report(self) -> interface.UpdateReport:
         """Return the report of the last update once more."""
+        self.refuse_interrupted()
         return self._report
 
     def __repr__(self) -> str:
@@ -219,6 +202,7 @@ class RecordedSlam:
 
     def _events(self) -> Iterator[Event]:
         """Yield the events in their order."""
+        self.refuse_interrupted()
         events: list[Event] = []
         event = self._last
         while event is not None:

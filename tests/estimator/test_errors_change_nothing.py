@@ -1,9 +1,10 @@
-"""A call that raises an error leaves every filter as it was."""
+"""A call that raises an error leaves every filter as it was; an interrupt marks it."""
 
 import comparison
 import numpy as np
 import pytest
 from inner_parts import map_of
+from interrupts import assert_whole
 
 from slamgym.estimator import list_estimators, make_estimator
 from slamgym.estimator.large_maps.sparse_information import sparse_information_slam
@@ -125,6 +126,28 @@ def test_an_insane_call_raises_a_plain_error_and_changes_nothing(name, managed):
         with pytest.raises((ValueError, np.linalg.LinAlgError)):
             call(slam)
         assert digest(slam) == before, label
+
+
+WRAPPED = [{"association": name, "confirm": (1, 2)} for name in ("joint", "hypotheses")]
+INTERRUPTED = [(name, policy) for name in list_estimators() for policy in WRAPPED]
+INTERRUPTED += [("smoother", False)]
+
+
+@pytest.mark.parametrize(("name", "managed"), INTERRUPTED)
+def test_an_interrupt_leaves_no_filter_mixed_without_a_mark(name, managed):
+    slam = driven(name, managed)
+    ids = [5, 6, 7, 8] if name == "smoother" else None
+    if managed and managed["association"] == "hypotheses":
+        for _ in range(6):
+            slam.predict((0.2, 0.1))
+        slam.update(READINGS)
+        assert len(slam.hypotheses) > 1
+
+    def some(total):
+        return np.linspace(0, total - 1, 14).astype(int).tolist()
+
+    for call in (lambda s: s.predict((0.2, 0.1)), lambda s: s.update(READINGS, ids)):
+        assert_whole(slam, call, marked=True, lines=some)
 
 
 @pytest.mark.parametrize("name", OPTIONS)

@@ -203,7 +203,7 @@ def test_only_scans_before_the_first_sighting_make_a_landmark_dear(confirm, dear
         readings = scan_at(np.array([scan - 6.0, 0.0, 0.0]))[: 5 if scan >= 6 else 4]
         _, complete = slam.best.alternatives(readings)[0]
         plan = complete()
-        slam.best.take(plan)
+        slam.best.follow(*slam.best.feed(plan))
         slam.predict((1.0, 0.0))
         prices.append(plan.price)
     assert np.flatnonzero(np.array(prices) > 1).tolist() == dear

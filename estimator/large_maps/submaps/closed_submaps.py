@@ -296,6 +296,15 @@ class Neighbourhood:
         self._reaches = [*self._reaches[:-1], max(within, self._reaches[-1])]
         return copy.slam.map_view()
 
+    @property
+    def viewed(self) -> tuple[Any, ...]:
+        """What :meth:`view` changes."""
+        return self._copy, self._steps, self._reaches
+
+    @viewed.setter
+    def viewed(self, before: tuple[Any, ...]) -> None:
+        self._copy, self._steps, self._reaches = before
+
     def bookmark(self) -> Undo:
         """Return what takes back later changes, but for the steps of the filter.
 

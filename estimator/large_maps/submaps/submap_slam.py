@@ -358,6 +358,15 @@ class SubmapSlam:
         """Memory of submaps and joined map [bytes]."""
         return self._graph.closed.nbytes + self._neighbourhood.nbytes
 
+    @property
+    def viewed(self) -> tuple[Any, ...]:
+        """What :meth:`local_view` changes; an earlier value takes its calls back."""
+        return self._neighbourhood.viewed
+
+    @viewed.setter
+    def viewed(self, before: tuple[Any, ...]) -> None:
+        self._neighbourhood.viewed = before
+
     def bookmark(self) -> Undo:
         """Return what takes back later calls, as far as no kernel has run."""
         return undo_all(
