@@ -447,7 +447,7 @@ SOURCES = {
         "Brossard, Barrau, Bonnabel: Exploiting symmetries, IEEE Sensors J. 2019",
         symmetries,
         "From the published data of figures 2 and 3. The NEES there jumps between 0.4 "
-        "and 5 from one step to the next, so the data are of one run, not of 100: the "
+        "and 5 from one step to the next, so the data show one run, not 100: the "
         "interval is that of a single run.",
     ),
     "bailey": Source(
