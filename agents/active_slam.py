@@ -158,6 +158,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
     changing = (*LandmarkWorldEnv.changing, "task", "_explorers")
+    fixed = (*LandmarkWorldEnv.fixed, "walls")
 
     def __init__(
         self,
@@ -348,9 +349,8 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
     def _seen(self) -> Observations:
         return self.task.observations()
 
-    def _infos(self) -> dict[str, Any]:
-        landmarks, ended = self._worlds.complex_landmarks, self._ended
-        return super()._infos() | self._explorers.infos(landmarks, ended)
+    def _more_infos(self) -> dict[str, Any]:
+        return self._explorers.infos(self._worlds.complex_landmarks, self._ended)
 
 
 # --------------------------------------------------------------------------------------

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from operator import getitem
+from operator import attrgetter, getitem
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -17,7 +18,10 @@ from numpy.typing import ArrayLike
 from ..arrays import AnyArray, Array, ComplexArray, ImageArray, WordArray
 from ..restorable import Restorable, State, refuse_other_state
 from ..sim_configs import Scenario, load_scenario
+from ..sim_configs.field_types import short_repr
+from ..sim_configs.landmarks_and_controls import possible_positions
 from ..sim_configs.scenario import plain, refuse_unknown_keywords
+from ..suggestions import closest
 from .bearing_range import BearingRangeSensor, hide_identities
 from .drives import drive_of
 from .noise_streams import NoiseRows, PoseSensors, WorldNoise, row_of
@@ -32,6 +36,7 @@ if TYPE_CHECKING:
 Observation = dict[str, Any]
 
 OF_A_WORLD = "of a world"  # in messages
+_OPTIONS = "pose", "landmarks", "scenario"
 _FPS = 30
 
 
@@ -73,7 +78,13 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
     ``scenario.start.pose``. Either the true start or the start pose of a filter
     (`start_estimate`) is drawn around it. A random layout without its own seed places
     new landmarks in every episode. Ranges (``randomise``) draw noise, sensor and start
-    anew, see `drawn_scenario`.
+    anew, see `drawn_scenario`. The options of `reset` change one episode:
+
+    | option | content |
+    |---|---|
+    | ``pose`` | (x, y, θ) in place of ``scenario.start.pose`` [m, m, rad] |
+    | ``landmarks`` | positions of all N landmarks, shape (N, 2) [m] |
+    | ``scenario`` | a world for the same robot, with readings of the same form |
 
     ## Episode End
     Never terminated; truncated after ``scenario.steps`` steps.
@@ -110,8 +121,13 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         *("_np_random", "_body", "_motion_noise", "_sensor_noise", "_renderer"),
     )
     replaced = (
-        *("_np_random_seed", "_drawn_scenario", "_sensor", "_starts", "_key"),
+        *("_drawn_scenario", "_np_random_seed", "_key"),
         *("_landmarks", "_start_estimate", "_steps_left", "scenario"),
+    )
+    #: What the worlds of all episodes have in common.
+    fixed: ClassVar[tuple[str, ...]] = (
+        *("dt", "steps", "robot", "compass", "gps", "landmarks.count"),
+        *("sensor.kind", "sensor.identities", "sensor.max_clutter"),
     )
     _spec: EnvSpec | None = None
 
@@ -136,11 +152,11 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         self._limits = robot.max_speed, robot.max_turn_rate
         self._drive = drive_of(robot)
         self._body = UnicycleBody(robot.radius, self.scenario.walls, self._drive)
-        self._odometer = OdometrySensor(self.scenario)
         self._pose_sensors = PoseSensors(self.scenario)
         self._key: WordArray = np.zeros((1, 2), dtype=np.uint64)
         self._hides_identities = not self.scenario.sensor.identities
         self._landmarks: ComplexArray = np.empty(0, dtype=np.complex128)
+        self._drawn_scenario = self.scenario
         self._adopt(self.scenario)
 
     @property
@@ -162,22 +178,24 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         seed : int >= 0, optional
             Seed of all randomness in this episode and the following ones.
         options : dict, optional
-            Must be empty.
+            ``pose``, ``landmarks`` and ``scenario`` of this episode.
 
         Raises
         ------
         ValueError
-            If there is an option.
+            If an option is unknown or malformed, or the readings would not fit the
+            observation space. The episode before it then continues.
         """
-        if options:
-            raise ValueError(f"options must be empty, got {options!r}")
+        world, changes = self._asked(options) if options else (self.scenario, {})
         super().reset(seed=seed)
         self._key = key = episode_keys([self.np_random])
-        has_ranges = self.scenario.randomise is not None
-        if has_ranges:
-            self._adopt(drawn_scenarios(self.scenario, key)[0])
-        redraws = has_ranges or self._starts.redraws_landmarks
-        if redraws or len(self._landmarks) == 0:
+        drawn = drawn_scenarios(world, key)[0]
+        if changes and drawn is not world:  # ranges have changed them once more
+            drawn = drawn.with_changes(**changes)
+        is_new = drawn is not self._drawn_scenario
+        if is_new:
+            self._adopt(drawn)
+        if is_new or self._starts.redraws_landmarks or len(self._landmarks) == 0:
             self._landmarks = self._starts.landmarks(key)
         poses, estimates = self._starts.poses(key)
         self._body.place(poses[0].tolist())
@@ -186,7 +204,7 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         self._sensor_noise.begin(key, first=0)
         self._steps_left = self.scenario.steps
         if self._renderer is not None:
-            self._renderer.begin(self.landmarks)
+            self._renderer.begin(self.landmarks, world)
         return self._observe(odometry=np.zeros(2), collision=False)
 
     def step(
@@ -252,6 +270,9 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         refuse_other_state(self, state, len(self.changing) + len(self.replaced))
         scenario = state[len(self.changing) + self.replaced.index("scenario")]
         refuse_other_world(self.scenario, scenario)
+        drawn = state[len(self.changing) + self.replaced.index("_drawn_scenario")]
+        if drawn is not self._drawn_scenario:
+            self._adopt(drawn)
         super().restore(state)
 
     def render(self) -> ImageArray | None:
@@ -272,9 +293,32 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         if self._renderer is not None:
             self._renderer.close()
 
+    def _asked(self, options: Mapping[str, Any]) -> tuple[Scenario, dict[str, Any]]:
+        """Return the world that options of `reset` ask for, and how they change it."""
+        for name in options:
+            if name not in _OPTIONS:
+                known = ", ".join(_OPTIONS)
+                hint = closest(name, _OPTIONS)
+                raise ValueError(f"options may hold {known}, got '{name}'{hint}")
+        changes: dict[str, Any] = {}
+        if "pose" in options:
+            changes["start"] = {"pose": _numbers("pose", options["pose"], (3,))}
+        if "landmarks" in options:
+            shape = self.scenario.landmarks.count, 2
+            points = _numbers("landmarks", options["landmarks"], shape)
+            changes["landmarks"] = {"layout": "points", "points": points}
+        world = load_scenario(options.get("scenario", self.scenario))
+        world = world.with_changes(**changes)
+        refuse_other_spaces(self.scenario, world, self.fixed)
+        return world, changes
+
     def _adopt(self, scenario: Scenario) -> None:
-        """Take the settings that an episode draws from a scenario."""
+        """Take the settings of an episode from its scenario."""
+        if self._drawn_scenario.walls != scenario.walls:
+            radius = self.scenario.robot.radius
+            self._body = UnicycleBody(radius, scenario.walls, self._drive)
         self._drawn_scenario = scenario
+        self._odometer = OdometrySensor(scenario)
         self._sensor = BearingRangeSensor(scenario)
         self._starts = EpisodeStarts(scenario)
         noise = WorldNoise(scenario)
@@ -344,6 +388,47 @@ def plain_spec(spec: EnvSpec, steps: int) -> EnvSpec:
     if isinstance(path := kwargs.get("scenario"), Path):
         kwargs["scenario"] = str(path)
     return replace(spec, kwargs=kwargs, max_episode_steps=length)
+
+
+def _numbers(name: str, value: object, shape: tuple[int, ...]) -> list[Any]:
+    """Return an option of `reset` as lists of finite numbers."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(
+            f"options['{name}'] must be finite numbers of shape {shape}, "
+            f"got {short_repr(value)}"
+        )
+    numbers: list[Any] = array.tolist()
+    return numbers
+
+
+def refuse_other_spaces(own: Scenario, asked: Scenario, fixed: Sequence[str]) -> None:
+    """Refuse the world of an episode that differs in what is fixed, or in its spaces.
+
+    Without a finite range, the readings at the start have to fit.
+    """
+    for name in fixed:
+        needed, given = map(attrgetter(name), (own, asked))
+        if needed != given:
+            raise ValueError(
+                f"options['scenario'] must have {name} = {short_repr(needed)}, as the "
+                f"environment, got {short_repr(given)}"
+            )
+    if math.isinf(asked.sensor.max_range):
+        away = possible_positions(asked.landmarks) - asked.start.pose[:2]
+        reach = max(asked.sensor.min_range + 1.0, np.linalg.norm(away, axis=1).max())
+        asked = asked.with_changes(sensor={"max_range": float(reach)})
+    spaces = observation_space(own), observation_space(asked)
+    for name in ("landmarks", "odometry"):
+        most, given = (float(np.max(space[name].high)) for space in spaces)
+        if given > most:
+            raise ValueError(
+                f"options must keep '{name}' in the observation space, up to "
+                f"{most:.6g}, got {given:.6g}"
+            )
 
 
 def refuse_other_world(own: Scenario, other: Scenario) -> None:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 EstimatorFactory: TypeAlias = "Callable[..., SlamEstimator]"
 _NOISE = ("motion_std", "measurement_std", "initial_pose", "initial_pose_std")
+_OTHERS = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
 _REFUSED = re.compile(r"(?:unexpected keyword argument|no option) '(\w+)'")
 
 _factories: dict[str, EstimatorFactory | str] = {}  # or where to import it from
@@ -190,9 +191,9 @@ def with_sensor(
     factory: EstimatorFactory, options: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return options with the numbers of the sensor's noise as part of the sensor."""
-    named = inspect.signature(factory).parameters
-    numbers = {name for name in NUMBERS if name in options and name not in named}
-    if not (numbers and accepted_options(factory, {"sensor": None})):
+    names, passes_others = _keywords(factory)
+    numbers = {name for name in NUMBERS if name in options and name not in names}
+    if not (numbers and ("sensor" in names or passes_others)):
         return dict(options)
     others = {name: value for name, value in options.items() if name not in numbers}
     read = {name: options[name] for name in ("sensor", *numbers) if name in options}
@@ -265,24 +266,24 @@ def _unknown_option(
 
 def _known_options(factory: EstimatorFactory) -> list[str]:
     """Return the options of a factory, and of the classes that get its others."""
-    if not isinstance(factory, type):
-        return _keywords(factory)[0]
-    names: list[str] = []
-    for maker in (*factory.__mro__[:-1], ekf.EkfSlam):  # the base filter of a large map
-        own, passes_others = _keywords(maker)
-        own += NUMBERS if "sensor" in own else ()
-        names += [name for name in own if name not in names]
+    makers = [factory]
+    if isinstance(factory, type):  # the base filter of a large map is an `EkfSlam`
+        makers = [*factory.__mro__[:-1], ekf.EkfSlam]
+    known: list[str] = []
+    for maker in makers:
+        names, passes_others = _keywords(maker)
+        names += NUMBERS if "sensor" in names else ()
+        known += [name for name in names if name not in (*_NOISE, *known)]
         if not passes_others:
             break
-    return names
+    return known
 
 
 def _keywords(factory: Callable[..., Any]) -> tuple[list[str], bool]:
-    """Return the options that a signature names, and whether it takes any other."""
-    parameters = inspect.signature(factory).parameters.values()
-    named = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
-    passes_others = any(p.kind is p.VAR_KEYWORD for p in parameters)
-    return [name for name in named if name not in _NOISE], passes_others
+    """Return the keywords that a signature names, and whether it takes any other."""
+    kinds = {p.name: p.kind for p in inspect.signature(factory).parameters.values()}
+    names = [name for name, kind in kinds.items() if kind not in _OTHERS]
+    return names, _OTHERS[1] in kinds.values()
 
 
 def accepted_options(
@@ -296,13 +297,9 @@ def accepted_options(
     >>> accepted_options(EkfSlam, {"min_range": 0.1, "colour": "red"})
     {'min_range': 0.1}
     """
-    parameters = inspect.signature(factory).parameters.values()
-    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
-        return dict(options)
-    known = {parameter.name for parameter in parameters}
-    if "sensor" in known:
-        known.update(NUMBERS)
-    return {key: value for key, value in options.items() if key in known}
+    names, passes_others = _keywords(factory)
+    names += NUMBERS if "sensor" in names else ()
+    return {k: v for k, v in options.items() if passes_others or k in names}
 
 
 def _inside(path: str) -> str:

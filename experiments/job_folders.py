@@ -217,7 +217,7 @@ def _end_with(engaging: int) -> None:
 def _watch(engaging: int) -> None:
     while os.getppid() == engaging:
         time.sleep(_PATIENCE)
-    os._exit(1)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 # --------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ class EpisodeRenderer(Restorable):
         Largest number of frames per second in the window [1/s].
     """
 
-    changing = ("_landmarks", "_path", "_present", "_belief")
+    changing = ("_landmarks", "_path", "_present", "_belief", "_scenario")
 
     def __init__(self, scenario: Scenario, mode: str, fps: float) -> None:
         if mode not in RENDER_MODES:
@@ -47,22 +47,27 @@ class EpisodeRenderer(Restorable):
         self._fps = fps
         self._renderer: WorldRenderer | None = None
         self._landmarks: Array = np.empty((0, 2))
-        self.begin(self._landmarks)
+        self.begin(self._landmarks, scenario)
 
-    def begin(self, landmarks: Array) -> None:
-        """Start an episode with these landmarks, (N, 2) [m]."""
-        if not np.array_equal(landmarks, self._landmarks):
-            self.close()
-        self._landmarks = landmarks
+    def begin(self, landmarks: Array, scenario: Scenario) -> None:
+        """Start an episode in a world with these landmarks, (N, 2) [m]."""
+        self._close_unless((landmarks, scenario))
+        self._landmarks, self._scenario = landmarks, scenario
         self._path: list[list[float]] = []
         self._present: dict[str, Any] = {}
         self._belief: BeliefLike | None = None
 
     def restore(self, state: State) -> None:
         """Return to an earlier step, perhaps of another episode."""
-        shown = self._landmarks
+        shown = self._landmarks, self._scenario
         super().restore(state)
-        if not np.array_equal(shown, self._landmarks):
+        self._close_unless(shown)
+
+    def _close_unless(self, shown: tuple[Array, Scenario]) -> None:
+        """Close the figure, unless it shows this map of this world."""
+        landmarks, scenario = shown
+        is_same = scenario is self._scenario or scenario == self._scenario
+        if not (is_same and np.array_equal(landmarks, self._landmarks)):
             self.close()
 
     def add(

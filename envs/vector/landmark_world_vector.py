@@ -316,7 +316,7 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
         if self._renderers:
             landmarks = self._worlds.landmarks
             for world in np.flatnonzero(worlds).tolist():
-                self._renderers[world].begin(landmarks[world])
+                self._renderers[world].begin(landmarks[world], self.scenario)
             self._show(worlds)
 
     def _show(self, worlds: BoolArray) -> None:
@@ -361,7 +361,11 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
             infos["landmark_ids"] = worlds.landmark_ids
         if worlds.pose_readings is not None:
             infos |= worlds.pose_sensors.by_name(worlds.pose_readings)
-        return infos
+        return infos | self._more_infos()
+
+    def _more_infos(self) -> Infos:
+        """Return what a subclass adds."""
+        return {}
 
     def _begun_worlds(self) -> WorldBatch:
         if not self._worlds.begun:
@@ -415,7 +419,9 @@ def checked_reset_mask(options: dict[str, Any] | None, count: int) -> BoolArray 
         return None
     unknown = set(options) - {"reset_mask"}
     if unknown:
-        raise ValueError(f"options may hold 'reset_mask' alone, got {sorted(unknown)}")
+        raise ValueError(
+            f"options of many worlds may hold 'reset_mask' alone, got {sorted(unknown)}"
+        )
     mask = options["reset_mask"]
     if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
         raise TypeError(f"reset_mask must be a bool ndarray, got {mask!r}")

@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from numba import njit
 
-from .jit import Kernel, KernelCache, kept
+from .jit import Kernel, kept
 
 #: Libraries whose versions count in the digest, not their sources.
 LIBRARIES = ("builtins", "math", "numba", "numpy")
@@ -69,7 +69,7 @@ def _recompiled(function: Any, like: Any) -> Any:
     """Compile a function with the options of another one."""
     options = {k: v for k, v in like.targetoptions.items() if k != "nopython"}
     kernel = njit(**options)(function)
-    return kept(kernel) if isinstance(like._cache, KernelCache) else kernel
+    return kept(kernel) if "_nrt" in options else kernel  # else not one of `.jit`
 
 
 def _parts_of(value: Any, seen: set[int]) -> Iterator[bytes]:

@@ -460,13 +460,82 @@ def test_wrong_settings_are_refused_by_name(changes, message):
         make(**changes)
 
 
-def test_options_are_refused_and_leave_the_episode_alone():
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"pse": 1}, r"options may hold pose, .*, got 'pse'; did you mean 'pose'"),
+        ({"pose": (0, 1)}, r"\['pose'\] must be finite numbers of shape \(3,\), got"),
+        ({"pose": "here"}, r"\['pose'\] must be finite numbers .*, got 'here'"),
+        ({"pose": (np.nan, 0, 0)}, r"\['pose'\] must be finite"),
+        ({"pose": (9e4, 0, 0)}, "keep 'landmarks' in the observation space, up to"),
+        ({"landmarks": [[1, 2]]}, r"\['landmarks'\] must be .* of shape \(30, 2\)"),
+        ({"scenario": "nowhere"}, "scenario must be a preset"),
+        ({"scenario": "loop"}, r"\['scenario'\] must have dt = 0.5, as the env.* 1.0"),
+    ],
+)
+def test_wrong_options_are_refused_and_leave_the_episode_alone(options, message):
     env, twin = make(), make()
     episode(env, count=3)
     episode(twin, count=3)
-    with pytest.raises(ValueError, match=r"options must be empty, got \{'pose'"):
-        env.reset(seed=9, options={"pose": (0, 0, 0)})
+    with pytest.raises(ValueError, match=message):
+        env.reset(seed=9, options=options)
     assert_same([env.step([1, 0])[::4]], [twin.step([1, 0])[::4]])
+    assert_same(episode(env, seed=None), episode(twin, seed=None))
+
+
+def test_an_option_of_reset_equals_the_setting_for_one_episode():
+    places = np.random.default_rng(1).uniform(-8, 8, (30, 2))
+    walled = load_scenario("six_landmarks").with_changes(**ROAMING, walls=WALLS)
+    start = {"start": {"pose": (1.0, 2.0, 0.5), "std": (0.1, 0.1, 0.1)}}
+    points = {"landmarks": {"layout": "points", "points": places}}
+    for options, changes in (
+        ({"pose": np.array([1.0, 2.0, 0.5])}, start),
+        ({"landmarks": places}, points),
+        ({"scenario": walled.with_changes(sensor={"dropout": 0.3})},
+         {"walls": WALLS, "sensor": {"dropout": 0.3}}),
+        ({"scenario": walled, "landmarks": places}, {"walls": WALLS, **points}),
+    ):  # fmt: skip
+        own = {"start": {"std": (0.1, 0.1, 0.1)}} if "pose" in options else {}
+        env, twin = make(**own), make(**{**own, **changes})
+        assert_same(episode(env, 5), episode(make(**own), 5))
+        moments = [env.reset(seed=7, options=options)]
+        moments += [env.step(action)[::4] for action in actions(100)]
+        assert_same(moments, episode(twin))
+        assert_same(episode(env), episode(make(**own)))  # the next one is as before
+
+
+def test_options_of_reset_replace_what_ranges_draw():
+    env = make(randomise={"start_x": (-5.0, -4.0), "landmark_shift": 0.5},
+               landmarks={"layout": "points", "points": [(2.0, 1.0), (3.0, 0.0)]},
+               start={"std": (0.0, 0.0, 0.0)})  # fmt: skip
+    _, info = env.reset(seed=1, options={"pose": (1, 0, 0), "landmarks": np.eye(2)})
+    assert info["pose"].tolist() == [1, 0, 0]
+    assert env.landmarks.tolist() == np.eye(2).tolist()
+    assert -5 <= env.reset()[1]["pose"][0] <= -4
+
+
+def test_a_state_of_an_episode_with_options_can_be_restored():
+    env = make()
+    walled = env.scenario.with_changes(walls=WALLS, motion={"std": (0.2, 0.2, 0.2)})
+    env.reset(seed=3, options={"scenario": walled, "pose": (0, 0, 0.1)})
+    state = env.state()
+    ahead = [env.step([1.0, 0.0])[::4] for _ in range(20)]
+    assert any(info["collision"] for _, info in ahead)
+    env.reset()
+    env.restore(state)
+    assert_same([env.step([1.0, 0.0])[::4] for _ in range(20)], ahead)
+
+
+def test_a_frame_shows_the_walls_of_the_option():
+    walled = load_scenario("six_landmarks").with_changes(**ROAMING, walls=WALLS)
+    env, twin = (make(render_mode="rgb_array", **w) for w in ({}, {"walls": WALLS}))
+    env.reset(seed=3)
+    before = env.render()
+    env.reset(seed=3, options={"scenario": walled})
+    twin.reset(seed=3)
+    np.testing.assert_array_equal(env.render(), twin.render())
+    env.reset(seed=3)
+    np.testing.assert_array_equal(env.render(), before)
 
 
 @pytest.mark.parametrize(
