@@ -484,8 +484,8 @@ def choose_filters(
     """
     if not isinstance(estimator, str):
         raise ValueError(
-            "estimator must be a registered name for vector environments, "
-            f"got {estimator!r}"
+            "estimator must be a name for vector environments, 'module:Class' or one "
+            f"that register_estimator gives to a class, got {estimator!r}"
         )
     if not scenario.sensor.identities:
         filters = [

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter, getitem
 from pathlib import Path
+from reprlib import repr as short_repr
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
@@ -18,7 +19,6 @@ from numpy.typing import ArrayLike
 from ..arrays import AnyArray, Array, ComplexArray, ImageArray, WordArray
 from ..restorable import Restorable, State, refuse_other_state
 from ..sim_configs import Scenario, load_scenario
-from ..sim_configs.field_types import short_repr
 from ..sim_configs.landmarks_and_controls import possible_positions
 from ..sim_configs.scenario import plain, refuse_unknown_keywords
 from ..suggestions import closest
@@ -423,7 +423,8 @@ def refuse_other_spaces(own: Scenario, asked: Scenario, fixed: Sequence[str]) ->
         asked = asked.with_changes(sensor={"max_range": float(reach)})
     spaces = observation_space(own), observation_space(asked)
     for name in ("landmarks", "odometry"):
-        most, given = (float(np.max(space[name].high)) for space in spaces)
+        bounds: list[Any] = [space[name] for space in spaces]
+        most, given = (float(each.high.max()) for each in bounds)
         if given > most:
             raise ValueError(
                 f"options must keep '{name}' in the observation space, up to "

@@ -5,13 +5,14 @@ mistakes of a scenario become one `ScenarioError`.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from reprlib import repr as short_repr
 from typing import Annotated, Any, Self, cast
 
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     StrictBool,
@@ -98,6 +99,13 @@ def _expected(
             "must be {expected}, got {got}",
             {"expected": expectation, "got": short_repr(value)},
         ) from None
+
+
+def kind_in(key: str) -> BeforeValidator:
+    """Refuse a table without its kind as one of an unknown kind, which lists all."""
+    return BeforeValidator(
+        lambda value: {key: "", **value} if isinstance(value, Mapping) else value
+    )
 
 
 def _within_bounds(value: Any) -> Any:
@@ -263,7 +271,7 @@ def _line(details: dict[str, Any]) -> str:
             return f"{path} {details['msg']}"
         case "rule":
             return f"{path}.{details['msg']}" if path else str(details["msg"])
-        case "union_tag_not_found" | "union_tag_invalid":
+        case "union_tag_invalid":
             return _unknown_tag(path, context)
     expected = _CONTAINERS.get(kind, f"valid ({details['msg']})")
     return f"{path or 'scenario'} must be {expected}, got {details['input']!r}"
@@ -271,9 +279,9 @@ def _line(details: dict[str, Any]) -> str:
 
 def _unknown_tag(path: str, context: dict[str, Any]) -> str:
     field = f"{path}.{context['discriminator'].strip(chr(39))}"
-    if "tag" not in context:
-        return f"{field} must be given"
     names = [name.strip().strip("'") for name in context["expected_tags"].split(",")]
+    if not context["tag"]:
+        return f"{field} must be given, one of {', '.join(names)}"
     return unknown_choice(field, context["tag"], names)
 
 

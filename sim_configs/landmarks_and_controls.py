@@ -23,6 +23,7 @@ from .field_types import (
     ScenarioTable,
     Seed,
     broken_rule,
+    kind_in,
     setting,
 )
 
@@ -208,6 +209,7 @@ LandmarkLayout = Annotated[
     | StreetsLayout
     | RandomLayout,
     Field(discriminator="layout"),
+    kind_in("layout"),
 ]
 
 
@@ -400,6 +402,7 @@ ControlSequence = Annotated[
     | SpiralSequence
     | BlocksSequence,
     Field(discriminator="sequence"),
+    kind_in("sequence"),
 ]
 
 

@@ -375,8 +375,16 @@ def test_wrong_arguments_are_refused(name, estimator, options, message):
     ("scenario", "estimator", "message"),
     [
         ("loop", "unscented", "cannot run in batches"),
-        ("loop", EkfSlam, "estimator must be a registered name"),
-        ("hidden_identities", EkfSlam, "estimator must be a registered name"),
+        (
+            "loop",
+            EkfSlam,
+            "estimator must be a name for .* that register_estimator gives",
+        ),
+        (
+            "hidden_identities",
+            EkfSlam,
+            "estimator must be a name for .* that register_estimator gives",
+        ),
     ],
 )
 def test_an_estimator_that_many_worlds_cannot_take_is_refused(

@@ -516,7 +516,7 @@ def test_options_of_reset_replace_what_ranges_draw():
 
 def test_a_state_of_an_episode_with_options_can_be_restored():
     env = make()
-    walled = env.scenario.with_changes(walls=WALLS, motion={"std": (0.2, 0.2, 0.2)})
+    walled = env.scenario.with_changes(walls=WALLS, motion={"std": (0.1, 0.1, 0.0)})
     env.reset(seed=3, options={"scenario": walled, "pose": (0, 0, 0.1)})
     state = env.state()
     ahead = [env.step([1.0, 0.0])[::4] for _ in range(20)]

@@ -208,7 +208,10 @@ def test_what_does_not_fit_together_is_refused(changes, message):
 def test_a_layout_without_its_name_is_refused():
     table = load_scenario("six_landmarks").model_dump()
     del table["landmarks"]["layout"]
-    assert mistake(table) == "landmarks.layout must be given"
+    assert mistake(table) == (
+        "landmarks.layout must be given, one of points, grid, ring, corridor, streets, "
+        "random"
+    )
 
 
 def test_integers_stand_for_floats_and_become_floats():
