@@ -243,7 +243,9 @@ def honesty(trace: RunTrace) -> str:
 
 
 _ROWS = (("x error [m]", "x"), ("y error [m]", "y"), ("θ error [rad]", "θ"))
-_LOG_FROM = 8.0  # times the band's upper bound: larger NIS needs a logarithmic axis
+#: Times the band's upper bound, or parts of its lower one: NIS beyond, the largest or
+#: the median, needs a logarithmic axis.
+_LOG_FROM = 8.0
 
 
 def errors_figure(trace: RunTrace) -> Figure:
@@ -335,9 +337,13 @@ def _draw_nis(axes: Axes, trace: RunTrace) -> None:
         return
     share = np.mean(inside[used])
     style.write_title(axes, f"NIS: {share:.0%} of the steps in the 95% band", size=10)
-    if trace.nis[used].max() > _LOG_FROM * np.nanmax(upper):
+    nis, least = trace.nis[used], float(np.nanmin(lower))
+    if nis.max() > _LOG_FROM * np.nanmax(upper):
         axes.set_yscale("log")
-        axes.set_ylim(bottom=max(0.3 * float(np.nanmin(lower)), 1e-3))
+        axes.set_ylim(bottom=max(0.3 * least, 1e-3))
+    elif nis.any() and _LOG_FROM * np.median(nis) < least:
+        axes.set_yscale("log")
+        axes.set_ylim(bottom=0.3 * float(nis[nis > 0].min()))
     else:
         axes.set_ylim(bottom=-0.03 * axes.get_ylim()[1])  # markers at 0 are whole
     _legend_above(axes, columns=3)

@@ -530,6 +530,9 @@ def test_without_true_poses_only_the_nis_is_drawn():
 def test_nis_far_off_gets_a_logarithmic_axis():
     far = np.where(np.arange(13) == 5, 1e5, 6.0)
     assert errors_figure(make_trace(nis=far)).axes[-1].get_yscale() == "log"
+    axes = errors_figure(make_trace(nis=np.linspace(0.0, 0.01, 13))).axes[-1]
+    assert axes.get_yscale() == "log"
+    assert 0 < axes.get_ylim()[0] < 0.01 / 12
     assert typical(errors_figure).axes[-1].get_yscale() == "linear"
 
 
