@@ -57,6 +57,8 @@ class NoiseRow(NamedTuple):
     factor: float
     #: Its value then [m or rad]; None for the reference.
     std: float | None
+    #: Area of the last predicted pose's 3σ ellipse, before its update [m²].
+    predicted_area: float
     #: Area of the final pose's 3σ ellipse [m²].
     pose_area: float
     #: Mean area of the final landmarks' 3σ ellipses [m²]; None without landmarks.
@@ -166,10 +168,13 @@ def _measured(done: Replay, variation: Variation, settings: FilterSettings) -> N
     of_path = rmse_table(path_accuracy(done.log, trace.t, trace.poses)) or {}
     nees, nis = nees_summary(trace) or {}, nis_summary(trace) or {}
     areas = ellipse_areas(trace.landmark_covariances)
+    last = trace.predicted_pose_covariances[-1], trace.pose_covariances[-1]
+    predicted_area, pose_area = ellipse_areas(np.stack(last)[:, :2, :2]).tolist()
     row = NoiseRow(
         *variation,
         std=std,
-        pose_area=float(ellipse_areas(trace.pose_covariances[-1:, :2, :2])[0]),
+        predicted_area=predicted_area,
+        pose_area=pose_area,
         landmark_area=finite(areas.mean()) if len(areas) else None,
         landmark_rmse=of_map.get("raw"),
         landmark_rmse_aligned=of_map.get("aligned"),

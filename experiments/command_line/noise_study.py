@@ -133,6 +133,8 @@ class Results(NamedTuple):
     titles: Sequence[str]
     figure: "Figure"
     dpi: int
+    #: Map of each row, by the name of its file; empty where a row has many runs.
+    maps: "dict[str, Figure]"
     #: What to print, one below the other.
     shown: Sequence[Any]
 
@@ -165,9 +167,10 @@ def one_run_study(
             runs = study(progress=tick)
         with reporter.progress("drawing"):
             drawn = figures.noise_study_figure([(run.title, run.trace) for run in runs])
+            maps = {_file_name(run): figures.map_figure(run.trace) for run in runs}
         title = heading("", name, ", noise study of ", estimator)
         rows, titles = [run.row for run in runs], [run.title for run in runs]
-        return Results(rows, titles, drawn, 130, (title, runs_table(runs)))
+        return Results(rows, titles, drawn, 130, maps, (title, runs_table(runs)))
 
     about = {"estimator": estimator, "settings": settings_table(settings)}
     return PreparedStudy((name, estimator), about, run)
@@ -192,7 +195,7 @@ def effects_study(world: Scenario, given: NoiseStudyOptions) -> PreparedStudy:
         with reporter.progress("running", unit="runs") as tick:
             effects = study(changed=places, progress=tick)
         shown = [effects_table(world.name, runs, effects)]
-        return Results(effects, (), noise_effects_figure(effects), 150, shown)
+        return Results(effects, (), noise_effects_figure(effects), 150, {}, shown)
 
     return PreparedStudy(
         (world.name, f"{runs}-runs"), {"runs": runs, "seed": seed}, run
@@ -212,6 +215,10 @@ def write_study(study: PreparedStudy, out: Path | None, reporter: Reporter) -> N
         found = study.run(reporter)
         figure = sign(found.figure, " · ".join(study.names))
         figures.save_figure(figure, folder / "noise_study.png", dpi=found.dpi)
+        for name, drawn in found.maps.items():
+            (folder / "maps").mkdir(exist_ok=True)
+            sign(drawn, " · ".join((*study.names, name)))
+            figures.save_figure(drawn, folder / "maps" / f"{name}.png", dpi=100)
         _write_csv(folder / "noise_study.csv", found.rows)
         rows = [_plain(row) for row in found.rows]
         if found.titles:
@@ -220,6 +227,15 @@ def write_study(study: PreparedStudy, out: Path | None, reporter: Reporter) -> N
         summary = write_summary(folder, {**head, "rows": rows})
     reporter.show(*found.shown, "", written(str(place), summary["files"]))
     reporter.finish({**summary, "out": str(place)})
+
+
+def _file_name(run: "NoiseRun") -> str:
+    """Name the map of a run, as in unchanged, sigma_x_times_10 and sigma_x_by_10."""
+    row = run.row
+    if row.factor == 1:
+        return "unchanged"
+    letter = {"α": "alpha", "β": "beta"}.get(row.sigma[1:], row.sigma[1:])
+    return f"sigma_{letter}_{'times' if row.factor > 1 else 'by'}_10"
 
 
 def _write_csv(path: Path, rows: "Sequence[NoiseRow] | Sequence[NoiseEffect]") -> None:

@@ -1,5 +1,6 @@
 """Filter a log for a command: `filter_and_write` writes and prints a run's results."""
 
+import csv
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 #: Largest map whose covariance is written: 32 MB.
 _MOST_LANDMARKS = 1000
+#: Largest map whose covariances are also written as text.
+_FEW_LANDMARKS = 20
 _FEW_STEPS = 60  # of a run whose every step is drawn by default
 
 
@@ -113,6 +116,8 @@ def filter_and_write(
             viewers.write_rerun(given.rerun, log, viewed, walls=walls)
     write_slamlog(runs[0].log, folder / "log.csv")
     write_belief(folder / "belief.npz", runs[0])
+    if len(traces[0].landmark_ids) <= _FEW_LANDMARKS:
+        write_covariances(folder, traces[0])
     summaries = [
         summarise(run, settings, resolution=given.resolution)
         for run, settings in zip(runs, filters.values(), strict=True)
@@ -182,6 +187,27 @@ def write_belief(path: Path, run: Replay) -> None:
     if len(trace.landmark_ids) <= _MOST_LANDMARKS:
         arrays["covariance"] = belief.covariance
     np.savez(path, **arrays)
+
+
+def write_covariances(folder: Path, trace: RunTrace) -> None:
+    """Write the two covariances of covariance.png as text.
+
+    In covariance_first.csv, of the first map, and covariance_final.csv, a row holds the
+    covariances of one entry of the state (x, y, θ, l1x, l1y, …) with all [m, rad].
+    """
+    first = trace.step_of_first_map()
+    for name, step, covariance in (
+        ("first", first, trace.first_covariance),
+        ("final", trace.last_step, trace.final_covariance),
+    ):
+        ids = trace.map_at(step).ids.tolist()
+        entries = ["x", "y", "θ", *(f"l{i}{axis}" for i in ids for axis in "xy")]
+        path = folder / f"covariance_{name}.csv"
+        with path.open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(["", *entries])
+            rows = zip(entries, covariance.tolist(), strict=True)
+            writer.writerows([entry, *row] for entry, row in rows)
 
 
 def write_figures(

@@ -2,6 +2,7 @@
 
 import math
 import textwrap
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -166,11 +167,11 @@ def _ratio(numbers: dict[str, Any], hint: Sequence[str]) -> str:
 
 
 def written(folder: str, files: Sequence[str]) -> Text:
-    """List the written files; the pictures of single steps count as one."""
-    steps = [file for file in files if file.startswith("map_steps/")]
-    names = sorted(file for file in files if file not in steps)
-    if steps:
-        names.append(f"map_steps/ ({len(steps)}\N{NO-BREAK SPACE}pictures)")
+    """List the written files; the pictures of a folder count as one."""
+    names = sorted(file for file in files if "/" not in file)
+    folders = Counter(file.partition("/")[0] for file in files if "/" in file)
+    for name, count in sorted(folders.items()):
+        names.append(f"{name}/ ({count}\N{NO-BREAK SPACE}pictures)")
     listed = textwrap.fill(
         ", ".join(names), _WIDTH, initial_indent="  ", subsequent_indent="  "
     )
@@ -322,6 +323,7 @@ def _gospa(parts: dict[str, Any]) -> str:
 # Noise studies.
 
 _COLUMNS = {
+    "predicted_area": "prior\narea\n[m²]",
     "pose_area": "pose\narea\n[m²]",
     "landmark_area": "landmark\narea\n[m²]",
     "landmark_rmse": "map\nerror\n[m]",
@@ -337,6 +339,8 @@ def runs_table(runs: "Sequence[NoiseRun]") -> Table:
     title = "Final 3σ areas and RMS errors; for NEES and NIS, 1 is expected"
     rows: list[dict[str, Any]] = [run.row._asdict() for run in runs]
     shown = [key for key in _COLUMNS if any(row[key] is not None for row in rows)]
+    if len(shown) == len(_COLUMNS):  # too wide for 80; the file holds it
+        shown.remove("predicted_area")
     table = _table((), title=title, collapse_padding=True)  # fits 80
     for name in ("noise", "value"):
         table.add_column(name, no_wrap=True)

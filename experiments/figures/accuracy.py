@@ -375,8 +375,7 @@ def covariance_figure(trace: RunTrace) -> Figure:
     trace : RunTrace
         The run.
     """
-    counts = [len(ids) for ids, *_ in trace.landmark_history]
-    first_step = next((step for step, count in enumerate(counts) if count), 0)
+    first_step = trace.step_of_first_map()
     figure = style.new_figure(12.4, 5.6)
     before, after = figure.subplots(1, 2)
     _draw_correlations(before, trace.first_covariance, trace.map_at(first_step).ids)

@@ -131,6 +131,11 @@ class RunTrace:
         """Return the map after a step."""
         return MapEstimate(*self.landmark_history[step])
 
+    def step_of_first_map(self) -> int:
+        """Return the first step with landmarks; 0 if there are none."""
+        counts = [len(ids) for ids, *_ in self.landmark_history]
+        return next((step for step, count in enumerate(counts) if count), 0)
+
     def first_steps(self) -> Integers:
         """Return the step at which each landmark of the final map first appears."""
         first = dict.fromkeys(self.landmark_ids.tolist(), self.last_step)

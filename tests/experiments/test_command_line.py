@@ -112,6 +112,7 @@ def test_a_run_writes_pictures_log_scenario_and_numbers(finished_run):
         with Image.open(folder / name) as picture:
             assert min(picture.size) > 300
     texts = ["belief.npz", "log.csv", "run.html", "scenario.toml", "summary.json"]
+    texts += ["covariance_final.csv", "covariance_first.csv"]
     found = [p.relative_to(folder).as_posix() for p in folder.rglob("*.*")]
     assert summary["files"] == sorted(names + texts)
     assert sorted(found) == sorted([MANIFEST, *summary["files"]])
@@ -723,9 +724,29 @@ def test_several_mistakes_of_a_scenario_stand_in_one_line(here):
 
 
 @pytest.mark.slow
+def test_the_covariances_of_a_run_are_written_with_the_names_of_their_entries(
+    finished_run,
+):
+    folder, _ = finished_run
+    with (folder / "covariance_final.csv").open() as stream:
+        (_, *entries), *rows = csv.reader(stream)
+    with np.load(folder / "belief.npz") as saved:
+        names = [f"l{i}{axis}" for i in saved["landmark_ids"] for axis in "xy"]
+        assert entries == [row[0] for row in rows] == ["x", "y", "θ", *names]
+        values = np.array([row[1:] for row in rows], dtype=float)
+        np.testing.assert_array_equal(values, saved["covariance"])
+    first = (folder / "covariance_first.csv").read_text().splitlines()
+    assert 3 < len(first) <= len(rows) + 1
+
+
+@pytest.mark.slow
 def test_a_noise_study_draws_one_figure_and_tables_eleven_runs(log):
     summary = answered("noise-study", log, "--out", "study")
-    assert summary["files"] == ["noise_study.csv", "noise_study.png", "summary.json"]
+    sigmas = ("alpha", "beta", "r", "x", "y")
+    changed = [f"sigma_{s}_{way}_10" for s in sigmas for way in ("by", "times")]
+    maps = [f"maps/{name}.png" for name in (*changed, "unchanged")]
+    texts = ["noise_study.csv", "noise_study.png", "summary.json"]
+    assert summary["files"] == [*maps, *texts]
     with (log.parent / "study" / "noise_study.csv").open() as stream:
         table = list(csv.DictReader(stream))
     assert len(table) == len(summary["rows"]) == 11

@@ -90,12 +90,15 @@ def test_the_table_cuts_no_number_at_80_columns(of_log):
 def test_areas_are_those_of_the_final_3_sigma_ellipses(of_log):
     reference = of_log[0]
     trace, row = reference.trace, reference.row
-    *areas, of_pose = (
+    last = trace.pose_covariances[-1], trace.predicted_pose_covariances[-1]
+    *areas, of_pose, predicted = (
         math.pi * math.prod(3 * np.sqrt(np.linalg.eigvalsh(P)))
-        for P in (*trace.landmark_covariances, trace.pose_covariances[-1, :2, :2])
+        for P in (*trace.landmark_covariances, *(P[:2, :2] for P in last))
     )
     assert row.landmark_area == pytest.approx(np.mean(areas))
     assert row.pose_area == pytest.approx(of_pose)
+    assert row.predicted_area == pytest.approx(predicted)
+    assert row.predicted_area > row.pose_area
 
 
 def scans(log):
