@@ -23,7 +23,7 @@ __dir__ = __all__.copy
 #: program.
 COMMANDS = (
     *("run", "replay", "smooth", "fit_noise", "monte_carlo", "generate", "judge"),
-    *("noise_study", "render_video"),
+    *("benchmark", "noise_study", "render_video"),
 )
 for _name in COMMANDS:
     leaf(f"experiments.command_line.{_name}")

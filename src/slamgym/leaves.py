@@ -36,6 +36,10 @@ LEAVES: dict[str, tuple[str, ...]] = {
         "experiments.space_poses",
         "experiments.command_line.judge",
     ),
+    "benchmark": (
+        "experiments.consistency_protocol",
+        "experiments.command_line.benchmark",
+    ),
     "viewers": ("experiments.viewers",),
     "formats of trajectories": (
         "experiments.trajectories.g2o",

@@ -60,7 +60,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         noise_study noise_fitting
         trajectories
         estimate_conventions estimate_files log_conventions
-        judging space_poses
+        judging space_poses consistency_protocol
         command_line
     """,
     "experiments.monte_carlo_study": """

@@ -34,7 +34,7 @@ from slamgym.sim_configs.scenario import Gps, Randomise, SensorTable
 
 pytestmark = pytest.mark.usefixtures("here")
 COMMANDS = "run replay smooth fit-noise generate judge monte-carlo noise-study render"
-COMMANDS = (*COMMANDS.split(), "scenarios", "estimators")
+COMMANDS = (*COMMANDS.split(), "benchmark", "scenarios", "estimators")
 LOG = """# format: slamlog 1
 # name: little
 # motion_std: 0.1,0.1,0.05
