@@ -9,14 +9,13 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import lru_cache, partial
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from functools import lru_cache
+from typing import Any, Protocol, runtime_checkable
 
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
 from .beliefs import Belief, MapView, ScanDecisions, UpdateReport, part_of
-from .guards.undo import Undo, to_the_end, undo_all, undone_on_error
 
 __all__ = [
     "Belief",
@@ -31,9 +30,6 @@ __all__ = [
     "with_fix",
 ]
 __dir__ = __all__.copy
-
-Result = TypeVar("Result")
-Answer = TypeVar("Answer")
 
 
 @runtime_checkable
@@ -118,68 +114,6 @@ def optional_members(estimator: SlamEstimator) -> dict[str, Any]:
     large = "local_view", "join", "smoothed", "belief_limit"
     offered = (name for name in ("observe_truth", *large) if hasattr(estimator, name))
     return {name: getattr(estimator, name) for name in offered}
-
-
-def bookmark(estimator: Any) -> Undo:
-    """Return what takes back later calls, as far as no kernel changes arrays in place.
-
-    A foreign filter is restored from its saved state.
-    """
-    if hasattr(estimator, "bookmark"):
-        undo: Undo = estimator.bookmark()
-        return undo
-    return partial(restore, estimator, estimator.state_dict())
-
-
-def advance(
-    estimator: Any,
-    step: Callable[[], Result],
-    then: Callable[[Result], Answer],
-    undo: Undo,
-    undo_then: Callable[[], Undo],
-) -> Answer:
-    """Return ``then(step())``; an interrupt finds nothing done, or both.
-
-    A compiled kernel changes a covariance in one call.  To take this back would need a
-    copy of the covariance before every step; instead, what follows is brought to its
-    end before the interrupt is passed on.
-
-    Parameters
-    ----------
-    estimator
-        The filter that takes the step.  Its ``steps`` tell whether it has, and its
-        ``report()`` returns the report once more.  Without these it is restored.
-    step : callable
-        Its last change is the step of the filter.
-    then : callable
-        What follows, from the result of the step.
-    undo : callable
-        Takes back all that ``step`` changes before the filter takes its step.
-    undo_then : callable
-        Returns what takes back ``then``, which is called after the step.
-    """
-    steps = getattr(estimator, "steps", None)
-    if steps is None:
-        with undone_on_error(undo_all(bookmark(estimator), undo_then(), undo)):
-            return then(step())
-    taken_back: Undo | None = None
-
-    def settle() -> None:
-        nonlocal taken_back
-        if estimator.steps == steps:
-            undo()
-            return
-        taken_back = taken_back or undo_then()
-        taken_back()
-        then(estimator.report())
-
-    try:
-        result = step()
-        taken_back = undo_then()
-        return then(result)
-    except BaseException:
-        to_the_end(settle)
-        raise
 
 
 def restore(estimator: Any, state: Mapping[str, Any]) -> None:

@@ -48,6 +48,7 @@ from ..beliefs import Belief, MapView, UpdateReport
 from ..guards import saved_states
 from ..guards.argument_checks import LOWEST_ID, RESERVED_IDS, refuse_reserved
 from ..guards.saved_states import NUMBERS, WHOLE, Table, with_prefix, without_prefix
+from ..guards.undo import undone_on_error
 from ..kernels.scan_update import (
     AT_ESTIMATE,
     DONE,
@@ -131,9 +132,8 @@ class WaitingMap(GaussianMap):
     def take_in(self, update: UpdateKernel, readings: Array, ids: IntArray) -> int:
         """Update with readings of mapped landmarks; let those of others wait."""
         refuse_reserved(ids.tolist())
-        undo = self.bookmark()
-        self.hold(self.used, self.slots)  # what follows changes a copy
-        try:
+        with undone_on_error(self):
+            self.hold(self.used, self.slots)  # what follows changes a copy
             status = super().take_in(update, readings, ids)
             if status == DONE:
                 report = super().report()
@@ -141,9 +141,6 @@ class WaitingMap(GaussianMap):
                 new = Waiting(np.column_stack([ids, ids])[left], readings[left])
                 placed = self._collect(new)
                 self._report = report.replace(added_ids=placed)
-        except BaseException:
-            undo()
-            raise
         return status
 
     def report(self) -> UpdateReport:

@@ -226,10 +226,6 @@ class MapFilter:
         self.map.resume(snapshot["map"])
         vars(self).update(with_copies({**snapshot, "map": self.map}))
 
-    def bookmark(self) -> Callable[[], None]:
-        """Return what takes back later calls, as far as no kernel has run."""
-        return self.map.bookmark()
-
     @property
     def steps(self) -> int:
         """Number of steps taken; it changes together with the belief."""

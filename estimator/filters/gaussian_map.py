@@ -8,7 +8,7 @@ reading.  A `ScanReport` holds the results of a scan.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import accumulate
 from typing import Any, NamedTuple, cast
 from weakref import ref
@@ -302,10 +302,6 @@ class GaussianMap:
     def remove(self, ids: Sequence[int]) -> None:
         """Marginalise landmarks; all other numbers keep their last bit."""
         self.keep_without(self.used, ids)
-
-    def bookmark(self) -> Callable[[], None]:
-        """Return a function that undoes later changes, except those of kernels."""
-        return partial(vars(self).update, vars(self).copy())
 
     @property
     def used(self) -> BeliefArrays:

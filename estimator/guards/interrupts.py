@@ -1,10 +1,8 @@
 """Calls that change several parts of a filter: an interrupt midway leaves a mark."""
 
-from collections.abc import Callable
 from typing import Any
 
-#: What takes back changes.
-Undo = Callable[[], object]
+from .undo import Undo
 
 
 class Interruptible:

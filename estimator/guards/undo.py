@@ -1,40 +1,29 @@
-"""Calls that change all of a state or nothing, also where an interrupt ends them."""
+"""Take back changes: of a call that is refused, or of an interrupted short one."""
 
 from collections.abc import Callable
-from typing import Any
 
 from .argument_checks import with_copies
 
 #: What takes back later changes; it may be called more than once.
-Undo = Callable[[], None]
+Undo = Callable[[], object]
 
 
 class undone_on_error:  # noqa: N801 (reads as a verb, in a with statement)
-    """Take back what the block has changed if it raises, even `KeyboardInterrupt`.
+    """Restore the :func:`attributes` of objects if the block raises, even an interrupt.
 
-    With ``unless_moved``, only if this filter has not taken another step.
+    The block may replace their arrays, but not change them in place.
     """
 
-    def __init__(self, undo: Undo, unless_moved: Any = None) -> None:
-        self._undo, self._slam = undo, unless_moved
-        self._steps = getattr(unless_moved, "steps", None)
+    def __init__(self, *objects: object) -> None:
+        self._undo = attributes(*objects)
 
     def __enter__(self) -> None:
         """Begin the block."""
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Take back the changes if there is an error."""
-        if kind is not None and getattr(self._slam, "steps", None) == self._steps:
-            to_the_end(self._undo)
-
-
-def to_the_end(call: Callable[[], object]) -> None:
-    """Call a function, once more if an interrupt ends it."""
-    try:
-        call()
-    except KeyboardInterrupt:
-        to_the_end(call)
-        raise
+        """Restore the attributes if there is an error."""
+        if kind is not None:
+            self._undo()
 
 
 def undo_all(*undos: Undo) -> Undo:

@@ -3,7 +3,6 @@
 import copy
 import pickle
 import sys
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -400,33 +399,6 @@ def test_no_step_does_more_of_the_map_than_a_full_update(base, jumping, monkeypa
     assert max(done) < 2 * full
     assert sum(step > 0 for step in done) > 5
     assert max(waiting) < 150  # and nothing piles up
-
-
-def test_an_interrupt_applies_no_downdate_twice(monkeypatch):
-    """The last lines of a step are interrupted, which apply one to two blocks."""
-    slam, applied = map_all(CompressedEkfSlam(*NOISE), 150), []
-    spied(
-        monkeypatch,
-        DeferredCovariance,
-        "_apply",
-        lambda _, blocks: applied.extend(blocks),
-    )
-    for odometry, readings, ids in wander(150, 80, jumping=True):
-        slam.predict(odometry)
-        twin = copy.deepcopy(slam)
-        applied.clear()
-        slam.update(readings, ids)
-        if len(applied) > 1:
-            break
-    assert applied == [0, 1]
-    other = copy.deepcopy(twin)
-    lines = lines_of(partial(other.update, readings, ids))
-    for line in range(lines - 80, lines):
-        other = copy.deepcopy(twin)
-        assert is_interrupted(partial(other.update, readings, ids), line)
-        if other.steps < slam.steps:
-            other.update(readings, ids)
-        assert_same_bits(other.belief(), slam.belief())
 
 
 def test_a_downdate_without_memory_is_still_to_be_applied(monkeypatch):

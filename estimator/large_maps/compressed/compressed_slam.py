@@ -19,8 +19,8 @@ from ...filters.ekf import (
 )
 from ...guards import argument_checks, saved_states
 from ...guards.argument_checks import LandmarkIds
-from ...guards.undo import Undo, attributes, undo_all, undone_on_error
-from ...interface import advance
+from ...guards.interrupts import Interruptible, changing
+from ...guards.undo import Undo, attributes, undo_all
 from ...models.sensors import only_placing
 from .compressed_map import (
     SHORT_PHASE,
@@ -39,7 +39,7 @@ BASES: dict[str, type[EkfSlam]] = {
 CHECKED_LANDMARKS = 200  # landmarks of a saved state whose joint covariance is checked
 
 
-class CompressedEkfSlam:
+class CompressedEkfSlam(Interruptible):
     """Compressed EKF-SLAM: the full filter, at a fraction of its cost.
 
     In each step the filter updates only the *local map*: the pose and the landmarks
@@ -117,10 +117,12 @@ class CompressedEkfSlam:
         loaded.reset(pose, pose_std)
         # The numbers: landmarks of the local map beyond those of a scan, scans in this
         # phase, how many phases may still spread their beginning over steps.
-        self._map, self._extra, self._age, self._rests = loaded, 0, 0, 0
+        with changing(self, "reset", anew=True):
+            self._map, self._extra, self._age, self._rests = loaded, 0, 0, 0
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move the pose by one odometry reading, as :meth:`EkfSlam.predict`."""
+        self.refuse_interrupted()
         self._map.filter.predict(odometry, dt)
 
     def update(
@@ -149,29 +151,23 @@ class CompressedEkfSlam:
 
         required = [i for i in ids if i in slots]
         changes = not self._is_adequate(required)
-
-        def correct() -> UpdateReport:
+        with changing(self, "update", self._undo() if changes else None):
             if changes:
                 self._choose_local_map(required)
-            return self._map.filter.update(readings, named)
-
-        undo = self.bookmark() if changes else undo_all()
-        return advance(self._map.filter, correct, self._follow, undo, self._around)
+            report = self._map.filter.update(readings, named)
+            self._map.add()
+            if report.degrees_of_freedom:
+                self._age += 1
+                rank = report.degrees_of_freedom + 1
+                self._map.work(rank, self._age, hurried=not self._rests)
+        return report
 
     def observe_pose(
         self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
     ) -> UpdateReport:
         """Correct the belief with a reading of the pose, as `EkfSlam.observe_pose`."""
+        self.refuse_interrupted()
         return self._map.filter.observe_pose(reading, matrix, covariance)
-
-    def _follow(self, report: UpdateReport) -> UpdateReport:
-        """Do what follows an update of the filter; return its report."""
-        self._map.add()
-        if report.degrees_of_freedom:
-            self._age += 1
-            rank = report.degrees_of_freedom + 1
-            self._map.work(rank, self._age, hurried=not self._rests)
-        return report
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Remove landmarks by marginalisation; the belief about all else is unchanged.
@@ -182,7 +178,7 @@ class CompressedEkfSlam:
             If one is not in the map; no landmark is then removed.
         """
         ids = argument_checks.mapped_identities(landmark_ids, self._map.slots)
-        with undone_on_error(self.bookmark()):
+        with changing(self, "remove", self._undo()):
             self._map.remove(ids)
 
     def merge(self, kept: int, gone: int) -> None:
@@ -210,7 +206,7 @@ class CompressedEkfSlam:
         """
         kept, gone = argument_checks.landmark_pairs(pairs, self._map.slots)
         ids, local = [*kept, *gone], self._map.local
-        with undone_on_error(self.bookmark()):
+        with changing(self, "merge", self._undo()):
             if not all(i in local for i in ids):
                 size = max(self._local_size or 0, len(local), len(ids))
                 self._map.change_local_map(ids, size, hurried=not self._rests)
@@ -233,6 +229,7 @@ class CompressedEkfSlam:
         MemoryError
             If memory cannot hold the covariance.
         """
+        self.refuse_interrupted()
         ids = argument_checks.asked_identities(landmark_ids, self._map.slots)
         return self._map.belief(ids)
 
@@ -251,11 +248,13 @@ class CompressedEkfSlam:
     @property
     def landmark_ids(self) -> tuple[int, ...]:
         """The mapped landmarks, in the order of the belief."""
+        self.refuse_interrupted()
         return tuple(self._map.slots)
 
     @property
     def local_ids(self) -> tuple[int, ...]:
         """The landmarks of the local map."""
+        self.refuse_interrupted()
         return tuple(self._map.local)
 
     @property
@@ -265,6 +264,7 @@ class CompressedEkfSlam:
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the whole state, as arrays; large for a large map."""
+        self.refuse_interrupted()
         name = {"estimator": np.array(type(self).__name__)}
         return name | self._map.state_dict([self._extra, self._age, self._rests])
 
@@ -277,18 +277,16 @@ class CompressedEkfSlam:
         extra, age, rests = loaded.load_state_dict(state, type(self).__name__)
         some = loaded.belief(list(loaded.slots)[:CHECKED_LANDMARKS])
         saved_states.refuse_indefinite("the covariance of state", some.covariance)
-        self._map, self._extra, self._age, self._rests = loaded, extra, age, rests
+        with changing(self, "load_state_dict", anew=True):
+            self._map, self._extra, self._age, self._rests = loaded, extra, age, rests
 
-    def bookmark(self) -> Undo:
-        """Return what takes back later calls, as far as no kernel has run."""
-        return undo_all(self._map.filter.bookmark(), self._around())
-
-    def _around(self) -> Undo:
-        """Return what takes back later changes of all but the local filter.
+    def _undo(self) -> Undo:
+        """Return what takes back a change of the local map.
 
         A handover may be further than before: its results do not depend on the time.
         """
-        return undo_all(self._map.deferred.checkpoint(), attributes(self._map, self))
+        parts = attributes(self._map.filter.map, self._map, self)
+        return undo_all(parts, self._map.deferred.checkpoint())
 
     @property
     def steps(self) -> int:
@@ -297,6 +295,7 @@ class CompressedEkfSlam:
 
     def report(self) -> UpdateReport:
         """Return the report of the last update once more."""
+        self.refuse_interrupted()
         return self._map.filter.report()
 
     def _choose_local_map(self, required: Sequence[int]) -> None:

@@ -10,7 +10,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
 from ...filters.ekf import EkfSlam
-from ...guards.undo import Undo, contents, undo_all, undone_on_error
+from ...guards.undo import Undo, contents, undo_all
 from ...interface import Belief, UpdateReport
 from ...models.rigid_motion import as_covariance
 from ..multifrontal import pairs
@@ -116,19 +116,17 @@ class SparseBelief:
 
     def remove(self, ids: Sequence[int]) -> None:
         """Marginalise landmarks."""
-        with undone_on_error(self.checkpoint()):
-            gone = self._include_links(ids)
-            rest = marginalise(self.local, self.pose, gone)
-            self._drop(ids, gone, rest)
+        gone = self._include_links(ids)
+        rest = marginalise(self.local, self.pose, gone)
+        self._drop(ids, gone, rest)
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two landmarks being the same, and drop the second."""
-        with undone_on_error(self.checkpoint()):
-            dropped = self._include_links([gone, kept])
-            place = int(np.flatnonzero(self.local.slots == self.slots[kept])[0])
-            dropped[place] = False
-            merged = merge_landmarks(self.local, self.pose, place, dropped)
-            self._drop([gone], dropped, merged)
+        dropped = self._include_links([gone, kept])
+        place = int(np.flatnonzero(self.local.slots == self.slots[kept])[0])
+        dropped[place] = False
+        merged = merge_landmarks(self.local, self.pose, place, dropped)
+        self._drop([gone], dropped, merged)
 
     def marginal(self, ids: Sequence[int]) -> Belief:
         """Return the marginal of the pose and some landmarks.

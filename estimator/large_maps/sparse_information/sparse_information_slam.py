@@ -18,8 +18,9 @@ from ...beliefs import Belief, MapView, UpdateReport, describe_filter
 from ...filters.ekf import EkfSlam
 from ...guards import argument_checks, saved_states
 from ...guards.argument_checks import LandmarkIds
+from ...guards.interrupts import Interruptible, changing
 from ...guards.saved_states import with_prefix, without_prefix
-from ...guards.undo import Undo, attributes, undo_all, undone_on_error
+from ...guards.undo import attributes
 from ...models.bearing_range import wrap_angle
 from ..multifrontal import PLACES, ROWS
 from . import local_information
@@ -28,7 +29,7 @@ from .scan_update import ESTIMATE, ScanRules, process_scan
 from .sparse_belief import SparseBelief
 
 
-class SparseInformationSlam:
+class SparseInformationSlam(Interruptible):
     """Exactly sparse extended information filter.
 
     The filter stores the map as an information matrix Λ, whose zeros state that two
@@ -122,9 +123,11 @@ gate_probability, noise_at_rest, min_range
         dense = self._scan_rules.dense()
         dense.reset(pose, pose_std)
         self._held: EkfSlam | SparseBelief = dense
+        self.interrupted_in = ""
 
     def predict(self, odometry: ArrayLike, dt: float = 1.0) -> None:
         """Move the pose by one odometry reading, as :meth:`EkfSlam.predict`."""
+        self.refuse_interrupted()
         if isinstance(self._held, EkfSlam):
             self._held.predict(odometry, dt)
             return
@@ -157,6 +160,7 @@ gate_probability, noise_at_rest, min_range
         readings = argument_checks.scan(measurements)
         ids = argument_checks.identities(landmark_ids, len(readings), self)
         argument_checks.refuse_unusable(readings, ids)
+        self.refuse_interrupted()
         if isinstance(self._held, EkfSlam) and self._stays_dense(ids):
             return self._held.update(readings, ids)
         belief = self._belief
@@ -166,7 +170,7 @@ gate_probability, noise_at_rest, min_range
             chosen = belief.new_local_map(ids)
             changes = chosen is not None or not belief.slots.keys() >= set(ids)
             undo = belief.checkpoint() if changes else attributes(belief)
-            with undone_on_error(undo):
+            with changing(self, "update", undo):
                 if chosen is not None:
                     belief.change_local_map(chosen)
                     belief.origin = belief.pose.mean[:2].copy()
@@ -218,8 +222,11 @@ gate_probability, noise_at_rest, min_range
             If one is not in the map; no landmark is then removed.
         """
         ids = argument_checks.mapped_identities(landmark_ids, self._slots)
-        if ids:
-            self._held.remove(ids)
+        held = self._held
+        undo = None if isinstance(held, EkfSlam) else held.checkpoint()
+        with changing(self, "remove", undo):
+            if ids:
+                held.remove(ids)
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two landmarks being the same, and remove the second.
@@ -236,8 +243,9 @@ gate_probability, noise_at_rest, min_range
         """
         argument_checks.two_landmarks(kept, gone, self._slots)
         belief = self._belief
-        belief.merge(kept, gone)
-        self._held = belief
+        with changing(self, "merge", belief.checkpoint()):
+            belief.merge(kept, gone)
+            self._held = belief
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
         """Return a snapshot of the belief, for the whole map or a part of it.
@@ -254,6 +262,7 @@ gate_probability, noise_at_rest, min_range
         ValueError
             If one is not in the map, or more than ``belief_limit`` are asked for.
         """
+        self.refuse_interrupted()
         ids = argument_checks.asked_identities(landmark_ids, self._slots)
         argument_checks.refuse_large_belief(
             len(ids), self.belief_limit, "give landmark_ids"
@@ -278,6 +287,7 @@ gate_probability, noise_at_rest, min_range
     @property
     def landmark_ids(self) -> tuple[int, ...]:
         """The mapped landmarks, in the order of the belief."""
+        self.refuse_interrupted()
         return tuple(self._slots)
 
     @property
@@ -316,6 +326,7 @@ gate_probability, noise_at_rest, min_range
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the whole state, as arrays."""
+        self.refuse_interrupted()
         name, base = type(self).__name__, self._scan_rules.base
         if isinstance(self._held, EkfSlam):
             names = {"estimator": np.array(name), "base": np.array(base)}
@@ -332,12 +343,7 @@ gate_probability, noise_at_rest, min_range
             self._held = dense
         else:
             self._held = checked_state(state, name, base)
-
-    def bookmark(self) -> Undo:
-        """Return what takes back later calls, as far as no kernel has run."""
-        held = self._held
-        undo = held.bookmark() if isinstance(held, EkfSlam) else held.checkpoint()
-        return undo_all(attributes(self), undo)
+        self.interrupted_in = ""
 
     @property
     def steps(self) -> int:
@@ -346,6 +352,7 @@ gate_probability, noise_at_rest, min_range
 
     def report(self) -> UpdateReport:
         """Return the report of the last update once more."""
+        self.refuse_interrupted()
         held = self._held
         return held.report() if isinstance(held, EkfSlam) else held.report
 

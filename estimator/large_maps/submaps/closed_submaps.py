@@ -20,7 +20,7 @@ from ...filters.gaussian_map import without_landmarks
 from ...filters.pose_readings import coincide
 from ...guards import argument_checks, saved_states
 from ...guards.argument_checks import LandmarkIds
-from ...guards.undo import Undo, attributes, undo_all
+from ...guards.undo import Undo, attributes
 from ...interface import Belief, MapView, UpdateReport
 from ...models.rigid_motion import ErrorFrame
 from . import joining
@@ -268,11 +268,10 @@ class Neighbourhood:
         self.forget()
         if saved is not None:
             self._copy, self._reaches = saved
-            self._steps = self._copy.slam.steps
 
     def forget(self) -> None:
         """Discard the copy, for a new run."""
-        self._copy, self._steps = None, 0
+        self._copy = None
         # Largest distance asked for or measured with each recent scan; the last entry
         # is for the time since the last scan [m].
         self._reaches = RECENT_SCANS * [0.0]
@@ -297,22 +296,17 @@ class Neighbourhood:
         return copy.slam.map_view()
 
     @property
-    def viewed(self) -> tuple[Any, ...]:
+    def viewed(self) -> tuple[_Copy | None, list[float]]:
         """What :meth:`view` changes."""
-        return self._copy, self._steps, self._reaches
+        return self._copy, self._reaches
 
     @viewed.setter
-    def viewed(self, before: tuple[Any, ...]) -> None:
-        self._copy, self._steps, self._reaches = before
+    def viewed(self, before: tuple[_Copy | None, list[float]]) -> None:
+        self._copy, self._reaches = before
 
-    def bookmark(self) -> Undo:
-        """Return what takes back later changes, but for the steps of the filter.
-
-        A step that has been taken is not taken again.
-        """
-        if self._copy is None:
-            return attributes(self)
-        return undo_all(self._copy.slam.bookmark(), attributes(self))
+    def checkpoint(self) -> Undo:
+        """Return what takes back later changes, but for the steps of the filter."""
+        return attributes(self, *([] if self._copy is None else [self._copy.slam.map]))
 
     def renew(self) -> None:
         """Replace the copy, if there is one and the submaps can be joined."""
@@ -323,19 +317,7 @@ class Neighbourhood:
     def predict(self, odometry: ArrayLike, dt: float) -> None:
         """Move the robot."""
         if self._copy is not None:
-            step = partial(self._copy.slam.predict, odometry, dt)
-            self._take(self._copy.slam, step)
-
-    def _take(self, slam: InvariantEkfSlam, step: Callable[[], object]) -> None:
-        """Take a step of the filter, unless an interrupted call has taken it."""
-        if slam.steps == self._steps:
-            step()
-        self._steps = slam.steps
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether there is no copy."""
-        return self._copy is None
+            self._copy.slam.predict(odometry, dt)
 
     def update(
         self, measurements: ArrayLike, ids: LandmarkIds | None, report: UpdateReport
@@ -367,7 +349,7 @@ class Neighbourhood:
             self.renew()
         if self._copy is before:  # a new copy contains the scan already
             try:
-                self._take(before.slam, partial(before.slam.update, readings, ids))
+                before.slam.update(readings, ids)
             except np.linalg.LinAlgError:
                 self.renew()
 
@@ -435,8 +417,7 @@ class Neighbourhood:
             "landmark_ids": np.array(belief.landmark_ids, dtype=np.int64),
         }
         slam.restore(state)
-        copy = _Copy(slam, region)
-        vars(self).update(_copy=copy, _steps=slam.steps)
+        self._copy = copy = _Copy(slam, region)
         return copy
 
 

@@ -20,9 +20,9 @@ from ...beliefs import Belief, MapView, UpdateReport, describe_map
 from ...filters.ekf import EkfSlam, InvariantEkfSlam
 from ...guards import argument_checks, saved_states
 from ...guards.argument_checks import LandmarkIds
+from ...guards.interrupts import Interruptible, changing
 from ...guards.saved_states import with_prefix, without_prefix
-from ...guards.undo import Undo, attributes, undo_all, undone_on_error
-from ...interface import advance
+from ...guards.undo import Undo, attributes, undo_all
 from ...models.sensors import only_placing
 from .closed_submaps import ClosedSubmaps, Neighbourhood, Region, merged
 from .graph import ORIGIN, ActiveSubmap, Chain, ClosingRule, SubmapGraph
@@ -39,7 +39,7 @@ from .store import (
 BASES: dict[str, type[EkfSlam]] = {"ekf": EkfSlam, "invariant": InvariantEkfSlam}
 
 
-class SubmapSlam:
+class SubmapSlam(Interruptible):
     """SLAM in submaps: small independent local maps, joined on demand.
 
     A filter starts at the origin of its own frame, where it knows its pose exactly, and
@@ -127,16 +127,19 @@ class SubmapSlam:
         self._rule = ClosingRule.checked(submap_size, heading_limit, extent_limit)
         self.belief_limit = argument_checks.whole("belief_limit", belief_limit, 1)
         self._folder = None if folder is None else FolderStore(folder)
-        self._begin(initial_pose, initial_pose_std)
+        self._begin(
+            argument_checks.finite_vector("pose", initial_pose, 3),
+            argument_checks.standard_deviations("pose_std", initial_pose_std, 3),
+        )
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run with an empty map, as `EkfSlam.reset`."""
-        with undone_on_error(self.bookmark()):
-            self._begin(pose, pose_std)
-
-    def _begin(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         first = argument_checks.finite_vector("pose", pose, 3)
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
+        with changing(self, "reset", self._undo(), anew=True):
+            self._begin(first, std)
+
+    def _begin(self, first: Array, std: Array) -> None:
         if self._folder is not None:
             self._folder.clear()
         folder = self._folder  # its length, and so its truth value, may be 0
@@ -153,16 +156,9 @@ class SubmapSlam:
         motion = argument_checks.pair("odometry", odometry)
         argument_checks.duration(dt)
         self._claim_folder()
-        slam, near = self._active.filter, self._neighbourhood
-        if near.is_empty:
-            slam.predict(motion, dt)
-            return
-
-        def follow(_: object) -> None:
-            near.predict(motion, dt)
-
-        step = partial(slam.predict, motion, dt)
-        advance(slam, step, follow, undo_all(), near.bookmark)
+        with changing(self, "predict"):
+            self._active.filter.predict(motion, dt)
+            self._neighbourhood.predict(motion, dt)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -196,30 +192,20 @@ class SubmapSlam:
         argument_checks.refuse_reserved(ids)
         argument_checks.refuse_unusable(readings, ids)
         self._claim_folder()
-
-        def correct() -> UpdateReport:
-            if self._graph.is_overdue:
+        overdue, index = self._graph.is_overdue, self._graph.index
+        with changing(self, "update", self._undo() if overdue else None):
+            if overdue:
                 self._close()
-            return self._active.filter.update(readings, ids)
-
-        slam, then = self._active.filter, partial(self._follow, readings, ids)
-        undo = self.bookmark() if self._graph.is_overdue else undo_all()
-        return advance(slam, correct, then, undo, self.bookmark)
-
-    def _follow(
-        self, readings: Array, ids: list[int], report: UpdateReport
-    ) -> UpdateReport:
-        """Do what follows an update of the active submap; return the report."""
-        index = self._graph.index
-        new = tuple(i for i in report.added_ids if i not in index)
-        index.add(new)
-        if new != report.added_ids:
-            report = report.replace(added_ids=new)
-        self._neighbourhood.update(readings, ids, report)
-        if len(readings) and self._rule.closes(self._active, len(readings)):
-            with suppress(OSError):  # the next scan tries again, and raises
-                self._close()
-        self._report = report
+            report = self._active.filter.update(readings, ids)
+            new = tuple(i for i in report.added_ids if i not in index)
+            index.add(new)
+            if new != report.added_ids:
+                report = report.replace(added_ids=new)
+            self._neighbourhood.update(readings, ids, report)
+            if len(readings) and self._rule.closes(self._active, len(readings)):
+                with suppress(OSError):  # the next scan tries again, and raises
+                    self._close()
+            self._report = report
         return report
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
@@ -235,7 +221,7 @@ class SubmapSlam:
         """
         ids = argument_checks.mapped_identities(landmark_ids, self._graph.index)
         self._claim_folder()
-        with undone_on_error(self.bookmark()):
+        with changing(self, "remove", self._undo()):
             self._graph.remove(ids)
             self._neighbourhood.remove(ids)
 
@@ -260,7 +246,7 @@ class SubmapSlam:
         kept, gone = argument_checks.landmark_pairs(pairs, self._graph.index)
         pairs = list(zip(kept, gone, strict=True))
         self._claim_folder()
-        with undone_on_error(self.bookmark()):
+        with changing(self, "merge", self._undo()):
             self._graph.merge_pairs(pairs)
             self._neighbourhood.merge_pairs(pairs)
 
@@ -270,8 +256,8 @@ class SubmapSlam:
         After ``join()``, unlike after ``belief()``, ``pose`` and ``local_belief()``
         include all loops closed so far, and later joins begin here.
         """
-        if self.closed_count:
-            with undone_on_error(self._graph.checkpoint()):
+        with changing(self, "join", self._graph.checkpoint()):
+            if self.closed_count:
                 self._graph.join()
 
     def local_view(self, within: float = 0.0) -> MapView:
@@ -294,6 +280,7 @@ class SubmapSlam:
         ValueError, numpy.linalg.LinAlgError
             As `belief`; the state is then unchanged.
         """
+        self.refuse_interrupted()
         reach = argument_checks.distance("within", within)
         return self._neighbourhood.view(reach)._replace(whole=self.landmark_ids)
 
@@ -315,6 +302,7 @@ class SubmapSlam:
             If the submaps contradict each other so that they cannot be joined, or if
             their covariances are degenerate.
         """
+        self.refuse_interrupted()
         ids = argument_checks.asked_identities(landmark_ids, self._graph.index)
         instead = "give landmark_ids, call local_belief()"
         argument_checks.refuse_large_belief(len(ids), self.belief_limit, instead)
@@ -326,6 +314,7 @@ class SubmapSlam:
         The frame of the submap is the composition of all submaps since the last
         :meth:`join`.  The cost does not depend on the size of the map.
         """
+        self.refuse_interrupted()
         return self._graph.local_belief()
 
     def __repr__(self) -> str:
@@ -336,16 +325,19 @@ class SubmapSlam:
     @property
     def pose(self) -> Array:
         """(x, y, θ), shape (3,) [m, m, rad], as in :meth:`local_belief`."""
+        self.refuse_interrupted()
         return self._graph.pose
 
     @property
     def landmark_ids(self) -> tuple[int, ...]:
         """The mapped landmarks, in the order of the belief."""
+        self.refuse_interrupted()
         return tuple(self._graph.index)
 
     @property
     def local_ids(self) -> tuple[int, ...]:
         """The landmarks of the active submap."""
+        self.refuse_interrupted()
         return self._graph.active_ids()
 
     @property
@@ -367,13 +359,12 @@ class SubmapSlam:
     def viewed(self, before: tuple[Any, ...]) -> None:
         self._neighbourhood.viewed = before
 
-    def bookmark(self) -> Undo:
-        """Return what takes back later calls, as far as no kernel has run."""
+    def _undo(self) -> Undo:
+        """Return what takes back a change before the step of the active submap."""
         return undo_all(
-            self._active.filter.bookmark(),
-            self._neighbourhood.bookmark(),
+            attributes(self, self._active.filter.map),
+            self._neighbourhood.checkpoint(),
             self._graph.checkpoint(),
-            attributes(self),
         )
 
     @property
@@ -383,6 +374,7 @@ class SubmapSlam:
 
     def report(self) -> UpdateReport:
         """Return the report of the last update once more."""
+        self.refuse_interrupted()
         return self._report
 
     def state_dict(self) -> dict[str, Any]:
@@ -390,6 +382,7 @@ class SubmapSlam:
 
         A filter that loads the state reads them from the folder, which must not change.
         """
+        self.refuse_interrupted()
         vicinity = self._neighbourhood.state_dict()
         return as_arrays(type(self).__name__, self._graph, vicinity)
 
@@ -404,7 +397,7 @@ class SubmapSlam:
         """
         graph = saved_graph(state, type(self).__name__, self._active, self._folder)
         near = self._neighbourhood.restored(without_prefix(state, "vicinity", "_"))
-        with undone_on_error(self.bookmark()):
+        with changing(self, "load_state_dict", self._undo(), anew=True):
             self._active.filter.load_state_dict(without_prefix(state, "local", "_"))
             self._graph, self._neighbourhood = graph, near
             self._report = UpdateReport()
