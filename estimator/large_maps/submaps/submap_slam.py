@@ -127,19 +127,16 @@ class SubmapSlam(Interruptible):
         self._rule = ClosingRule.checked(submap_size, heading_limit, extent_limit)
         self.belief_limit = argument_checks.whole("belief_limit", belief_limit, 1)
         self._folder = None if folder is None else FolderStore(folder)
-        self._begin(
-            argument_checks.finite_vector("pose", initial_pose, 3),
-            argument_checks.standard_deviations("pose_std", initial_pose_std, 3),
-        )
+        self._begin(initial_pose, initial_pose_std)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run with an empty map, as `EkfSlam.reset`."""
+        with changing(self, "reset", self._undo(), anew=True):
+            self._begin(pose, pose_std)
+
+    def _begin(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         first = argument_checks.finite_vector("pose", pose, 3)
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
-        with changing(self, "reset", self._undo(), anew=True):
-            self._begin(first, std)
-
-    def _begin(self, first: Array, std: Array) -> None:
         if self._folder is not None:
             self._folder.clear()
         folder = self._folder  # its length, and so its truth value, may be 0
