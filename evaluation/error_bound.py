@@ -1,14 +1,12 @@
 """Lower bound of the errors of any filter: the posterior Cramér-Rao bound.
 
-The bound of Tichavský, Muravchik and Nehorai [1]_ is the recursion of a Kalman filter
-that is linearised at the truth. It is computed in the invariant error frame. In this
-frame, the Jacobian of the motion is the identity, and those of the readings depend on
-relative positions only. In the additive frame, such a filter would observe its heading.
-With p the position, l each landmark, J = [0 −1; 1 0] and G = ∂(β, r)/∂(l − p)::
+The bound of Tichavský, Muravchik and Nehorai [1]_ is the covariance of a Kalman filter
+that is linearised at the truth. An EKF that gets the true motion and exact readings is
+such a filter, because its estimate is the truth. Many runs are filtered at once. The
+bound is about the errors in the invariant frame. With p the position, l each landmark
+and J = [0 −1; 1 0], these are to first order ::
 
-    motion     ξ_p += R(θ) ε_xy − J p' ε_α,    ξ_θ += ε_α,    ξ_l −= J l ε_α
-    reading    G (ξ_l − ξ_p) + noise
-    first one  ξ_l = ξ_p + G⁻¹ noise
+    ξ_p = e_p − J p e_θ,    ξ_θ = e_θ,    ξ_l = e_l − J l e_θ
 
 References
 ----------
@@ -18,18 +16,20 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
-from ..arrays import Array, BoolArray, IntArray
+from ..arrays import SMALLEST, Array, BoolArray, IntArray
+from ..estimator.filters.batch import BatchSlam
+from ..estimator.filters.ekf import EkfSlam
 from ..estimator.guards import argument_checks
-from ..estimator.models.bearing_range import reading_slopes_jit
-from ..estimator.models.rigid_motion import seen_from
+from ..estimator.kernels.batch import NEVER
+from ..estimator.models.rigid_motion import invariant_covariance, seen_from
 from ..estimator.models.sensors import BEARING_RANGE, POSITION, Sensor, find_sensor
-from ..jit import jit, njit_allocating, njit_internal
 
 
 class PosteriorBound(NamedTuple):
@@ -70,6 +70,7 @@ def posterior_bound(
     pose_std: ArrayLike = (np.inf, np.inf, np.inf),
     sensor: str | Sensor = "bearing_range",
     origin: tuple[float, float] = (0.0, 0.0),
+    threads: int | None = None,
 ) -> PosteriorBound:
     """Return the bound of many runs, each along its own true path.
 
@@ -96,6 +97,8 @@ def posterior_bound(
     origin : (float, float)
         Origin of the invariant frame [m].  It must lie near the path: about a distant
         one, the heading error dominates, and the other errors lose their digits.
+    threads : int, optional
+        By default, the number of cores.
 
     Raises
     ------
@@ -117,26 +120,33 @@ def posterior_bound(
     about = argument_checks.finite_vector("origin", origin, 2)
     poses, places = seen_from(about, poses), places - about
     check = argument_checks.standard_deviations
-    stds = check("measurement_std", measurement_std, 2)
-    read = find_sensor(sensor)
-    noise = np.array([*read.noise(stds), float(read == POSITION)])
-    motion = check("motion_std", motion_std, 3) ** 2
-    start = check("start_std", start_std, 3)
-    durations = np.broadcast_to(np.asarray(dt, dtype=np.float64), (count, steps)).copy()
-    fixes = np.broadcast_to(np.square(pose_std), (count, steps, 3)).astype(np.float64)
-    position, heading, raw = (np.full((count, steps), np.nan) for _ in range(3))
-    if read not in (BEARING_RANGE, POSITION):
-        unknown = np.full(count, np.nan)
-        return PosteriorBound(position, heading, raw, unknown, origin=origin)
-    starts = _invariant_start(poses[:, :1], start)
-    runs = zip(poses, places, seen, durations, fixes, strict=True)
-    rows = zip(position, heading, raw, strict=True)
-    covariances = tuple(
-        _of_one_run(run, (motion, noise), start, out)
-        for run, start, out in zip(runs, starts, rows, strict=True)
+    start, read = check("start_std", start_std, 3), find_sensor(sensor)
+    stds = (
+        check("motion_std", motion_std, 3),
+        check("measurement_std", measurement_std, 2),
     )
-    spread = np.array([_about_centre(covariance) for covariance in covariances])
-    return PosteriorBound(position, heading, raw, spread, covariances, origin)
+    position, heading, raw = (np.full((count, steps), np.nan) for _ in range(3))
+    spread, covariances = np.full(count, np.nan), list[Array]()
+    if read not in (BEARING_RANGE, POSITION):
+        return PosteriorBound(position, heading, raw, spread, origin=origin)
+    slam = EkfSlam(*stds, sensor=read, min_range=SMALLEST)
+    durations = np.broadcast_to(np.asarray(dt, dtype=np.float64), (count, steps))
+    fixes = np.broadcast_to(np.asarray(pose_std, dtype=np.float64), poses.shape)
+    for some in _pieces(seen):
+        part = _Drives(
+            poses[some], places[some], seen[some], durations[some], fixes[some]
+        )
+        P, whole, known = _filtered(part, slam, start, threads)
+        x, y = poses[some, :, 0], poses[some, :, 1]
+        lever = (
+            2 * (y * P[..., 0, 2] - x * P[..., 1, 2]) + (x * x + y * y) * P[..., 2, 2]
+        )
+        raw[some], heading[some] = P[..., 0, 0] + P[..., 1, 1], P[..., 2, 2]
+        position[some] = raw[some] + lever
+        spread[some] = _about_centre(whole, known)
+        sizes = (3 + 2 * known).tolist()
+        covariances += [each[:n, :n] for each, n in zip(whole, sizes, strict=True)]
+    return PosteriorBound(position, heading, raw, spread, tuple(covariances), origin)
 
 
 def efficiency(bound: Array, squared_error: Array) -> Efficiency:
@@ -183,183 +193,116 @@ def map_error_squared(error: Array) -> Array:
     return np.asarray((apart**2).sum(axis=-1).mean(axis=-1))
 
 
-def _invariant_start(first: Array, std: Array) -> Array:
-    """Return D P Dᵀ of the first poses, shape (B, 3, 3)."""
-    lever = np.zeros((len(first), 3, 3))
-    lever[:] = np.eye(3)
-    lever[:, 0, 2], lever[:, 1, 2] = first[:, 0, 1], -first[:, 0, 0]
-    return np.asarray(lever * std**2 @ lever.mT)
+class _Drives(NamedTuple):
+    """What B runs of T scans do and read, without noise."""
+
+    poses: Array  # (B, T, 3)
+    places: Array  # (B, L, 2) of landmarks
+    visible: BoolArray  # (B, T, L)
+    dt: Array  # (B, T)
+    pose_std: Array  # (B, T, 3), of readings of the poses, infinite where there is none
 
 
-_Run = tuple[Array, Array, BoolArray, Array, Array]  # path, map, visible, dt, fixes
-_Bounds = tuple[Array, Array, Array]  # rows of a `PosteriorBound`
+_MOST_BYTES = 2**22  # of the covariances of the runs that are filtered at once
 
 
-def _of_one_run(
-    run: _Run, noise: tuple[Array, Array], start: Array, out: _Bounds
-) -> Array:
-    """Fill in the bounds of a run, and return the covariance at its end.
+def _pieces(visible: BoolArray) -> Iterator[slice]:
+    """Cut runs into pieces that fit into memory."""
+    most = int(visible.any(axis=1).sum(axis=1).max(initial=0))
+    size = max(argument_checks.usable_cores(), _MOST_BYTES // (8 * (3 + 2 * most) ** 2))
+    for begin in range(0, len(visible), size):
+        yield slice(begin, begin + size)
 
-    Landmarks enter in the order in which they are read, so that those still unread
-    cost nothing.
+
+def _filtered(
+    drives: _Drives, slam: EkfSlam, start_std: Array, threads: int | None
+) -> tuple[Array, Array, IntArray]:
+    """Filter runs at the truth.
+
+    Returns
+    -------
+    pose_covariances : ndarray, shape (B, T, 3, 3)
+        In the additive frame.
+    covariances : ndarray, shape (B, 3 + 2n, 3 + 2n)
+        At the end, in the invariant frame.
+    known : ndarray of int, shape (B,)
+        The number of landmarks that each run reads, n at most.
     """
-    poses, landmarks, visible, dt, fixes = run
-    rows = np.flatnonzero(visible.any(axis=0))
-    rows = rows[np.argsort(visible[:, rows].argmax(axis=0), kind="stable")]
-    P = np.zeros((3 + 2 * len(rows), 3 + 2 * len(rows)))
-    P[:3, :3] = start
-    most = int(visible.sum(axis=1).max(initial=0))  # readings of a scan
-    by_row = np.argsort(rows)  # the order within a scan
-    run = poses, landmarks[rows], visible[:, rows], dt, fixes
-    _follow(run, by_row, noise, np.empty((2, 2 * most, len(P))), P, out)
-    at = 3 + 2 * by_row
-    columns = np.concatenate([np.arange(3), np.stack([at, at + 1], axis=1).ravel()])
-    return np.asarray(P[np.ix_(columns, columns)])
+    is_read = drives.visible.any(axis=1)
+    known = is_read.sum(axis=1)
+    rows = np.argsort(~is_read, axis=1, kind="stable")[:, : known.max(initial=0)]
+    if not is_read.all():
+        drives = drives._replace(
+            places=np.take_along_axis(drives.places, rows[..., None], axis=1),
+            visible=np.take_along_axis(drives.visible, rows[:, None], axis=2),
+        )
+    batch = BatchSlam(
+        slam,
+        *rows.shape,
+        initial_poses=drives.poses[:, 0],
+        initial_pose_std=start_std,
+        threads=threads,
+    )
+    pose_covariances = _pose_covariances(batch, drives, slam.sensor)
+    beliefs = batch.beliefs()
+    whole = invariant_covariance(beliefs.means, beliefs.covariances)
+    whole[batch.failed_at != NEVER] = np.nan
+    return pose_covariances, whole, known
 
 
-def _about_centre(covariance: Array) -> float:
-    """Return the mean variance of the landmarks about their centre."""
-    count = len(covariance) // 2 - 1
-    if not count:
-        return float("nan")
-    total = 0.0
-    for axis in (3, 4):
-        block = covariance[axis::2, axis::2].copy()
-        total += block.trace() / count - block.mean()
-    return float(total)
+def _pose_covariances(batch: BatchSlam, drives: _Drives, sensor: Sensor) -> Array:
+    """Take a batch through exact drives, in pieces that end where poses are read."""
+    poses, _, visible, dt, pose_std = drives
+    moved, z = _displacements(poses), _readings(drives, sensor)
+    dt = np.where(np.arange(dt.shape[1]) > 0, dt, 0.0)
+    P, begin = np.empty((*dt.shape, 3, 3)), 0
+    due = np.flatnonzero(np.isfinite(pose_std).any(axis=(0, 2)))
+    for end in sorted({*(due + 1).tolist(), dt.shape[1]}):
+        part = np.s_[:, begin:end]
+        P[part] = batch.run(
+            moved[part], z[part], visible[part], dt[part]
+        ).pose_covariances
+        last, begin = end - 1, end
+        stds, going = pose_std[:, last], batch.failed_at == NEVER
+        for std in np.unique(stds[going], axis=0):
+            if (here := np.isfinite(std)).any():
+                runs, R = going & (stds == std).all(axis=1), np.diag(std[here] ** 2)
+                batch.observe_pose(poses[:, last, here], np.eye(3)[here], R, runs=runs)
+                P[runs, last] = batch.storage().covariances[runs, :3, :3]
+    return P
 
 
-@jit
-def _follow(
-    run: _Run,
-    by_row: IntArray,
-    noises: tuple[Array, Array],
-    pending: Array,
-    P: Array,
-    out: _Bounds,
-) -> None:
-    """Take the bound P of one run through all its scans, in place.
+def _displacements(poses: Array) -> Array:
+    """Return the motion before each pose in the frame of the robot, (B, T, 3)."""
+    step, heading = np.diff(poses, axis=1, prepend=poses[:, :1]), poses[:, :-1, 2]
+    dx, dy = step[:, 1:, 0].copy(), step[:, 1:, 1].copy()
+    cos, sin = np.cos(heading), np.sin(heading)
+    step[:, 1:, 0], step[:, 1:, 1] = cos * dx + sin * dy, cos * dy - sin * dx
+    return step
 
-    The first `size` rows and columns of P are those of the pose and of the landmarks
-    read so far. Landmark i is the (i + 1)-th to be read. A scan is subtracted from P in
-    one pass, from its pending rows and shares: P −= Σ share rowᵀ.
+
+def _readings(drives: _Drives, sensor: Sensor) -> Array:
+    """Return the exact readings, shape (B, T, L, 2), zeros where not visible."""
+    poses, places, visible, *_ = drives
+    run, scan, row = np.nonzero(visible)
+    dx, dy = (places[run, row] - poses[run, scan, :2]).T
+    cos, sin = np.cos(poses[..., 2])[run, scan], np.sin(poses[..., 2])[run, scan]
+    z = np.zeros((*visible.shape, 2))
+    z[visible] = sensor.read(cos * dx + sin * dy, cos * dy - sin * dx)
+    return z
+
+
+def _about_centre(covariances: Array, known: IntArray) -> Array:
+    """Return the mean variance of the landmarks about their centre, shape (B,).
+
+    Runs with equally many landmarks are computed together: a sum of more numbers, even
+    zeros, has other last bits.
     """
-    (poses, landmarks, visible, dt, fixes), (motion, noise) = run, noises
-    entry = np.zeros((len(P), 3))
-    size = 3
-    for t in range(len(poses)):
-        if t > 0 and dt[t] > 0:
-            _move(poses, landmarks, t, motion * dt[t], entry, P, size)
-        x, y = poses[t, 0], poses[t, 1]
-        count = 0
-        for i in by_row:
-            if not visible[t, i]:
-                continue
-            dx, dy = landmarks[i, 0] - x, landmarks[i, 1] - y
-            bx, by, rx, ry = reading_slopes_jit(dx, dy)
-            distance = np.sqrt(dx * dx + dy * dy)
-            across = (noise[0] + noise[3] / max(distance, 1e-12)) ** 2
-            along = (noise[1] + noise[2] * distance) ** 2
-            if noise[4] > 0:  # (x, y) in the robot's frame
-                ry, rx = np.cos(poses[t, 2]), -np.sin(poses[t, 2])
-                bx, by, distance = ry, -rx, 1.0
-            c = 3 + 2 * i
-            if c < size:
-                _read(P, size, pending, count, c, bx, by, across)
-                _read(P, size, pending, count + 1, c, rx, ry, along)
-                count += 2
-            else:
-                _subtract(P, size, pending, count)
-                count = 0
-                size += 2
-                _add(P, c, size, rx, ry, across * distance * distance, along)
-        _subtract(P, size, pending, count)
-        for axis, lever in enumerate((-y, x, 1.0)):
-            _fix(P, size, axis, lever, fixes[t, axis])
-        out[0][t], out[1][t] = P[0, 0] + P[1, 1], P[2, 2]
-        lever = 2 * (x * P[1, 2] - y * P[0, 2]) + (x * x + y * y) * P[2, 2]
-        out[2][t] = out[0][t] + lever
-
-
-@njit_allocating
-def _move(
-    poses: Array, points: Array, t: int, noise: Array, entry: Array, P: Array, size: int
-) -> None:
-    """Add the noise of the motion to scan t, with the variances ``noise``."""
-    cos, sin = np.cos(poses[t - 1, 2]), np.sin(poses[t - 1, 2])
-    entry[0, 0], entry[1, 0] = cos, sin
-    entry[0, 1], entry[1, 1] = -sin, cos
-    entry[0, 2], entry[1, 2], entry[2, 2] = poses[t, 1], -poses[t, 0], 1.0
-    for i in range(size // 2 - 1):
-        entry[3 + 2 * i, 2], entry[4 + 2 * i, 2] = points[i, 1], -points[i, 0]
-    for i in range(2):
-        for j in range(2):
-            for k in range(2):
-                P[i, j] += entry[i, k] * entry[j, k] * noise[k]
-    turn = entry[:, 2].copy()
-    for i in range(size):
-        turned, row = turn[i] * noise[2], P[i]
-        for j in range(size):
-            row[j] += turned * turn[j]
-
-
-@njit_allocating
-def _fix(P: Array, size: int, axis: int, lever: float, variance: float) -> None:
-    """Take in a reading of x, y or θ: of ξ along the axis, and `lever` times ξ_θ."""
-    if variance == np.inf:
-        return
-    row = lever * P[2, :size]
-    if axis < 2:
-        row += P[axis, :size]
-    total = lever * row[2] + variance
-    if axis < 2:
-        total += row[axis]
-    for i in range(size):
-        for j in range(size):
-            P[i, j] -= row[i] * row[j] / total
-
-
-@njit_allocating
-def _read(
-    P: Array, size: int, due: Array, m: int, c: int, gx: float, gy: float, noise: float
-) -> None:
-    """Take in one number, (gx, gy) (ξ_l − ξ_p) plus noise, of the landmark at c.
-
-    It becomes due, after ``m`` others; the variance of its noise is ``noise``.
-    """
-    now = np.empty((4, size))  # rows of P after what is due
-    for n, at in enumerate((c, c + 1, 0, 1)):
-        now[n] = P[at, :size]
-        for k in range(m):
-            now[n] -= due[1, k, at] * due[0, k, :size]
-    row, share = due[0, m], due[1, m]
-    for j in range(size):
-        row[j] = gx * (now[0, j] - now[2, j]) + gy * (now[1, j] - now[3, j])
-    total = gx * (row[c] - row[0]) + gy * (row[c + 1] - row[1]) + noise
-    for i in range(size):
-        share[i] = row[i] / total
-
-
-@njit_internal
-def _subtract(P: Array, size: int, pending: Array, count: int) -> None:
-    """Subtract what is pending, the two numbers of each reading together."""
-    for i in range(size):
-        target = P[i]
-        for k in range(0, count, 2):
-            first, second = pending[0, k], pending[0, k + 1]
-            share, other = pending[1, k, i], pending[1, k + 1, i]
-            for j in range(size):
-                target[j] = target[j] - share * first[j] - other * second[j]
-
-
-@njit_internal
-def _add(
-    P: Array, c: int, size: int, rx: float, ry: float, across: float, along: float
-) -> None:
-    """Add the landmark at c, read in the direction (rx, ry), ξ_l = ξ_p + noise."""
-    for j in range(size):
-        P[c, j], P[c + 1, j] = P[0, j], P[1, j]
-        P[j, c], P[j, c + 1] = P[0, j], P[1, j]
-    P[c, c] = P[0, 0] + rx * rx * along + ry * ry * across
-    P[c + 1, c + 1] = P[1, 1] + ry * ry * along + rx * rx * across
-    P[c, c + 1] = P[c + 1, c] = P[0, 1] + rx * ry * (along - across)
+    found = np.where(known > 0, 0.0, np.nan)
+    for n in np.unique(known[known > 0]).tolist():
+        runs = np.flatnonzero(known == n)
+        for axis in (3, 4):
+            block = covariances[runs, axis : 3 + 2 * n : 2, axis : 3 + 2 * n : 2]
+            own = np.ascontiguousarray(block.diagonal(axis1=1, axis2=2))
+            found[runs] += own.mean(axis=1) - block.reshape(len(runs), -1).mean(axis=1)
+    return found

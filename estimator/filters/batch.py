@@ -232,13 +232,14 @@ class BatchSlam(Restorable):
 
         Parameters
         ----------
-        odometry : array_like, shape (B, T, 2)
-            (d, α) before each scan [m, rad].
+        odometry : array_like, shape (B, T, 2) or (B, T, 3)
+            (d, α) before each scan [m, rad], or the columns of another drive; or the
+            displacement (dx, dy, α) in the robot's frame [m, m, rad] of any drive.
         measurements : array_like, shape (B, T, L, 2)
             Rows (β, r) of landmarks 0 … L−1 [rad, m]; what is not visible is not read.
         visible : array_like of bool, shape (B, T, L)
             Which readings there are.
-        dt : float or array_like, shape (T,)
+        dt : float or array_like, shape (T,) or (B, T)
             Duration that the motion noise of each step counts.  A first scan before
             any motion is odometry (0, 0) with dt = 0.
         runs : array_like of bool, shape (B,), optional
@@ -251,9 +252,9 @@ class BatchSlam(Restorable):
         """
         u = argument_checks.as_floats("odometry", odometry)
         steps = u.shape[1] if u.ndim == 3 else 0
-        u = shaped("odometry", u, (self.runs, steps, 2))
+        u = self._displacements(u, (self.runs, steps))
         durations = _durations(dt)
-        if durations.shape not in ((), (1,), (steps,)):
+        if durations.shape not in ((), (1,), (steps,), (self.runs, steps)):
             raise ValueError(
                 f"dt must be one number or {steps}, got shape {durations.shape}"
             )
@@ -351,12 +352,18 @@ class BatchSlam(Restorable):
         durations: Array,
     ) -> StepData:
         """Return the data of steps, of ``shape`` (B,) or (B, T), or refuse them."""
-        u = shaped("odometry", odometry, (*shape, 2))
+        moved = self._displacements(odometry, shape)
         z = shaped("measurements", measurements, (*shape, self.landmarks, 2))
         seen = _shaped_flags("visible", visible, (*shape, self.landmarks))
         dt = shaped("dt", durations, shape)
         z, seen, dt = map(_writeable, (z, seen, dt))
-        return StepData(self.motion.displacements(u), z, seen, dt)
+        return StepData(moved, z, seen, dt)
+
+    def _displacements(self, odometry: ArrayLike, shape: tuple[int, ...]) -> Array:
+        u = argument_checks.as_floats("odometry", odometry)
+        if u.shape == (*shape, 3):
+            return _writeable(u)
+        return self.motion.displacements(shaped("odometry", u, (*shape, 2)))
 
     def _drive(
         self, data: tuple[Any, ...], trace: BatchTrace, runs: ArrayLike | None
@@ -409,7 +416,9 @@ def _of(part: slice, arrays: tuple[Any, ...]) -> tuple[Any, ...]:
 def _durations(dt: ArrayLike) -> Array:
     """Return durations, or refuse such as are not finite or below 0."""
     durations = argument_checks.as_floats("dt", dt)
-    if not all(0.0 <= each <= LARGEST for each in durations.ravel().tolist()):
+    few = durations.size < 100  # numpy needs longer for a few numbers
+    ends = durations.ravel().tolist() if few else (durations.min(), durations.max())
+    if not all(0.0 <= each <= LARGEST for each in ends):
         raise ValueError(
             f"dt must be finite numbers >= 0 and at most {LARGEST:g}, got {dt!r}"
         )

@@ -340,7 +340,9 @@ def first_flaw(settings: FilterSettings, runs: SimulatedRuns, run: int) -> str:
 _MANY = 6  # deviations that a displacement hardly exceeds
 
 
-def bound_runs(scenario: Scenario, runs: SimulatedRuns) -> PosteriorBound:
+def bound_runs(
+    scenario: Scenario, runs: SimulatedRuns, *, threads: int | None = None
+) -> PosteriorBound:
     """Return the bound along each run's true path, with the noise of the world.
 
     Where the world hides identities, it is that of a filter which knows them. It is nan
@@ -362,6 +364,7 @@ def bound_runs(scenario: Scenario, runs: SimulatedRuns) -> PosteriorBound:
         pose_std=runs.fix_std,
         sensor=sensor_with_noise(scenario.sensor.kind, scenario),
         origin=scenario.start.pose[:2],
+        threads=threads,
     )
     return bound._replace(covariances=())
 

@@ -406,7 +406,7 @@ class _Work:
     def _measured(self, span: range) -> list[Block]:
         world, first = self.job.scenario, self.job.seed + span.start
         runs = simulate_runs(world, len(span), first, only_read=True)
-        bound = bound_runs(world, runs)
+        bound = bound_runs(world, runs, threads=self.threads)
         noise = noise_of_runs(world, self.job.assumed, runs)
         oracle = oracle_of_runs(world, runs, self.job.resolution)
         parts = []

@@ -92,6 +92,21 @@ def test_each_run_gives_the_bits_of_a_single_filter(case, data):
             assert trace.degrees_of_freedom[run, step] == report.degrees_of_freedom
 
 
+def test_runs_take_displacements_and_durations_of_their_own(data):
+    odometry, measurements, visible = data
+    moved = np.insert(odometry, 1, 0.0, axis=2)
+    dt = np.ones((RUNS, STEPS)) * np.arange(RUNS)[:, None]
+    batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
+    trace = batch.run(moved, measurements, visible, dt)
+    for run in range(RUNS):
+        one = make_batch("ekf", runs=1, landmarks=LANDMARKS, **NOISE)
+        alone = one.run(*(array[[run]] for array in data), dt[run])
+        np.testing.assert_array_equal(trace.poses[run], alone.poses[0])
+        np.testing.assert_array_equal(
+            trace.pose_covariances[run], alone.pose_covariances[0]
+        )
+
+
 def test_runs_in_pieces_continue_where_they_stopped(data):
     settings = {"runs": RUNS, "landmarks": LANDMARKS, **NOISE}
     whole, pieces = make_batch("ekf", **settings), make_batch("ekf", **settings)

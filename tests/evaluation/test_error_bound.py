@@ -1,15 +1,13 @@
-"""The bound on the errors of any filter: against Kalman's covariance, and filters."""
+"""The bound on the errors of any filter: against Kalman's covariance, and dense."""
 
 import tracemalloc
 
 import numpy as np
 import pytest
 
-from slamgym.estimator import make_estimator
-from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.motions import predict_pose
-from slamgym.estimator.models.rigid_motion import invariant_covariance
-from slamgym.estimator.models.sensors import BEARING_RANGE
+from slamgym.estimator.models.rigid_motion import rotation
+from slamgym.estimator.models.sensors import BEARING_RANGE, POSITION
 from slamgym.evaluation.error_bound import (
     efficiency,
     map_error_squared,
@@ -42,33 +40,76 @@ def bound_of(poses, visible, landmarks=PLACES, **changes):
     return posterior_bound(poses[None], landmarks[None], visible[None], **settings)
 
 
+def lever(point):
+    """Return −J p."""
+    return np.array([point[1], -point[0]])
+
+
+def corrected(P, H, R):
+    """Take in a reading of H ξ."""
+    return P - P @ H.T @ np.linalg.solve(H @ P @ H.T + R, H @ P)
+
+
+def dense_bound(poses, visible, pose_std, sensor, motion_std, measurement_std):
+    """Bound one run by the recursion of its invariant error, with dense matrices::
+
+    motion     ξ_p += R(θ) ε_xy − J p' ε_α,    ξ_θ += ε_α,    ξ_l −= J l ε_α
+    reading    G (ξ_l − ξ_p) + noise,    G = ∂z/∂(l − p)
+    first one  ξ_l = ξ_p + G⁻¹ noise
+    """
+    D = np.eye(3)
+    D[:2, 2] = lever(poses[0, :2])
+    P, order, states = D @ np.diag(np.square(START_STD)) @ D.T, [], []
+    for t, pose in enumerate(poses):
+        if t:
+            F = np.eye(len(P), 3)
+            F[:2, :2] = rotation(poses[t - 1, 2])
+            for row, point in enumerate([pose[:2], *PLACES[order]]):
+                F[[0, 1] if row == 0 else [1 + 2 * row, 2 + 2 * row], 2] = lever(point)
+            P = P + F @ np.diag(np.square(motion_std)) @ F.T
+        for i in np.flatnonzero(visible[t]):
+            G = sensor.predict(pose, PLACES[[i]]).jacobian_landmark[0]
+            distance = np.linalg.norm(PLACES[i] - pose[:2])
+            Q = np.diag(sensor.stds(measurement_std, distance) ** 2)
+            if i in order:
+                H, c = np.zeros((2, len(P))), 3 + 2 * order.index(i)
+                H[:, :2], H[:, c : c + 2] = -G, G
+                P = corrected(P, H, Q)
+            else:
+                order.append(i)
+                A = np.vstack([np.eye(len(P)), np.eye(2, len(P))])
+                P = A @ P @ A.T
+                P[-2:, -2:] += np.linalg.inv(G) @ Q @ np.linalg.inv(G).T
+        for axis in np.flatnonzero(np.isfinite(pose_std[t])):
+            H = np.zeros((1, len(P)))
+            H[0, 2] = 1.0 if axis == 2 else -lever(pose[:2])[axis]
+            H[0, axis] = 1.0
+            P = corrected(P, H, pose_std[t, axis] ** 2)
+        D[:2, 2] = -lever(pose[:2])
+        states.append(
+            (P[:2, :2].trace(), P[2, 2], (D @ P[:3, :3] @ D.T)[:2, :2].trace())
+        )
+    at = np.argsort(order)
+    columns = [0, 1, 2, *(np.array([3, 4]) + 2 * at[:, None]).ravel()]
+    return np.array(states).T, P[np.ix_(columns, columns)]
+
+
 @pytest.mark.parametrize("fixes", [False, True])
-def test_the_bound_is_the_invariant_filter_where_it_linearises_at_the_truth(fixes):
+@pytest.mark.parametrize("sensor", [NOISE["sensor"], POSITION])
+def test_the_bound_is_the_recursion_of_the_invariant_error(sensor, fixes):
     poses, visible = exact_drive()
+    rng = np.random.default_rng(5)
+    poses += 0.1 * rng.standard_normal(poses.shape)  # sideways too
     pose_std = np.full((len(poses), 3), np.inf)
     if fixes:
         pose_std[3::3, :2], pose_std[1::2, 2] = (0.2, 0.1), 0.05
-    bound = bound_of(poses, visible, pose_std=pose_std)
-    start = {"initial_pose": poses[0], "initial_pose_std": START_STD}
-    slam = make_estimator("invariant", **start, **NOISE)
-    for t, pose in enumerate(poses):
-        if t:
-            slam.predict((0.3, 0.2))
-        seen = np.flatnonzero(visible[t])
-        slam.update(predict_measurement(pose, PLACES[seen]).measurement, seen)
-        if (here := np.isfinite(pose_std[t])).any():
-            R = np.diag(pose_std[t, here] ** 2)
-            slam.observe_pose(pose[here], np.eye(3)[here], R)
-        claimed = invariant_covariance(slam.belief().mean, slam.belief().covariance)
-        assert bound.position[0, t] == pytest.approx(claimed[:2, :2].trace())
-        assert bound.heading[0, t] == pytest.approx(claimed[2, 2])
-        additive = slam.belief().pose_covariance[:2, :2].trace()
-        assert bound.raw_position[0, t] == pytest.approx(additive)
-    ids = slam.belief().landmark_ids
-    assert set(ids) == set(range(len(PLACES)))
-    columns = [0, 1, 2, *(3 + 2 * i + axis for i in ids for axis in (0, 1))]
-    found = bound.covariances[0][np.ix_(columns, columns)]
-    assert found == pytest.approx(claimed, rel=1e-9, abs=1e-12)
+    visible[:, 2] = False
+    noise = NOISE | {"sensor": sensor}
+    bound = bound_of(poses, visible, pose_std=pose_std, **noise)
+    expected, covariance = dense_bound(poses, visible, pose_std, **noise)
+    for found, row in zip(bound, expected, strict=False):
+        np.testing.assert_allclose(found[0], row, rtol=1e-9)
+    np.testing.assert_allclose(bound.covariances[0], covariance, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("far", [(1e3, -1e3), (451234.5, 4412345.25), (1e9, -1e9)])
@@ -144,6 +185,23 @@ def test_landmarks_that_are_never_read_do_not_change_a_bit_and_take_no_memory():
         assert array.tobytes() == other.tobytes()
     assert few.covariances[0].tobytes() == many.covariances[0].tobytes()
     assert peak < 10 * (places.nbytes + seen.nbytes)  # not (2 × 10,000)² numbers
+
+
+@pytest.mark.parametrize("pose_std", [np.inf, 0.1])
+def test_readings_without_noise_have_no_bound_beyond_the_second(pose_std):
+    poses, visible = exact_drive()
+    visible[:] = True
+    bound = bound_of(
+        poses,
+        visible,
+        measurement_std=(0, 0),
+        sensor=BEARING_RANGE,
+        motion_std=(0, 0, 0),
+        start_std=(0, 0, 0),
+        pose_std=[pose_std] * 3,
+    )
+    assert np.isnan(bound.position[0, 1:]).all()
+    assert np.isnan(bound.covariances[0]).all()
 
 
 def test_no_landmark_leaves_dead_reckoning():
