@@ -7,10 +7,14 @@ import math
 import os
 import re
 import stat
+from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
+from ...arrays import Array
 from ...sim_configs.scenario_files import replace_when_written
 
 MAX_ID_DIGITS = 18  # every such number fits int64
@@ -221,6 +225,31 @@ def read_lines(path: str | PathLike[str]) -> list[LogLine]:
         byte = f"byte 0x{data[error.start]:02x}: save the file as UTF-8"
         raise line.error("UTF-8 text", byte) from None
     return to_lines(text, str(path))
+
+
+def texts(values: Array) -> list[str]:
+    """Write numbers so that reading gives the same bits, and nan as nothing.
+
+    Examples
+    --------
+    >>> texts(np.array([0.1, 2.0, np.nan]))
+    ['0.1', '2.0', '']
+    """
+    found = list(map(repr, values.tolist()))
+    for row in np.flatnonzero(np.isnan(values)).tolist():
+        found[row] = ""
+    return found
+
+
+def rows_of(separator: str, *columns: Iterable[str]) -> list[str]:
+    """Write rows from columns of texts.
+
+    Examples
+    --------
+    >>> rows_of(",", ["a", "b"], texts(np.array([1.0, 2.0])))
+    ['a,1.0', 'b,2.0']
+    """
+    return list(map(separator.join, zip(*columns, strict=False)))
 
 
 def write_whole(path: str | PathLike[str], text: str) -> None:

@@ -23,8 +23,9 @@ scan.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import repeat
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,7 +36,16 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, IntArray
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.motions import find_motion
-from .log_lines import LogError, LogLine, read_lines, shown, to_lines, write_whole
+from .log_lines import (
+    LogError,
+    LogLine,
+    read_lines,
+    rows_of,
+    shown,
+    texts,
+    to_lines,
+    write_whole,
+)
 
 __all__ = [
     "LogError",
@@ -192,15 +202,43 @@ def write_slamlog(log: SlamLog, path: str | PathLike[str]) -> None:
         If the log would not read back unchanged, for example because a number is not
         finite, or if the file cannot be written.
     """
-    text = "\n".join(_rendered(log)) + "\n"
+    text = _text([*_rendered_head(log), *_rendered_events(log), *_rendered_truth(log)])
+    copy = _read_back(log, text, path)
+    if len(copy.events) != len(log.events):
+        raise LogError(f"{path}: consecutive scans must differ in t, got equal times")
+    write_whole(path, text)
+
+
+def write_events(
+    log: SlamLog, events: Iterable[str], path: str | PathLike[str]
+) -> None:
+    """Write a log whose events are given as lines; only its head is read back.
+
+    Parameters
+    ----------
+    log : SlamLog
+        The log, without events.
+    events : iterable of str
+        Rows of odometry and measurements.
+    path : path
+        The file to write; its folder must exist.
+    """
+    head = list(_rendered_head(log))
+    _read_back(log, _text(head), path)
+    write_whole(path, _text([*head, *events, *_rendered_truth(log)]))
+
+
+def _text(lines: Iterable[str]) -> str:
+    return "\n".join(lines) + "\n"
+
+
+def _read_back(log: SlamLog, text: str, path: str | PathLike[str]) -> SlamLog:
     copy = _parse(to_lines(text, str(path)), log.name)
     if (copy.name, copy.header) != (log.name, log.header):
         raise LogError(
             f"{path}: name and header must be single lines without spaces at the ends"
         )
-    if len(copy.events) != len(log.events):
-        raise LogError(f"{path}: consecutive scans must differ in t, got equal times")
-    write_whole(path, text)
+    return copy
 
 
 class _SlamlogParser:
@@ -358,7 +396,7 @@ def _start(line: LogLine) -> Array:
     return np.array([line.to_real(number) for number in fields])
 
 
-def _rendered(log: SlamLog) -> Iterator[str]:
+def _rendered_head(log: SlamLog) -> Iterator[str]:
     yield FORMAT_LINE
     yield f"# name: {log.name}"
     yield f"# motion: {log.motion}"
@@ -367,6 +405,9 @@ def _rendered(log: SlamLog) -> Iterator[str]:
         yield f"# {key}: {value}"
     for landmark_id, position in zip(log.landmark_ids, log.landmarks, strict=True):
         yield f"landmark,{landmark_id},{numbers(*position)}"
+
+
+def _rendered_events(log: SlamLog) -> Iterator[str]:
     for event in log.events:
         if isinstance(event, OdometryRow):
             yield f"odometry,{numbers(event.t, event.d, event.alpha, event.dt)}"
@@ -375,8 +416,10 @@ def _rendered(log: SlamLog) -> Iterator[str]:
             yield f"pose,{numbers(event.t)},{values}"
         else:
             yield from _rendered_scan(event)
-    for *position, heading in log.ground_truth:
-        yield f"groundtruth,{numbers(*position)},{_known(heading)}"
+
+
+def _rendered_truth(log: SlamLog) -> list[str]:
+    return rows_of(",", repeat("groundtruth"), *map(texts, log.ground_truth.T))
 
 
 def _rendered_scan(scan: Scan) -> Iterator[str]:

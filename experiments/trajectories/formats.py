@@ -10,6 +10,7 @@ import math
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
+from itertools import repeat
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -27,6 +28,7 @@ from ...sim_configs import Scenario
 from ...sim_configs.field_types import unknown_choice
 from ...sim_configs.scenario_files import scenario_text
 from ..logs import slamlog
+from ..logs.log_lines import rows_of, texts
 from ..logs.recording import log_of_episode
 from ..run_and_replay.filter_settings import settings_for_scenario
 from .trajectory import (
@@ -344,8 +346,31 @@ def filtered_path(trajectory: Trajectory) -> tuple[Array, dict[int, Array]]:
 
 def _write_slamlog(trajectories: Sequence[Trajectory], path: Path) -> None:
     """Write a shard; see `TrajectoryFormat`."""
-    for name, trajectory in write_metadata(trajectories, path):
-        slamlog.write_slamlog(to_slamlog(trajectory), path / f"{name}.csv")
+    for name, each in write_metadata(trajectories, path):
+        world, seed, start = each.scenario, each.seed, each.start_estimate
+        landmarks = array_of(each, "landmarks")
+        log = log_of_episode(world, seed, start, landmarks, (), each.poses)
+        slamlog.write_events(log, _event_lines(each), path / f"{name}.csv")
+
+
+def _event_lines(trajectory: Trajectory) -> list[str]:
+    """Return the rows of the events of `to_slamlog`, from whole columns."""
+    mask, of = array_of(trajectory, "mask"), trajectory.landmark_ids
+    (step, row), z = np.nonzero(mask), array_of(trajectory, "measurements")[mask]
+    times = texts(np.arange(len(mask), dtype=np.float64))
+    at, ids = map(times.__getitem__, step.tolist()), map(str, row.tolist())
+    columns: list[Iterable[str]] = [repeat("measurement"), at, ids, *map(texts, z.T)]
+    if not trajectory.scenario.sensor.identities:
+        columns[2] = repeat("")
+        if of is not None:
+            columns += [repeat(""), map(str, of[mask].tolist())]
+    moves = map(texts, trajectory.odometry.T)
+    lines = rows_of(",", *columns)
+    lines += rows_of(",", repeat("odometry"), times[1:], *moves, repeat("1.0"))
+    order = np.argsort(
+        np.append(2 * step, 2 * np.arange(1, len(mask)) - 1), stable=True
+    )
+    return [lines[k] for k in order.tolist()]
 
 
 def _read_slamlog(path: Path) -> Iterator[Trajectory]:

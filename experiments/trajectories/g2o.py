@@ -19,7 +19,9 @@ refused.
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import count, repeat
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,8 @@ import numpy as np
 
 from ...arrays import Array
 from ...sim_configs import Scenario
-from .formats import filtered_path, numbers, read_metadata, write_lines, write_metadata
+from ..logs.log_lines import rows_of, texts
+from .formats import filtered_path, read_metadata, write_lines, write_metadata
 from .trajectory import Trajectory, array_of
 
 LIBRARIES = ("numba", "scipy")
@@ -55,21 +58,17 @@ def write(
     for each in trajectories:
         check(each.scenario)
     for name, each in write_metadata(trajectories, path):
-        landmarks = dict(enumerate(array_of(each, "landmarks")))
+        landmarks = array_of(each, "landmarks")
         poses, mapped = filtered_path(each)
         places = dict(sorted({**_first_seen(each, poses), **mapped}.items()))
-        graph = [
-            *_vertices(places, poses, len(landmarks)),
-            *_odometry_edges(each, len(landmarks), smallest_std),
-        ]
-        readings = list(_readings(each, smallest_std))
-        positions = [position for position, _ in readings]
-        write_lines(path / f"{name}.g2o", [*graph, *positions, f"FIX {len(landmarks)}"])
-        write_lines(
-            path / f"{name}_gtsam.g2o", [*graph, *(line for _, line in readings)]
-        )
-        truth = _vertices(landmarks, each.poses, len(landmarks))
-        write_lines(path / f"{name}_truth.g2o", list(truth))
+        first = len(landmarks)
+        graph = _vertices(list(places), np.array([*places.values()]), poses, first)
+        graph += _odometry_edges(each, first, smallest_std)
+        positions, polar = _readings(each, smallest_std)
+        write_lines(path / f"{name}.g2o", [*graph, *positions, f"FIX {first}"])
+        write_lines(path / f"{name}_gtsam.g2o", [*graph, *polar])
+        truth = _vertices(range(first), landmarks, each.poses, first)
+        write_lines(path / f"{name}_truth.g2o", truth)
 
 
 def read(path: Path) -> Iterator[Trajectory]:
@@ -78,11 +77,14 @@ def read(path: Path) -> Iterator[Trajectory]:
         yield _trajectory(path / name, about)
 
 
-def _vertices(landmarks: dict[int, Array], poses: Array, first: int) -> Iterator[str]:
-    for place, position in landmarks.items():
-        yield f"VERTEX_XY {place} {numbers(position)}"
-    for place, pose in enumerate(poses, start=first):
-        yield f"VERTEX_SE2 {place} {numbers(pose)}"
+def _vertices(
+    ids: Iterable[int], landmarks: Array, poses: Array, first: int
+) -> list[str]:
+    places = landmarks.reshape(-1, 2).T
+    each = rows_of(" ", repeat("VERTEX_XY"), map(str, ids), *map(texts, places))
+    return each + rows_of(
+        " ", repeat("VERTEX_SE2"), map(str, count(first)), *map(texts, poses.T)
+    )
 
 
 def _first_seen(trajectory: Trajectory, poses: Array) -> dict[int, Array]:
@@ -102,50 +104,59 @@ def _first_seen(trajectory: Trajectory, poses: Array) -> dict[int, Array]:
 
 def _odometry_edges(
     trajectory: Trajectory, first_pose: int, smallest: float
-) -> Iterator[str]:
-    """Yield odometry with the information of its noise.
+) -> list[str]:
+    """Return odometry with the information of its noise.
 
     The noise (εx, εy) refers to the old heading, while the error of an edge refers to
     the new one, rotated by α::
 
         Ω = diag(R(-α) diag(σx⁻², σy⁻²) R(α), σα⁻²)
     """
-    motion = trajectory.scenario.motion
-    for step, (distance, turn) in enumerate(trajectory.odometry.tolist(), first_pose):
-        rests = not motion.noise_at_rest and distance == turn == 0.0
-        std = (0.0, 0.0, 0.0) if rests else motion.std
-        along, aside, heading = (max(value, smallest) ** -2 for value in std)
-        xx, xy, yy = _turned(along, aside, -turn)
-        information = numbers((xx, xy, 0, yy, 0, heading))
-        yield (
-            f"EDGE_SE2 {step} {step + 1} {numbers((distance, 0, turn))} {information}"
-        )
+    motion, odometry = trajectory.scenario.motion, trajectory.odometry
+    moves = np.logical_or(odometry.any(axis=1), motion.noise_at_rest)
+    at_rest = max(0.0, smallest) ** -2
+    moving = [max(std, smallest) ** -2 for std in motion.std]
+    along, aside = (np.where(moves, value, at_rest) for value in moving[:2])
+    heading = [repr(moving[2] if moved else at_rest) for moved in moves.tolist()]
+    xx, xy, yy = map(texts, _turned(along, aside, -odometry[:, 1]))
+    start, end, zero = count(first_pose), count(first_pose + 1), repeat("0.0")
+    distance, turn = map(texts, odometry.T)
+    ends = repeat("EDGE_SE2"), map(str, start), map(str, end)
+    information = xx, xy, zero, yy, zero, heading
+    return rows_of(" ", *ends, distance, zero, turn, *information)
 
 
-def _readings(trajectory: Trajectory, smallest: float) -> Iterator[tuple[str, str]]:
-    """Yield every reading as a position in the robot's frame, and as (β, r, σβ, σr).
+def _readings(trajectory: Trajectory, smallest: float) -> tuple[list[str], list[str]]:
+    """Return all readings as positions in the robot's frame, and as (β, r, σβ, σr).
 
     The information of the position is of first order.
     """
     mask = array_of(trajectory, "mask")
-    measurements = array_of(trajectory, "measurements")
+    bearing, distance = array_of(trajectory, "measurements")[mask].T
     sensor = trajectory.scenario.sensor
     bearing_std = max(sensor.std[0], smallest)
-    for step, landmark in np.argwhere(mask).tolist():
-        bearing, distance = measurements[step, landmark].tolist()
-        range_std = max(sensor.std[1] + sensor.range_std_per_metre * distance, smallest)
-        information = _turned(range_std**-2, (distance * bearing_std) ** -2, bearing)
-        position = distance * math.cos(bearing), distance * math.sin(bearing)
-        ends = f"{mask.shape[1] + step} {landmark}"
-        yield (
-            f"EDGE_SE2_XY {ends} {numbers((*position, *information))}",
-            f"BR {ends} {numbers((bearing, distance, bearing_std, range_std))}",
-        )
+    range_std = sensor.std[1] + sensor.range_std_per_metre * distance
+    range_std = np.maximum(range_std, smallest)
+    cos, sin = _cos_sin(bearing)
+    along, aside = (
+        np.array([std**-2 for std in stds.tolist()])
+        for stds in (range_std, distance * bearing_std)
+    )
+    information = _turned(along, aside, bearing)
+    step, landmark = np.nonzero(mask)
+    places = [map(str, (mask.shape[1] + step).tolist()), map(str, landmark.tolist())]
+    ends = rows_of(" ", *places)
+    columns = distance * cos, distance * sin, *information
+    polar = *map(texts, (bearing, distance)), repeat(repr(bearing_std))
+    return (
+        rows_of(" ", repeat("EDGE_SE2_XY"), ends, *map(texts, columns)),
+        rows_of(" ", repeat("BR"), ends, *polar, texts(range_std)),
+    )
 
 
-def _turned(along: float, aside: float, angle: float) -> tuple[float, float, float]:
+def _turned(along: Array, aside: Array, angles: Array) -> tuple[Array, Array, Array]:
     """Return xx, xy, yy of R(angle) diag(along, aside) R(angle)ᵀ."""
-    cos, sin = math.cos(angle), math.sin(angle)
+    cos, sin = _cos_sin(angles)
     return (
         along * cos * cos + aside * sin * sin,
         (along - aside) * sin * cos,
@@ -153,34 +164,48 @@ def _turned(along: float, aside: float, angle: float) -> tuple[float, float, flo
     )
 
 
+def _cos_sin(angles: Array) -> tuple[Array, Array]:
+    """Return cosine and sine, with the same bits on every processor."""
+    listed = angles.tolist()
+    return np.array(list(map(math.cos, listed))), np.array(list(map(math.sin, listed)))
+
+
 def _trajectory(path: Path, about: dict[str, Any]) -> Trajectory:
-    graph = _fields(path.with_name(f"{path.name}_gtsam.g2o"))
-    truth = _fields(path.with_name(f"{path.name}_truth.g2o"))
-    odometry = _table(graph, "EDGE_SE2", (3, 5))
-    landmarks = _table(truth, "VERTEX_XY", (2, 3))
+    graph = _rows(path.with_name(f"{path.name}_gtsam.g2o"))
+    truth = _rows(path.with_name(f"{path.name}_truth.g2o"))
+    odometry, landmarks = (
+        _table(graph["EDGE_SE2"], 3, 5),
+        _table(truth["VERTEX_XY"], 2, 3),
+    )
     shape = (len(odometry) + 1, len(landmarks))
     measurements, mask = np.zeros((*shape, 2)), np.zeros(shape, dtype=np.bool_)
-    for tag, *fields in graph:
-        if tag == "BR":
-            place = int(fields[0]) - len(landmarks), int(fields[1])
-            measurements[place] = float(fields[2]), float(fields[3])
-            mask[place] = True
+    readings = _table(graph["BR"], 1, 2, 3, 4)
+    step, landmark = readings[:, :2].astype(np.int64).T
+    places = step - len(landmarks), landmark
+    measurements[places], mask[places] = readings[:, 2:], True
     return Trajectory(
         **about,
-        start_estimate=_table(graph, "VERTEX_SE2", (2, 3, 4))[0],
+        start_estimate=_table(graph["VERTEX_SE2"][:1], 2, 3, 4)[0],
         odometry=odometry,
-        poses=_table(truth, "VERTEX_SE2", (2, 3, 4)),
+        poses=_table(truth["VERTEX_SE2"], 2, 3, 4),
         landmarks=landmarks,
         measurements=measurements,
         mask=mask,
     )
 
 
-def _fields(path: Path) -> list[list[str]]:
-    return [line.split() for line in path.read_text(encoding="utf-8").splitlines()]
+def _rows(path: Path) -> dict[str, list[str]]:
+    """Return the lines of a file by their tags."""
+    found: dict[str, list[str]] = defaultdict(list)
+    for line in path.read_text(encoding="utf-8").splitlines():
+        found[line.partition(" ")[0]].append(line)
+    return found
 
 
-def _table(lines: Iterable[list[str]], tag: str, columns: tuple[int, ...]) -> Array:
-    """Return columns of all lines with a tag; column 0 is the tag."""
-    rows = [[float(line[k]) for k in columns] for line in lines if line[0] == tag]
-    return np.array(rows)
+def _table(lines: list[str], *columns: int) -> Array:
+    """Return columns of lines; column 0 is the tag."""
+    last = max(columns) + 1
+    parts = list(zip(*(line.split(None, last)[:last] for line in lines), strict=True))
+    if not parts:
+        return np.zeros((0, len(columns)))
+    return np.array([list(map(float, parts[k])) for k in columns]).T.copy()

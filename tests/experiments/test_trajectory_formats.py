@@ -11,7 +11,7 @@ import pytest
 from presets import PRESETS
 
 from slamgym.experiments.logs.importers import read_log
-from slamgym.experiments.logs.slamlog import OdometryRow
+from slamgym.experiments.logs.slamlog import OdometryRow, write_slamlog
 from slamgym.experiments.trajectories import (
     driven_episodes,
     generate_trajectories,
@@ -152,6 +152,10 @@ def test_a_slamlog_tells_a_filter_what_the_trajectory_says(preset, tmp_path):
             rows = drive.measurements[step][seen].tolist()
             assert scans[step].measurements.tolist() == rows
     assert (scans[0].landmark_ids is None) == (preset == "hidden_identities")
+    write_slamlog(log, tmp_path / "log.csv")
+    fmt("slamlog").write([drive], tmp_path / "shard")
+    shard_file = tmp_path / "shard" / "seed_00000003.csv"
+    assert shard_file.read_bytes() == (tmp_path / "log.csv").read_bytes()
 
 
 def test_parquet_is_one_row_per_moment(tmp_path):
