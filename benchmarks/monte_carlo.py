@@ -1,6 +1,9 @@
 """Time of a whole Monte Carlo, of its filter alone, and of a plain loop.
 
     python benchmarks/monte_carlo.py
+    python benchmarks/monte_carlo.py --parts [--earlier FOLDER]    # a former checkout
+
+``--parts`` compares bound and measures with the two filters of a study, in CPU time.
 
 One core, one process, interleaved rounds; ratios are medians over the rounds. The world
 has 20 landmarks around a circle, about half of them in view, and 1000 steps.
@@ -11,14 +14,19 @@ import os
 import tempfile
 import tracemalloc
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from statistics import median
 from time import perf_counter
+from typing import Any
 
 import gymnasium
 import numpy as np
-from interleaved import verdict
+from estimators import EARLIER, load_earlier
+from interleaved import ratio, time_interleaved, verdict
 from peers import StackedDense
+from rich.console import Console
+from rich.table import Table
 
 import slamgym
 from slamgym.estimator import BatchSlam, EkfSlam
@@ -129,16 +137,98 @@ def compare_memory(steps: int) -> None:
     print(f"  peak memory for 64 and 256 runs: {peaks[0]:.0f} and {peaks[1]:.0f} MiB")
 
 
+#: Worlds of `compare_parts` with the number of runs, and the least gain of a study.
+WORLDS = {
+    "six_landmarks": (256, 3.5),
+    "loop": (16, 1.8),
+    "corridor": (16, None),
+    "dense": (4, None),
+}
+FILTERS = "ekf", "invariant"
+PARTS = "filters", "bound", "measures", "study"
+SHARE = 0.5  # of bound and measures, of the time of the filters
+
+
+def parts_of(package: str, name: str, runs: int) -> dict[str, Callable[[], object]]:
+    """Return the parts of a study of a package, slamgym or an earlier one."""
+
+    def module(path: str) -> Any:
+        return import_module(f"{package}.{path}")
+
+    study = module("experiments.monte_carlo_study.filtered_runs")
+    settings_of = module("experiments.run_and_replay.filter_settings")
+    measures = module("experiments.monte_carlo_study.run_measures")
+    scenario = module("sim_configs").load_scenario(name)
+    simulated = module("experiments.run_and_replay.simulated_runs")
+    drives = simulated.simulate_runs(scenario, runs, 0, only_read=True)
+    settings = [
+        settings_of.settings_for_scenario(scenario, estimator=each) for each in FILTERS
+    ]
+    filtered = [study.filter_runs(each, drives) for each in settings]
+    bound = study.bound_runs(scenario, drives)
+    noise = study.noise_of_runs(scenario, scenario, drives)
+    whole = module("experiments.monte_carlo_study").monte_carlo
+    return {
+        "filters": lambda: [study.filter_runs(each, drives) for each in settings],
+        "bound": lambda: study.bound_runs(scenario, drives),
+        "measures": lambda: [
+            measures.measure_runs(drives, each, bound, noise) for each in filtered
+        ],
+        "study": lambda: whole(name, list(FILTERS), runs),
+    }
+
+
+def compare_parts(earlier: Path | None) -> None:
+    """Print the time of each part of a study, before and now, and the goals."""
+    packages = {"now": "slamgym"}
+    if earlier is not None:
+        load_earlier(earlier)
+        packages["before"] = EARLIER
+    table = Table(title=f"µs a run-step of {', '.join(FILTERS)} together, one core")
+    for column in ("world", "part", "before", "now", "gain", "goal", ""):
+        table.add_column(column, justify="left" if column in "world part" else "right")
+    for name, (runs, least) in WORLDS.items():
+        cases = {
+            f"{part} {when}": work
+            for when, package in packages.items()
+            for part, work in parts_of(package, name, runs).items()
+        }
+        times = time_interleaved(cases, rounds=3)
+        each = 1e6 / (runs * (load_scenario(name).steps + 1))
+        now = {part: median(times[f"{part} now"]) for part in PARTS}
+        for part, value in now.items():
+            row = [name, part, "", f"{each * value:.2f}", "", "", ""]
+            if earlier is not None:
+                before = f"{each * median(times[f'{part} before']):.2f}"
+                gain = ratio(times, f"{part} before", f"{part} now")
+                row[2], row[4] = before, f"{gain:.1f}"
+                if part == "study" and least:
+                    row[5:] = f">= {least}", verdict(gain, least, at_least=True)
+            table.add_row(*row)
+        share = (now["bound"] + now["measures"]) / now["filters"]
+        table.add_row(
+            *(name, "(bound + measures) / filters", "", f"{share:.2f}", ""),
+            *(f"<= {SHARE}", verdict(share, SHARE, at_least=False)),
+            end_section=True,
+        )
+    Console(width=100).print(table)
+
+
 def main() -> None:
     """Print what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=256)
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--parts", action="store_true")
+    parser.add_argument("--earlier", type=Path, help="a checkout of an earlier commit")
     arguments = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     print(f"slamgym {slamgym.__version__}")
+    if arguments.parts:
+        compare_parts(arguments.earlier)
+        return
     compare(arguments.runs, arguments.steps, arguments.rounds)
     compare_memory(arguments.steps)
 

@@ -201,7 +201,7 @@ def relative_map_nees(true_states: Array, means: Array, covariances: Array) -> A
     -------
     ndarray, shape (...)
     """
-    return normalised_squared_error(*_relative_map(true_states, means, covariances))
+    return normalised_squared_error(*relative_map(true_states, means, covariances))
 
 
 def relative_landmark_deviations(
@@ -227,9 +227,14 @@ def relative_landmark_deviations(
     ndarray, shape (..., n, 2)
         nan where the covariance of a landmark is singular.
     """
-    errors, claimed = _relative_map(true_states, means, covariances)
+    relative = relative_map(true_states, means, covariances)
+    return deviations_of_landmarks(*relative, means[..., 2])
+
+
+def deviations_of_landmarks(errors: Array, claimed: Array, headings: Array) -> Array:
+    """Return the deviations from what `relative_map` returns, and θ̂ (...)."""
     rows = np.arange(errors.shape[-1]).reshape(-1, 2)
-    turn = np.swapaxes(rotations(-means[..., 2]), -1, -2)[..., None, :, :]
+    turn = np.swapaxes(rotations(-headings), -1, -2)[..., None, :, :]
     blocks = turn @ claimed[..., rows[:, :, None], rows[:, None, :]]
     blocks = blocks @ np.swapaxes(turn, -1, -2)
     return whitened(np.einsum("...ij,...j->...i", turn, errors[..., rows]), blocks)
@@ -251,7 +256,7 @@ def is_indefinite(covariance: Array) -> bool:
     return bool(least < -_ROUNDING * len(std))
 
 
-def _relative_map(
+def relative_map(
     true_states: Array, means: Array, covariances: Array
 ) -> tuple[Array, Array]:
     """Return the errors of the map in the robot's frame, and their covariance."""

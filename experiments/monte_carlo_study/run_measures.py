@@ -440,9 +440,10 @@ def _measure_map(
         measured[f"landmark_nees_{frame}"] = by_id(values, ids, count)
     if not size:
         return measured
-    deviations = nees.relative_landmark_deviations(*states)
+    errors, claimed = nees.relative_map(*states)
+    deviations = nees.deviations_of_landmarks(errors, claimed, states[1][:, 2])
     measured |= deviations_by_id(deviations, ids, count)
-    relative = nees.relative_map_nees(*states)
+    relative = nees.normalised_squared_error(errors, claimed)
     for row in np.flatnonzero(np.isnan(relative)).tolist():
         if nees.is_indefinite(states[2][row]):
             relative[row] = math.inf
