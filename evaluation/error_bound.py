@@ -27,7 +27,6 @@ from ..arrays import SMALLEST, Array, BoolArray, IntArray
 from ..estimator.filters.batch import BatchSlam
 from ..estimator.filters.ekf import EkfSlam
 from ..estimator.guards import argument_checks
-from ..estimator.kernels.batch import NEVER
 from ..estimator.models.rigid_motion import invariant_covariance, seen_from
 from ..estimator.models.sensors import BEARING_RANGE, POSITION, Sensor, find_sensor
 
@@ -246,7 +245,7 @@ def _filtered(
     pose_covariances = _pose_covariances(batch, drives, slam.sensor)
     beliefs = batch.beliefs()
     whole = invariant_covariance(beliefs.means, beliefs.covariances)
-    whole[batch.failed_at != NEVER] = np.nan
+    whole[batch.failed_at >= 0] = np.nan
     return pose_covariances, whole, known
 
 
@@ -263,7 +262,7 @@ def _pose_covariances(batch: BatchSlam, drives: _Drives, sensor: Sensor) -> Arra
             moved[part], z[part], visible[part], dt[part]
         ).pose_covariances
         last, begin = end - 1, end
-        stds, going = pose_std[:, last], batch.failed_at == NEVER
+        stds, going = pose_std[:, last], batch.failed_at < 0
         for std in np.unique(stds[going], axis=0):
             if (here := np.isfinite(std)).any():
                 runs, R = going & (stds == std).all(axis=1), np.diag(std[here] ** 2)

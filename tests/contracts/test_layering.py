@@ -80,7 +80,7 @@ STRANGERS = {
     ("envs", "evaluation"),
     ("estimator", "sim_configs"),
 }
-EVALUATION_KNOWS = {"models", "guards", "beliefs", "interface"}
+EVALUATION_KNOWS = {"models", "guards", "beliefs", "interface", "filters"}
 MAY_IMPORT = {  # besides the standard library
     "sim_configs": {"numpy", "pydantic", "pydantic_core"},
     "envs": {"numpy", "scipy", "gymnasium", "pymunk"},
