@@ -3,6 +3,7 @@
     python benchmarks/estimators.py     # with filterpy and Stone Soup if installed
     pip install "slamgym[benchmark]"    # installs them
     python benchmarks/estimators.py --earlier FOLDER    # a checkout to compare with
+    python benchmarks/estimators.py --hidden    # readings without identities alone
 
 Every case takes the same step: predict, then all readings. "kernels" are the compiled
 functions alone; "public" are ``predict`` and ``update`` with all checks and the report.
@@ -18,6 +19,7 @@ from argparse import ArgumentParser
 from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from itertools import cycle
 from pathlib import Path
 from time import perf_counter, thread_time
 from typing import Any
@@ -209,6 +211,69 @@ def compare_single(landmarks: int) -> None:
             CONSOLE.print(f"  {slow} / {fast}: {found:.1f} ({said})")
 
 
+#: Landmarks seen and mapped, and the largest ratios to a filter with given identities:
+#: of a managed filter with hidden ones, and of one with given ones.
+HIDDEN = {
+    (6, 6): (5, 2),
+    (20, 20): (5, 2),
+    (50, 50): (8, 2),
+    (10, 200): (2, 2),
+    (10, 500): (2, 2),
+}
+
+
+def compare_hidden(seen: int, mapped: int) -> None:
+    """Print the time of a scan without identities, beside one with identities.
+
+    Landmarks have one on 25 m² each; the robot sees those that are nearest.
+    """
+    rng, side = np.random.default_rng(1), 5 * mapped**0.5
+    x, y = rng.uniform(-side / 2, side / 2, (2, mapped))
+    readings = np.stack([np.arctan2(y, x), np.hypot(x, y)], axis=1)
+    ids = np.argsort(readings[:, 1])[:seen]
+    near, goals = readings[ids], HIDDEN[seen, mapped]
+    scans = [
+        near + rng.standard_normal(near.shape) * MEASUREMENT_STD for _ in range(97)
+    ]
+    packages = {"": make_estimator}
+    if EARLIER in sys.modules:
+        packages = {", earlier": sys.modules[f"{EARLIER}.estimator"].make_estimator}
+        packages[""] = make_estimator
+    cases: dict[str, Callable[[], object]] = {}
+    for key, make in packages.items():
+        for name, given, options in (
+            ("identities given", ids, {}),
+            ("identities given, managed", ids, {"management": True}),
+            ("identities hidden", None, {"management": True}),
+        ):
+            slam = make("invariant", **NOISE, **options)
+            slam.update(readings, list(range(mapped)))
+            cases[name + key] = drive_step(slam, scans, given)
+    times = time_interleaved(cases)
+    CONSOLE.print(f"one step, {seen} seen of {mapped} landmarks")
+    for name in times:
+        found = ratio(times, name, "identities given")
+        goal = {"identities hidden": goals[0], "identities given, managed": goals[1]}
+        said = f" (<= {goal[name]}: {verdict(found, goal[name], at_least=False)})"
+        CONSOLE.print(
+            f"  {name}: {microseconds(times, name):.1f} µs, {found:.1f} ×"
+            + (said if name in goal else "")
+        )
+
+
+def drive_step(
+    slam: Any, scans: list[NDArray[np.float64]], ids: Any
+) -> Callable[[], object]:
+    """Take one scan after the other, and begin anew after the last one."""
+    rest = cycle(scans)
+
+    def step() -> None:
+        slam.predict(ODOMETRY)
+        slam.update(next(rest), ids)
+
+    return step
+
+
 def batch_data(
     runs: int, steps: int, landmarks: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
@@ -313,9 +378,14 @@ def wall_time(call: Callable[[], object]) -> float:
 if __name__ == "__main__":
     parser = ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--earlier", type=Path, help="a checkout of an earlier commit")
-    earlier = parser.parse_args().earlier
-    if earlier is not None:
-        load_earlier(earlier)
+    parser.add_argument("--hidden", action="store_true", help="these cases alone")
+    chosen = parser.parse_args()
+    if chosen.earlier is not None:
+        load_earlier(chosen.earlier)
+    for case in HIDDEN:
+        compare_hidden(*case)
+    if chosen.hidden:
+        sys.exit()
     for count in (6, 20, 50):
         compare_single(count)
     compare_batch()

@@ -92,7 +92,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
-from ...jit import jit, njit_internal
+from ...jit import jit, njit_inlined, njit_internal
 from ..interface import MapView
 from ..models.bearing_range import (
     expected_reading_jit,
@@ -187,14 +187,7 @@ class LostEvidence(NamedTuple):
 
     def after(self, more: float, mapped: Sequence[int]) -> LostEvidence:
         """Add the evidence of a scan before which these landmarks were in the map."""
-        present = max(0.0, self.present + min(more, MOST_OF_SCAN))
-        first_new = self.first_new
-        if present == 0:
-            first_new = max(first_new, 1 + max(mapped, default=-1))
-        share = min(abs(more) / TELLING, 1.0) / SCANS
-        lasting = min(present, self.lasting + share * (present - self.lasting))
-        changed = present, lasting, max(self.largest, lasting), first_new
-        return LostEvidence(*changed, *self[4:])
+        return evidence_of_misses(self, more, max(mapped, default=-1))
 
     def with_heading(self, variance: float, has_map: bool = True) -> LostEvidence:
         """Count a scan that leaves a variance of the heading [rad²].
@@ -207,23 +200,60 @@ class LostEvidence(NamedTuple):
         >>> evidence.unknown > LOST_SCORE
         True
         """
-        variance = min(max(float(variance), 0.0), UNIFORM)  # rounded, it may be < 0
-        is_unknown = has_map and variance - self.surest > UNKNOWN
-        unknown = self.unknown + MOST_OF_SCAN / 2 if is_unknown else 0.0
-        largest, surest = max(self.largest, unknown), min(self.surest, variance)
-        return self._replace(largest=largest, surest=surest, unknown=unknown)
+        return evidence_of_heading(self, float(variance), has_map)
 
     def with_readings(
         self, strange: int, explained: int, before: UnexplainedDensity
     ) -> LostEvidence:
         """Count a scan with readings that fit nothing, and with others."""
-        more = (1 - FEWER) * self.explained / before.scans
-        ratio = strange * math.log(1 + more / before.per_scan) - more
-        ratio += explained * math.log(FEWER)
-        unexplained = max(0.0, self.unexplained + min(ratio, MOST_OF_SCAN / 2) / 2)
-        total = MEMORY * self.explained + explained
-        largest = max(self.largest, unexplained)
-        return self._replace(largest=largest, unexplained=unexplained, explained=total)
+        sums = before.per_scan, before.scans
+        return evidence_of_readings(self, strange, explained, *sums)
+
+
+def evidence_of_misses(lost: LostEvidence, more: float, newest: int) -> LostEvidence:
+    """Return g, s and the largest evidence, where g changes by ``more``."""
+    present = max(0.0, lost.present + min(more, MOST_OF_SCAN))
+    first_new = lost.first_new
+    if present == 0:
+        first_new = max(first_new, 1 + newest)
+    share = min(abs(more) / TELLING, 1.0) / SCANS
+    lasting = min(present, lost.lasting + share * (present - lost.lasting))
+    largest = max(lost.largest, lasting)
+    left = lost.surest, lost.unknown, lost.unexplained, lost.explained
+    return LostEvidence(present, lasting, largest, first_new, *left)
+
+
+def evidence_of_heading(
+    lost: LostEvidence, variance: float, has_map: bool
+) -> LostEvidence:
+    """Return h and the largest evidence after a scan."""
+    variance = min(max(variance, 0.0), UNIFORM)  # rounded, it may be < 0
+    unknown = 0.0
+    if has_map and variance - lost.surest > UNKNOWN:
+        unknown = lost.unknown + MOST_OF_SCAN / 2
+    largest, surest = max(lost.largest, unknown), min(lost.surest, variance)
+    left = lost.unexplained, lost.explained
+    return LostEvidence(
+        lost.present, lost.lasting, largest, lost.first_new, surest, unknown, *left
+    )
+
+
+def evidence_of_readings(
+    lost: LostEvidence, strange: int, explained: int, per_scan: float, scans: float
+) -> LostEvidence:
+    """Return w and the largest evidence after n strange readings and m others."""
+    more = (1 - FEWER) * lost.explained / scans
+    ratio = strange * math.log(1 + more / per_scan) - more
+    ratio += explained * math.log(FEWER)
+    unexplained = max(0.0, lost.unexplained + min(ratio, MOST_OF_SCAN / 2) / 2)
+    total, largest = MEMORY * lost.explained + explained, max(lost.largest, unexplained)
+    left = lost.first_new, lost.surest, lost.unknown
+    return LostEvidence(lost.present, lost.lasting, largest, *left, unexplained, total)
+
+
+evidence_of_misses_jit = njit_inlined(evidence_of_misses)
+evidence_of_heading_jit = njit_inlined(evidence_of_heading)
+evidence_of_readings_jit = njit_inlined(evidence_of_readings)
 
 
 class Detections(NamedTuple):
@@ -273,7 +303,7 @@ class Detections(NamedTuple):
         proven = [i < new and self.shown.get(i, 0) >= PROVEN for i in ids]
         is_telling = np.array(proven, dtype=np.bool_)
         missed = np.array([self.missed.get(i, 1.0) for i in ids])
-        cost, fewer = _count(view[:2], scan, is_telling, longest, counts, missed)
+        cost, fewer = count_scan(view[:2], scan, is_telling, longest, counts, missed)
         left = {**self.missed, **dict(zip(ids, missed.tolist(), strict=True))}
         left = {i: chance for i, chance in left.items() if chance < 1}
         shown, seen = self.shown, [ids[k] for k in scan[0].tolist() if k >= 0]
@@ -325,12 +355,12 @@ class Detections(NamedTuple):
         """
         chance = prior * np.ones(len(view.ids))
         is_telling, counts = np.zeros(len(chance), dtype=np.bool_), self.detected.copy()
-        _count(view[:2], EMPTY, is_telling, longest, counts, chance)
+        count_scan(view[:2], EMPTY, is_telling, longest, counts, chance)
         return chance
 
 
 @jit
-def _count(
+def count_scan(
     belief: tuple[Array, Array],
     scan: Scan,
     is_telling: BoolArray,

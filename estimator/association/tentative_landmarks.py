@@ -34,7 +34,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
-from ...jit import jit, njit_internal
+from ...jit import jit, njit_inlined, njit_internal
 from ..guards import saved_states
 from ..interface import MapView
 from ..models.bearing_range import predict_measurement, wrap_angle
@@ -234,9 +234,8 @@ class UnexplainedDensity(NamedTuple):
         """
         if assumed is not None:
             return np.full(len(readings), assumed)
-        mean = self.per_scan / (2 * np.pi * self.longest)
         density = np.empty(len(readings))
-        _fill_density(self.cells, readings, self.longest, mean, density)
+        fill_density(self.cells, readings, self.longest, self.per_scan, density)
         return density
 
     @property
@@ -251,7 +250,7 @@ class UnexplainedDensity(NamedTuple):
     @property
     def per_scan(self) -> float:
         """Readings per scan; at least half a reading within the memory."""
-        return max(self.readings, 0.5) / self.scans
+        return _per_scan_of(self.readings, self.scans)
 
     @property
     def landmark_share(self) -> float:
@@ -265,10 +264,15 @@ class UnexplainedDensity(NamedTuple):
         rows = np.array(new, dtype=np.int64)
         cells = self.cells.copy() if new else self.cells
         lengths = self.farthest, self.known
-        farthest, known = _count_readings(cells, readings, rows, lengths)
+        farthest, known = count_readings(cells, readings, rows, lengths)
         sums = MEMORY * self.readings + len(new), MEMORY * self.scans + 1
         confirmed = MEMORY * self.landmarks + landmarks
         return UnexplainedDensity(*sums, farthest, confirmed, known, cells)
+
+
+def _per_scan_of(readings: float, scans: float) -> float:
+    """Return the readings per scan from running sums of both."""
+    return max(readings, 0.5) / scans
 
 
 def _longest_of(farthest: float, known: float) -> float:
@@ -276,7 +280,8 @@ def _longest_of(farthest: float, known: float) -> float:
     return known if known > 0.0 and BEYOND * known < farthest else farthest
 
 
-_longest_jit = njit_internal(_longest_of)
+longest_jit = njit_internal(_longest_of)
+per_scan_jit = njit_inlined(_per_scan_of)
 
 
 @njit_internal
@@ -288,10 +293,11 @@ def _cell(bearing: float, distance: float, longest: float) -> tuple[int, int]:
 
 
 @jit
-def _fill_density(
-    cells: Array, readings: Array, longest: float, mean: float, density: Array
+def fill_density(
+    cells: Array, readings: Array, longest: float, per_scan: float, density: Array
 ) -> None:
     """Fill the mean density times the shares of the sector and ring of each reading."""
+    mean = per_scan / (2 * np.pi * longest)
     sectors, rings = cells.sum(axis=1) + 0.5, cells.sum(axis=0) + 0.5
     usual, usual_ring = sectors.sum() / SECTORS, rings.sum() / RINGS
     for k in range(len(readings)):
@@ -300,7 +306,7 @@ def _fill_density(
 
 
 @jit
-def _count_readings(
+def count_readings(
     cells: Array, readings: Array, new: IntArray, lengths: tuple[float, float]
 ) -> tuple[float, float]:
     """Count new readings in their cells; return the longest ranges of all scans [m]."""
@@ -313,7 +319,7 @@ def _count_readings(
             farthest = max(farthest, distance)
             if not is_new[k]:
                 known = max(known, distance)
-    longest = _longest_jit(farthest, known)
+    longest = longest_jit(farthest, known)
     for bearing, distance in readings[new]:
         if np.isfinite(bearing) and np.isfinite(distance):
             cells[_cell(bearing, distance, longest)] += 1.0

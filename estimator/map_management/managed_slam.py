@@ -15,14 +15,14 @@ from functools import partial
 from itertools import islice
 from math import log
 from operator import itemgetter
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, IntArray
 from ..association.missed_landmarks import LOST_SCORE
-from ..association.scan_assignments import SAME, AssociationSensor
+from ..association.scan_assignments import AssociationSensor
 from ..association.scan_association import (
     Candidates,
     Option,
@@ -51,6 +51,7 @@ from ..interface import (
 from ..models.bearing_range import wrap_angle
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.rigid_motion import rotation
+from .clear_scans import SPREAD, ClearScans, is_near
 from .loop_closing import AROUND, FEWEST_READINGS, is_astray, places_of_scan
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy
@@ -60,10 +61,6 @@ from .recent_scans import FedScans, RecentScans
 Result = TypeVar("Result")
 
 # `benchmarks/association.py` counts the bad runs that these limits decide.
-
-#: Difference of −2 ln of probabilities: hypotheses e²⁰ = 5e8 times less probable than
-#: the best one are discarded.
-SPREAD = 40.0
 
 #: Number of associations tried in a scan, for each hypothesis kept.
 TRIED = 4
@@ -263,6 +260,12 @@ class ManagedSlam(Interruptible):
             all is then as before.
         """
         readings = argument_checks.scan(measurements)
+        if len(self._hypotheses) == 1:
+            with changing(self, "update"):
+                report = self._hypotheses[0].take_clear(readings, landmark_ids)
+                if report is not None:
+                    self.steps += 1
+                    return report
         with self._changing("update"):
             if landmark_ids is None:
                 return self._take(self._branches(readings))
@@ -545,10 +548,63 @@ class Hypothesis:
         self.editor = MapEditor(slam, merging=policy.merge_within is not None)
         self.pruner = MapPruner(policy, self.editor, sensor.noise)
         self.recent = RecentScans(slam, self.editor, policy)
-        #: Landmarks that are not in the map yet.
-        self.candidates = Candidates()
-        #: The report of the last update.
-        self.report = UpdateReport()
+        serves = ClearScans.serve(slam, policy)
+        self._clear = ClearScans(slam, policy, sensor) if serves else None
+        self._candidates = Candidates()
+        #: None after a clear scan: the filter can return it once more.
+        self._report: UpdateReport | None = UpdateReport()
+        self._row_ids: tuple[int, ...] = ()
+
+    @property
+    def candidates(self) -> Candidates:
+        """Landmarks that are not in the map yet, and what the scans have shown."""
+        if self._clear is not None:
+            self._candidates = self._clear.renew(self._candidates, self.pruner.records)
+        return self._candidates
+
+    @candidates.setter
+    def candidates(self, changed: Candidates) -> None:
+        if self._clear is not None:
+            self._clear.forget()
+        self._candidates = changed
+
+    @property
+    def report(self) -> UpdateReport:
+        """The report of the last update."""
+        if self._report is None:  # of a clear scan
+            report: UpdateReport = cast("Any", self.filter).report()
+            self._report = report.completed(row_ids=self._row_ids)
+        return self._report
+
+    @report.setter
+    def report(self, report: UpdateReport) -> None:
+        self._report = report
+
+    def take_clear(
+        self, readings: Array, landmark_ids: LandmarkIds | None
+    ) -> UpdateReport | None:
+        """Take in a scan (m, 2) if it is clear: see `ClearScans`; return its report."""
+        clear, given = self._clear, landmark_ids is not None
+        if clear is None:
+            return None
+        if given:
+            ids = argument_checks.identity_array(landmark_ids, len(readings), None)
+        else:
+            ids = np.empty(len(readings), np.int64)
+        before = self._candidates, self.pruner.records
+        if not clear.take(*before, readings, ids, given=given):
+            return None
+        self.editor.expire()
+        self._report, self._row_ids = None, tuple(ids.tolist())
+        report: UpdateReport = cast("Any", self.filter).report()
+        report = report.completed(row_ids=self._row_ids)
+        unused = () if clear.is_used else {*report.rejected_ids, *report.skipped_ids}
+        self.recent.note_clear(clear.number, readings, self._row_ids, unused)
+        return report
+
+    def _settle(self) -> None:
+        """Complete what clear scans have left for later, before the map is edited."""
+        self.candidates, self.report = self.candidates, self.report
 
     def map_view(self) -> MapView:
         """Return pose and map, without a copy where possible, until the next step."""
@@ -571,8 +627,8 @@ class Hypothesis:
         """Move by odometry (d, α), which is a displacement in the robot's frame."""
         self.filter.predict(reading, dt)
         self.editor.expire()
-        tentative = self.candidates.tentative
-        if len(tentative.seen):
+        is_clear = self._clear is not None and self._clear.is_loaded
+        if not is_clear and len((tentative := self.candidates.tentative).seen):
             variance = self.motion_noise.over(displacement, dt)
             moved = tentative.moved(displacement, variance)
             self.candidates = self.candidates._replace(tentative=moved)
@@ -684,15 +740,18 @@ class Hypothesis:
 
     def remove(self, ids: list[int]) -> None:
         """Marginalise mapped landmarks; all else stays."""
+        self._settle()
         self.recent.note_edits(self.pruner.remove(ids), ())
 
     def merge(self, kept: int, gone: int) -> None:
         """Merge two mapped landmarks; both identities then name the first."""
+        self._settle()
         self.pruner.join([(kept, gone)])
         self.recent.note_edits((), [(kept, gone)])
 
     def state_dict(self) -> dict[str, Any]:
         """Return the filter's state and the records of landmarks, as arrays."""
+        self._settle()
         return {
             **with_prefix("landmarks", self.pruner.records.state_dict()),
             **with_prefix("tentative", self.candidates.state_dict()),
@@ -765,23 +824,6 @@ def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
         if not apart <= OVERLAP:
             return False
     return True
-
-
-def is_near(one: MapView, other: MapView) -> bool:
-    """Return whether two maps of the same landmarks have nearly the same belief.
-
-    In every coordinate with means μ₁, μ₂ and deviations σ₁, σ₂, the second belief must
-    not be far off the first one and not be much less certain::
-
-        (μ₂ − μ₁)² + σ₂² − σ₁² ≤ (SAME σ₁)²
-    """
-    if one.ids != other.ids:
-        return False
-    size = 3 + 2 * len(one.ids)
-    gap = other.mean[:size] - one.mean[:size]
-    gap[2] = wrap_angle(float(gap[2]))
-    variances, others = (m.covariance.diagonal()[:size] for m in (one, other))
-    return bool((gap**2 + others <= (1 + SAME**2) * variances).all())
 
 
 def cost_of(report: UpdateReport) -> float:

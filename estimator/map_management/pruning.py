@@ -42,7 +42,7 @@ class MapPruner:
 
     def __init__(self, policy: LandmarkPolicy, editor: MapEditor, noise: Noise) -> None:
         self._policy, self._editor = policy, editor
-        self._noise = *np.maximum(noise[:3], 1e-12).tolist(), noise.bearing_std_metres
+        self._noise = noise_of_sightings(noise)
         self.records = LandmarkRecords()
 
     def view_around(self, readings: Array) -> MapView:
@@ -108,7 +108,7 @@ class MapPruner:
         shown_by = {row: i for row, i in enumerate(plan.row_ids) if i in seen}
         slots = self.records.slots(shown_by.values())
         sighting = plan.readings[[*shown_by]], view.mean[2], self._noise
-        _add_sightings(self.records.renewed(), slots, *sighting)
+        add_sightings(self.records.renewed(), slots, *sighting)
         if within is not None:
             shown = view.landmarks[slots := slots_of(view, seen)]
             close = _distances(shown, shown) < 2 * within
@@ -307,8 +307,14 @@ RECORDS: saved_states.Table = {
 }
 
 
+def noise_of_sightings(noise: Noise) -> tuple[float, float, float, float]:
+    """Return the noise that determines the information of a landmark, above 0."""
+    bearing, distance, per_metre = np.maximum(noise[:3], 1e-12).tolist()
+    return bearing, distance, per_metre, noise.bearing_std_metres
+
+
 @jit_in_place
-def _add_sightings(
+def add_sightings(
     counts: tuple[IntArray, Array],
     slots: IntArray,
     readings: Array,

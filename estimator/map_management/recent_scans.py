@@ -9,7 +9,7 @@ of another landmark: they are dropped, and the scans are repeated once more.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import chain, islice
 from typing import Any, NamedTuple
 
@@ -129,6 +129,21 @@ class RecentScans(Restorable):
                 ids = tuple(new if label != NO_LABEL else i for i, new, label in pairs)
                 self.decisions[place] = made._replace(row_ids=ids)
 
+    def note_clear(
+        self,
+        number: int,
+        readings: Array,
+        row_ids: tuple[int, ...],
+        unused: Collection[int],
+    ) -> None:
+        """Remember a scan, its landmarks, and those whose readings were not used."""
+        if self._window:
+            labels = (NO_LABEL,) * len(row_ids)
+            parts = number, self.motions, readings.copy(), row_ids, labels
+            self.scans = [*self.scans[-self._window :], RecentScan(*parts)]
+            self.motions = ()
+        self.decisions.append(ScanDecisions(_without(unused, row_ids)))
+
     def _repeat(self, scans: list[RecentScan], first: int) -> list[UpdateReport]:
         """Repeat the scans since one, and renew the states kept before them."""
         before = scans[first].before
@@ -179,9 +194,15 @@ def _decided(plan: ScanAssociation, report: UpdateReport) -> ScanDecisions:
     row_ids, skipped = tuple(plan.row_ids), report.skipped_ids
     new = {*report.added_ids, *plan.confirmed}.difference(skipped)
     unused = {*report.rejected_ids, *skipped} - new
-    if unused:
-        row_ids = tuple(None if i in unused else i for i in row_ids)
+    row_ids = _without(unused, row_ids)
     return ScanDecisions(row_ids, tuple([i for i in row_ids if i in new]))
+
+
+def _without(
+    unused: Collection[int], row_ids: tuple[int | None, ...]
+) -> tuple[int | None, ...]:
+    """Return the landmarks of rows, without those whose readings were not used."""
+    return tuple(None if i in unused else i for i in row_ids) if unused else row_ids
 
 
 def _relabel(scans: list[RecentScan], confirmed: Mapping[int, int]) -> int | None:

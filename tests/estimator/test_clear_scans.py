@@ -1,0 +1,163 @@
+"""Scans that compiled calls take in, beside the same scans taken in by the search."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from slamgym.envs import LandmarkWorldEnv
+from slamgym.estimator import UpdateReport, make_estimator
+from slamgym.estimator.map_management.clear_scans import ClearScans
+from slamgym.sim_configs import action_sequence, load_scenario
+
+
+@pytest.fixture
+def count(monkeypatch):
+    """Return a list that holds, for each attempt, whether the scan was clear."""
+    attempts, take = [], ClearScans.take
+
+    def counted(*args, **options):
+        attempts.append(take(*args, **options))
+        return attempts[-1]
+
+    monkeypatch.setattr(ClearScans, "take", counted)
+    return attempts
+
+
+def make(name="invariant", world=None, *, clear=True, **management):
+    """Return a managed filter, with clear scans or with the search alone."""
+    noise = {"motion_std": (0.05, 0.02, 0.01), "measurement_std": (0.02, 0.08)}
+    if world is not None:
+        noise = {"motion_std": world.motion.std, "measurement_std": world.sensor.std}
+        noise |= {"initial_pose": world.start.pose, **world.models}
+    with pytest.MonkeyPatch.context() as patch:
+        if not clear:
+            patch.setattr(ClearScans, "serve", lambda *_: False)
+        return make_estimator(name, **noise, management=management or True)
+
+
+def scans_of(name, steps):
+    world = load_scenario(name)
+    env = LandmarkWorldEnv(world)
+    observation, _ = env.reset(seed=3)
+    for action in action_sequence(world)[:steps]:
+        mask = observation["mask"]
+        yield observation["odometry"], observation["landmarks"][mask], mask.nonzero()[0]
+        observation, *_ = env.step(action)
+
+
+def assert_same_report(one, other):
+    for field in fields(UpdateReport):
+        if field.name != "factor":
+            values = getattr(one, field.name), getattr(other, field.name)
+            np.testing.assert_array_equal(*values, err_msg=field.name)
+    np.testing.assert_array_equal(one.innovation_factor, other.innovation_factor)
+
+
+def assert_same_state(one, other):
+    states = one.state_dict(), other.state_dict()
+    assert states[0].keys() == states[1].keys()
+    for key in states[0]:
+        values = [state[key] for state in states]
+        if key.endswith(("missed", "shown")):  # in any order
+            values = [np.sort(value, axis=0) for value in values]
+        np.testing.assert_array_equal(*values, err_msg=key)
+
+
+def compare(twins, scans, *, given=False, renew=7):
+    """Drive two filters; all that they return must be equal to the bit."""
+    for k, (odometry, readings, ids) in enumerate(scans):
+        reports = []
+        for slam in twins:
+            if k:
+                slam.predict(odometry)
+            reports.append(slam.update(readings, ids if given else None))
+        assert_same_report(*reports)
+        assert_same_report(reports[0], twins[0].report())
+        if k % renew == 0:
+            assert_same_state(*twins)
+            assert twins[0].lost_score == twins[1].lost_score
+    assert_same_state(*twins)
+    assert twins[0].decisions == twins[1].decisions
+    beliefs = [slam.belief() for slam in twins]
+    np.testing.assert_array_equal(beliefs[0].mean, beliefs[1].mean)
+    np.testing.assert_array_equal(beliefs[0].covariance, beliefs[1].covariance)
+
+
+@pytest.mark.parametrize(
+    ("name", "management", "least"),
+    [
+        ("loop", {}, 0.5),
+        ("corridor", {}, 0.6),
+        ("dropout", {}, 0.4),
+        ("six_landmarks", {"constellations": None}, 0.5),
+        ("corridor", {"association": "joint", "density": 0.05}, 0.6),
+        ("corridor", {"backdate": False, "capacity": 12}, 0.2),
+    ],
+)
+def test_a_clear_scan_gives_the_same_bits_as_the_search(count, name, management, least):
+    world = load_scenario(name)
+    twins = [make(world=world, clear=clear, **management) for clear in (True, False)]
+    compare(twins, scans_of(name, 250))
+    assert np.mean(count) > least
+
+
+@pytest.mark.parametrize("name", ["ekf", "first_estimates", "iterated"])
+def test_every_filter_on_the_shared_kernels_takes_clear_scans(count, name):
+    twins = [make(name, load_scenario("loop"), clear=clear) for clear in (True, False)]
+    compare(twins, scans_of("loop", 120))
+    assert np.mean(count) > 0.4
+
+
+def test_given_identities_of_mapped_landmarks_are_a_clear_scan(count):
+    twins = [make(world=load_scenario("loop"), clear=clear) for clear in (True, False)]
+    compare(twins, scans_of("loop", 250), given=True)
+    assert np.mean(count) > 0.8
+
+
+def test_a_large_map_whose_covariance_is_half_complete_takes_clear_scans(count):
+    rng = np.random.default_rng(2)
+    places = rng.uniform(-40, 40, (180, 2))
+    scan = np.stack([np.arctan2(*places.T[::-1]), np.hypot(*places.T)], axis=1)
+    near = np.argsort(scan[:, 1])[:9]
+    noise = rng.standard_normal((30, 9, 2)) * (0.02, 0.08)
+    twins = [make(clear=clear) for clear in (True, False)]
+    for slam in twins:
+        slam.update(scan, np.arange(len(scan)))
+    compare(twins, [((0.0, 0.0), scan[near] + more, None) for more in noise])
+    assert np.mean(count) > 0.5
+
+
+@pytest.mark.parametrize("change", ["remove", "merge", "observe", "load", "resume"])
+def test_changes_between_clear_scans_leave_the_same_filter(count, change):
+    scans, world = [*scans_of("loop", 160)], load_scenario("loop")
+    twins = [make(world=world, clear=clear) for clear in (True, False)]
+    compare(twins, scans[:100])
+    for slam in twins:
+        state, kept = slam.state_dict(), slam.snapshot()
+        first, second = slam.landmark_ids[:2]
+        if change == "remove":
+            slam.remove([first])
+        elif change == "merge":
+            slam.merge(first, second)
+        elif change == "observe":
+            slam.observe_pose(slam.belief().pose[2], [0, 0, 1], 0.01)
+        else:
+            for odometry, readings, _ in scans[100:110]:
+                slam.predict(odometry)
+                slam.update(readings)
+            slam.load_state_dict(state) if change == "load" else slam.resume(kept)
+    count.clear()
+    compare(twins, scans[100:], renew=1)
+    assert any(count)
+
+
+def test_reading_the_report_later_changes_nothing():
+    slam = make(world=load_scenario("loop"))
+    for odometry, readings, _ in scans_of("loop", 60):
+        slam.predict(odometry)
+        report = slam.update(readings)
+        assert slam.report().row_ids == report.row_ids
+        kept = report
+    slam.predict((0.1, 0.0))
+    assert slam.report() == kept
