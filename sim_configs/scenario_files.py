@@ -7,6 +7,8 @@ Files of any kind are written by `replace_when_written`, whole or not at all.
 """
 
 import json
+import os
+import platform
 import re
 import secrets
 import tomllib
@@ -28,6 +30,7 @@ SCHEMA_FILE = _FOLDER / "scenario.schema.json"
 
 #: Files and folders that this process is writing, to be removed if it must end.
 unfinished: set[Path] = set()
+_UNFINISHED = re.compile(r"\.(?P<process>\d+)@(?P<machine>.+)-[0-9a-f]{8}\.\w+$")
 
 
 def list_presets() -> tuple[str, ...]:
@@ -279,7 +282,8 @@ def replace_when_written(path: str | Path) -> Iterator[Path]:
     target = Path(path)
     if not target.parent.is_dir():
         raise FileNotFoundError(f"the folder of {target} does not exist")
-    partial = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
+    unique = f"{os.getpid()}@{platform.node()}-{secrets.token_hex(4)}"
+    partial = target.with_name(f".{target.stem}.{unique}{target.suffix}")
     unfinished.add(partial)
     try:
         with naming_file(target, partial):
@@ -288,6 +292,19 @@ def replace_when_written(path: str | Path) -> Iterator[Path]:
     finally:
         partial.unlink(missing_ok=True)
         unfinished.discard(partial)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove what killed processes of this machine have left of files in a folder."""
+    for path in folder.glob(".*@*-*.*"):
+        found = _UNFINISHED.search(path.name)
+        if found and found["machine"] == platform.node() and os.name == "posix":
+            try:
+                os.kill(int(found["process"]), 0)  # sends nothing
+            except ProcessLookupError:
+                path.unlink(missing_ok=True)
+            except OSError:  # a process of another user
+                continue
 
 
 @contextmanager

@@ -195,7 +195,8 @@ class Window:
         from matplotlib import pyplot  # noqa: PLC0415 (slow; for windows only)
 
         self._pyplot = pyplot
-        self.figure: Figure = pyplot.figure(FigureClass=PlainTextFigure)
+        with pyplot.rc_context({"figure.max_open_warning": 0}):  # one for each world
+            self.figure: Figure = pyplot.figure(FigureClass=PlainTextFigure)
         self._seconds_per_frame = 1 / fps
         self._due = time.monotonic()
         self._has_screen = bool(self.figure.canvas.required_interactive_framework)

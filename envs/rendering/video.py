@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from ...arrays import ImageArray
-from ...sim_configs.scenario_files import replace_when_written
+from ...sim_configs.scenario_files import remove_unfinished, replace_when_written
 
 
 def check_video(path: str | Path, fps: float = 30.0) -> None:
@@ -41,6 +41,8 @@ def write_video(
 ) -> None:
     """Write frames to a video file; an error leaves no partial file.
 
+    What a killed process has left in the folder is removed.
+
     Parameters
     ----------
     frames : iterable of ndarray of uint8, shape (H, W, 3)
@@ -62,6 +64,7 @@ def write_video(
     target = Path(path)
     check_video(target, fps)
     write = _write_mp4 if target.suffix.lower() == ".mp4" else _write_gif
+    remove_unfinished(target.parent)
     with replace_when_written(target) as partial:
         write(_checked(frames), partial, fps)
 

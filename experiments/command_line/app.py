@@ -4,7 +4,6 @@ Each command is a function in a module of its own, which takes options by name, 
 it imports what is heavy when it runs, so that help answers at once.
 """
 
-import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from ...leaves import leaf
-from .commands import BadInputError, Reporter, command, main
+from .commands import BadInputError, Reporter, command, docstring_of, main
 from .options import Options, declared, takes
 
 __all__ = ["main"]
@@ -101,7 +100,7 @@ def estimators(*, given: Options) -> None:
     from ...estimator.registry import PEERS, find_estimator, list_estimators
 
     each = [
-        (name, "slamgym", True, inspect.getdoc(find_estimator(name)) or "")
+        (name, "slamgym", True, docstring_of(find_estimator(name)))
         for name in list_estimators()
     ]
     each += [(p.name, p.library, p.installed, p.description) for p in PEERS.values()]

@@ -4,6 +4,7 @@ A command ends with one line on standard error and an exit code, whatever happen
 `Reporter` prints its progress to standard error, and its results to standard output.
 """
 
+import ast
 import atexit
 import contextlib
 import gc
@@ -20,6 +21,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
 
@@ -101,6 +103,8 @@ def _naming_interrupts() -> Iterator[None]:
     """Raise `InterruptedRunError` for an interrupt, which typer ends silently."""
     try:
         yield
+    except LostSchedulerError:  # which no user has interrupted
+        raise
     except BaseException as error:
         cause: BaseException | None = error
         while cause and not isinstance(cause, KeyboardInterrupt):
@@ -108,6 +112,10 @@ def _naming_interrupts() -> Iterator[None]:
         if cause is None:
             raise
         raise InterruptedRunError(*_remaining[-1:]) from cause
+
+
+class LostSchedulerError(OSError):
+    """The scheduler of a cluster is lost; an interrupt has ended the wait for it."""
 
 
 class TerminationError(KeyboardInterrupt):
@@ -346,10 +354,29 @@ def _help_of(function: Callable[..., Any]) -> tuple[str, str]:
 
     click keeps the lines after \b as they are.
     """
-    summary, _, rest = (inspect.getdoc(function) or "").partition("\n\n")
+    summary, _, rest = docstring_of(function).partition("\n\n")
     text, _, examples = rest.partition("\n\nExamples\n--------\n")
     lines = textwrap.indent(examples, "  ")
     return summary, f"{text}\n\n\b\nExamples:\n{lines}" if examples else text
+
+
+def docstring_of(item: Any) -> str:
+    """Return the docstring of a function or class, also where -OO has removed it."""
+    if sys.flags.optimize < 2:
+        return inspect.getdoc(item) or ""
+    return _docstrings_of(item.__module__).get(item.__name__, "")
+
+
+@cache
+def _docstrings_of(module: str) -> dict[str, str]:
+    """Read the docstrings of the functions and classes of a module in its source."""
+    try:
+        source = inspect.getsource(sys.modules[module])
+    except (OSError, TypeError):  # not written in Python
+        return {}
+    named = (ast.FunctionDef, ast.ClassDef)
+    parts = [each for each in ast.parse(source).body if isinstance(each, named)]
+    return {part.name: ast.get_docstring(part) or "" for part in parts}
 
 
 def _slamgym(

@@ -5,7 +5,8 @@ import re
 import shlex
 import sys
 import threading
-from collections.abc import Iterator
+from _thread import interrupt_main
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,14 @@ from rich.text import Text
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.field_types import unknown_choice
 from . import options
-from .commands import FAILURE, BadInputError, Reporter, command, interruptible
+from .commands import (
+    FAILURE,
+    BadInputError,
+    LostSchedulerError,
+    Reporter,
+    command,
+    interruptible,
+)
 
 FORMATS = ("pdf", "svg", "png")
 
@@ -260,8 +268,37 @@ def _dask_client(scheduler: str | None, jobs: int | None) -> Any:
         ) from None
     client: Any = distributed.Client
     if scheduler is not None:
-        return client(scheduler)
+        return _naming_loss(client(scheduler), scheduler)
     return _with_new_workers(client(n_workers=jobs, threads_per_worker=1, **_HERE))
+
+
+@contextlib.contextmanager
+def _naming_loss(client: Any, address: str) -> Iterator[None]:
+    """End the block, and name the scheduler, where the client has lost it.
+
+    Without it, joblib would wait for results forever, or raise one error or another.
+
+    Raises
+    ------
+    LostSchedulerError
+        If the block ends with an error, and the client has no connection.
+    """
+
+    def end_if_lost() -> None:
+        if client.status == "closed":  # it has tried for 30 s
+            interrupt_main()
+
+    with client:
+        try:
+            with _repeated(end_if_lost):
+                yield
+        except BaseException as error:
+            if client.status == "running":
+                raise
+            raise LostSchedulerError(
+                f"the Dask scheduler {address} is lost; what is finished is kept, and "
+                "the same command continues"
+            ) from error
 
 
 @contextlib.contextmanager
@@ -270,19 +307,30 @@ def _with_new_workers(client: Any) -> Iterator[None]:
 
     Dask restarts a worker that was killed, but not one that was killed as it started.
     """
-    over, cluster = threading.Event(), client.cluster
+    cluster = client.cluster
     wanted = len(cluster.worker_spec)
 
     def replace() -> None:
-        while not over.wait(_INTERVAL):
-            if len(cluster.workers) < wanted:
-                cluster.scale(wanted)
+        if len(cluster.workers) < wanted:
+            cluster.scale(wanted)
 
-    with client:
-        watch = threading.Thread(target=replace, daemon=True)
-        watch.start()
-        try:
-            yield
-        finally:
-            over.set()
-            watch.join()
+    with client, _repeated(replace):
+        yield
+
+
+@contextlib.contextmanager
+def _repeated(check: Callable[[], None]) -> Iterator[None]:
+    """Call a function again and again during the block, in another thread."""
+    over = threading.Event()
+
+    def watch() -> None:
+        while not over.wait(_INTERVAL):
+            check()
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()

@@ -22,7 +22,7 @@ import typer
 
 from ...sim_configs import Scenario, list_presets, load_scenario
 from ...sim_configs.field_types import unknown_choice
-from .commands import BadInputError, BrokenFilterError, Reporter
+from .commands import BadInputError, BrokenFilterError, Reporter, docstring_of
 
 if TYPE_CHECKING:
     from ...envs.controllers import Controller
@@ -411,7 +411,7 @@ def _help_texts(kind: type) -> dict[str, str]:
     """Return the texts of the attributes in the docstrings of a class and its bases."""
     texts = {}
     for each in reversed(kind.__mro__):
-        listed = inspect.cleandoc(each.__doc__ or "").partition("\nAttributes\n")[2]
+        listed = docstring_of(each).partition("\nAttributes\n")[2]
         for name, text in re.findall(r"^(\w+)\n((?: +.*\n?)+)", listed, re.MULTILINE):
             texts[name] = " ".join(text.split())
     return texts

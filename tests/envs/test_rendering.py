@@ -355,6 +355,15 @@ def screen(pyplot, monkeypatch):
     return served
 
 
+def test_more_windows_than_matplotlib_expects_are_no_warning(screen, pyplot):
+    renderers = [WorldRenderer(SIX, LANDMARKS, "human") for _ in range(25)]
+    for renderer in renderers:
+        renderer.render(snapshot())
+    assert len(pyplot.get_fignums()) == 25
+    for renderer in renderers:
+        renderer.close()
+
+
 def test_human_mode_without_windows_says_so_once_and_returns_none(pyplot, caplog):
     renderer = WorldRenderer(SIX, LANDMARKS, "human")
     for _ in range(3):

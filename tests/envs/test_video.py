@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 
 from slamgym.envs.rendering import write_video
+from slamgym.sim_configs.scenario_files import replace_when_written
 
 
 def moving_square(count=5, size=(40, 60)):
@@ -29,6 +30,20 @@ def test_gif_holds_every_frame_at_its_time(tmp_path):
     assert [duration for _, duration in shown] == [100] * 5
     for (frame, _), expected in zip(shown, moving_square(), strict=True):
         np.testing.assert_allclose(frame, expected, atol=3)
+
+
+def test_the_rest_of_a_killed_film_goes_and_that_of_another_film_stays(tmp_path):
+    code = "import sys; from slamgym.sim_configs import scenario_files as files\n"
+    code += "with files.replace_when_written(sys.argv[1]) as partial:\n"
+    code += "    partial.touch(); files.os.kill(files.os.getpid(), 9)"
+    subprocess.run([sys.executable, "-c", code, tmp_path / "run.gif"], check=False)
+    (killed,) = tmp_path.iterdir()
+    with replace_when_written(tmp_path / "other.gif") as written:
+        written.touch()
+        elsewhere = killed.with_name(killed.name.replace("@", "@another-"))
+        elsewhere.touch()
+        write_video(moving_square(), tmp_path / "film.gif")
+        assert {*tmp_path.iterdir()} == {written, elsewhere, tmp_path / "film.gif"}
 
 
 def test_gif_keeps_white_and_shows_colours_that_come_later(tmp_path):

@@ -936,6 +936,21 @@ def test_every_option_of_a_command_has_a_help(command):
     assert not [each.name for each in parameters if not (each.help or "").strip()]
 
 
+@pytest.mark.slow
+def test_python_without_docstrings_prints_the_same_help():
+    program = "from slamgym.experiments.command_line.app import main; main()"
+    for command in ("run --help", "--help"):
+        printed = [
+            subprocess.run(
+                [sys.executable, *flags, "-c", program, *command.split()],
+                capture_output=True,
+                check=True,
+            ).stdout
+            for flags in ([], ["-OO"])
+        ]
+        assert printed[0] == printed[1]
+
+
 def test_submaps_may_lie_in_a_folder(here, without_pictures):
     summary = answered(
         *("run", "six_landmarks", "--steps", 4, "--estimator", "submaps"),

@@ -5,6 +5,7 @@ import json
 import resource
 import signal
 import socket
+import subprocess
 import sys
 import time
 import tracemalloc
@@ -23,6 +24,10 @@ from recordings import recorded
 from slamgym.estimator import Belief, EkfSlam, make_estimator
 from slamgym.evaluation import AssociationScores, Gospa, oracle_errors
 from slamgym.evaluation.nees import pose_nees, state_nees
+from slamgym.experiments.command_line.commands import (
+    LostSchedulerError,
+    _naming_interrupts,
+)
 from slamgym.experiments.command_line.monte_carlo import connected
 from slamgym.experiments.monte_carlo_study import (
     monte_carlo,
@@ -701,6 +706,36 @@ def test_a_dask_worker_that_dask_does_not_restart_is_replaced():
         (nanny,) = client.cluster.workers.values()
         client.sync(nanny.close)
         assert client.submit(abs, -3).result(timeout=60) == 3
+
+
+@pytest.mark.slow
+def test_a_lost_dask_scheduler_ends_the_wait_for_its_results(tmp_path):
+    pytest.importorskip("distributed", reason="needs dask.distributed")
+    import dask
+
+    file = tmp_path / "scheduler.json"
+    python = f"{sys.executable} -m distributed.cli.dask_scheduler"
+    options = f"--port 0 --no-dashboard --host 127.0.0.1 --scheduler-file {file}"
+    command = f"{python} {options}".split()
+    scheduler = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    try:
+        while not file.exists() or not file.read_text().endswith("}"):
+            assert scheduler.poll() is None
+            time.sleep(0.1)
+        address = json.loads(file.read_text())["address"]
+        lost = f"the Dask scheduler {address} is lost; what is finished is kept"
+
+        def lose() -> None:
+            with _naming_interrupts(), connected("dask", address, None):
+                scheduler.kill()
+                time.sleep(60)  # as joblib waits for results
+
+        quickly = dask.config.set({"distributed.comm.timeouts.connect": "1s"})
+        with quickly, pytest.raises(LostSchedulerError, match=lost):
+            lose()
+    finally:
+        scheduler.kill()
+        scheduler.wait()
 
 
 class MyEkf(EkfSlam):
