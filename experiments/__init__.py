@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from .monte_carlo_study import rmse_figure as rmse_figure
     from .monte_carlo_study import runs_figure as runs_figure
     from .monte_carlo_study import summarise_monte_carlo as summarise_monte_carlo
+    from .monte_carlo_study import verdict_table as verdict_table
     from .monte_carlo_study import write_html_report as write_html_report
     from .noise_fitting import *
     from .noise_study import NoiseEffect as NoiseEffect

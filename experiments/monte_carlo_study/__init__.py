@@ -21,5 +21,6 @@ if TYPE_CHECKING:
     from .runner import monte_carlo as monte_carlo
     from .summary import consistency_of as consistency_of
     from .summary import summarise_monte_carlo as summarise_monte_carlo
+    from .summary import verdict_table as verdict_table
 else:
     __getattr__, __dir__, __all__ = attach(__name__)

@@ -130,6 +130,49 @@ def summarise_monte_carlo(
     }
 
 
+def verdict_table(results: xr.Dataset) -> Any:
+    """Return verdicts, consistency and errors, one row for each estimator.
+
+    ``to_latex`` of the table writes it for a paper.
+
+    Parameters
+    ----------
+    results : xarray.Dataset
+        Results of ``monte_carlo``.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Number of successful runs, verdict, averages over runs and steps, and over runs
+        at the end; NaN where unknown. NEES and NIS per degree of freedom are 1 for a
+        consistent filter.
+
+    Examples
+    --------
+    >>> from slamgym.experiments import monte_carlo
+    >>> table = verdict_table(monte_carlo("six_landmarks", "ekf,invariant", runs=2))
+    >>> list(table.index), list(table)[:3]
+    (['ekf', 'invariant'], ['runs', 'verdict', 'pose NEES / 3'])
+    """
+    summary = summarise_monte_carlo(results)
+    frame, found = summary["frame"], summary["estimators"].values()
+    numbers = {
+        "pose NEES / 3": [each["pose_nees"][frame]["mean"] for each in found],
+        "pose NEES / 3, end": [each["pose_nees"][frame]["end"] for each in found],
+        "NIS / degree": [each["nis"] for each in found],
+        "position RMSE [m]": [each["rmse"]["position"] for each in found],
+        "heading RMSE [rad]": [each["rmse"]["heading"] for each in found],
+    }
+    columns: dict[str, Any] = {
+        "runs": [each["good_runs"] for each in found],
+        "verdict": [each["verdict"] for each in found],
+        **{name: np.array(values, dtype=float) for name, values in numbers.items()},
+    }
+    variables = {name: ("estimator", values) for name, values in columns.items()}
+    labels = {"estimator": list(summary["estimators"])}
+    return xr.Dataset(variables, labels).to_dataframe()
+
+
 def summarise_estimator(
     scores: EstimatorScores, frame: ErrorFrame, knowable: float
 ) -> dict[str, Any]:

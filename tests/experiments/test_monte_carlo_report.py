@@ -14,6 +14,7 @@ from rich.console import Console
 from scipy.stats import chi2
 
 from slamgym import experiments
+from slamgym.estimator import EkfSlam
 from slamgym.evaluation import diagnose
 from slamgym.evaluation.consistency_report import evaluate_consistency
 from slamgym.evaluation.hypothesis_tests import equivalence_test, family_band
@@ -322,6 +323,34 @@ def test_a_few_bad_runs_that_make_the_average_are_pointed_out():
     assert (
         "; 3 of 200 runs make this average: without them, it is 1.17" in verdict.reason
     )
+
+
+def test_the_table_of_verdicts_has_the_numbers_of_the_summary():
+    dataset = typical()
+    table = experiments.verdict_table(dataset)
+    entries = summarise_monte_carlo(dataset)["estimators"]
+    assert list(table.index) == list(entries)
+    for label, found in entries.items():
+        row = table.loc[label]
+        assert row["verdict"] == found["verdict"]
+        assert row["pose NEES / 3"] == found["pose_nees"]["invariant"]["mean"]
+        assert row["NIS / degree"] == found["nis"]
+        assert row["heading RMSE [rad]"] == found["rmse"]["heading"]
+    assert "invariant & " in table.to_latex(float_format="%.3g")
+
+
+def test_the_table_of_verdicts_has_a_row_of_a_filter_that_always_fails():
+    results = monte_carlo("six_landmarks", {"ekf": Fails}, runs=2)
+    table = experiments.verdict_table(results)
+    assert table.loc["ekf", "runs"] == 0
+    assert table.iloc[0, 2:].isna().all()
+
+
+class Fails(EkfSlam):
+    """A filter that refuses to move."""
+
+    def predict(self, odometry, dt=1.0):
+        raise ValueError("no")
 
 
 def test_failed_runs_are_told_and_counted_nowhere_else():
