@@ -82,7 +82,7 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
 
     | option | content |
     |---|---|
-    | ``pose`` | (x, y, θ) in place of ``scenario.start.pose`` [m, m, rad] |
+    | ``pose`` | (x, y, θ) [m, m, rad] in place of ``scenario.start.pose`` |
     | ``landmarks`` | positions of all N landmarks, shape (N, 2) [m] |
     | ``scenario`` | a world for the same robot, with readings of the same form |
 

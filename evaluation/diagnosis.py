@@ -574,7 +574,7 @@ def excess_of(
         many = _averages_of(small.larger)[errors.of]
         factor /= small.larger.factor
         share = _share(small.larger.factor)
-        found += f", for {np.nanmean(many):.3g} times with {share}"
+        found += f", and with {share} {np.nanmean(many):.3g} times"
     if _change(many, after[errors.of], diverged, sign, 1 / factor) == "grows":
         return _of_growth(found, _shrunk_errors(small), factor)
     is_off = rest.remains or (rest.low > 1 if sign > 0 else rest.high < 1)

@@ -230,7 +230,7 @@ class Start(ScenarioTable):
         (0.0, 0.0, 0.0), "standard deviations (σx, σy, σθ) [m, m, rad]"
     )
     drawn: Annotated[Literal["truth", "estimate"], expect("'truth' or 'estimate'")] = (
-        setting("truth", "which of the two starts is drawn around `pose`")
+        setting("truth", "what is drawn around `pose`: the true start or its estimate")
     )
 
 

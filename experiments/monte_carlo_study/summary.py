@@ -417,7 +417,7 @@ def _declared(frame: ErrorFrame) -> list[Measure]:
             _by_freedom("relative_map_nees", "relative_map_dof"),
             "NEES of the map at the end", "1"),
         row("nees_end.worst_landmark", _worst_landmark(frame),
-            "… worst landmark, from the robot", "≈ 1"),
+            "… of the worst landmark", "≈ 1"),
         row("nis", lambda scores: scores.nis_per_degree,
             "NIS / degrees of freedom", "1"),
         row("heading_std_end.claimed", _end(root, "heading_std"),
@@ -570,13 +570,15 @@ def _by_freedom(name: str, dof: str = "") -> Computation:
 
 
 def _worst_landmark(frame: ErrorFrame) -> Computation:
-    """Return the ratio of the landmark that is farthest from 1, seen from the robot."""
+    """Return the ratio of a landmark farthest from 1, from the robot or in the map."""
 
     def compute(scores: EstimatorScores) -> float | None:
         maps = maps_of(scores, frame)
         if maps is None or not len(maps.ratios):
             return None
-        return finite(maps.ratios[farthest(maps.ratios)])
+        known = np.isfinite(maps.map_ratios)
+        ratios = np.concatenate([maps.ratios, maps.map_ratios[known]])
+        return finite(ratios[farthest(ratios)])
 
     return compute
 

@@ -107,7 +107,7 @@ def refutations(entry):
         found += ["the errors are larger"] * (before > 1.1 and not is_unseen)
     if (less := re.search(rf"of the noise, .*? are {NUMBER} times", text)) is None:
         return found
-    after, tenth = float(less[1]), re.search(rf"for {NUMBER} times with a tenth", text)
+    after, tenth = float(less[1]), re.search(rf"with a tenth {NUMBER} times", text)
     interval = re.search(rf"interval {NUMBER} to {NUMBER}\)", text)
     low, high = [after, after] if interval is None else map(float, interval.groups())
     if cause == "linearisation":
