@@ -254,10 +254,11 @@ def compare_hidden(seen: int, mapped: int) -> None:
     for name in times:
         found = ratio(times, name, "identities given")
         goal = {"identities hidden": goals[0], "identities given, managed": goals[1]}
-        said = f" (<= {goal[name]}: {verdict(found, goal[name], at_least=False)})"
+        said = ""
+        if name in goal:
+            said = f" (<= {goal[name]}: {verdict(found, goal[name], at_least=False)})"
         CONSOLE.print(
-            f"  {name}: {microseconds(times, name):.1f} µs, {found:.1f} ×"
-            + (said if name in goal else "")
+            f"  {name}: {microseconds(times, name):.1f} µs, {found:.1f} ×{said}"
         )
 
 
