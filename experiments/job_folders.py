@@ -227,7 +227,7 @@ def _watch(engaging: int) -> None:
 _LEFTOVER = re.compile(
     r"\.writing-[0-9a-f]{8}"
     r"|\.{1,2}(job|manifest|results|report|summary|slamgym_files|runs-\d{7,}-\d{7,})"
-    r"(\.[0-9a-f]{8}){1,2}\.(json|nc|html|npz)"
+    r"(\.(\d+@.+-)?[0-9a-f]{8}){1,2}\.(json|nc|html|npz)"
 )
 _ATTEMPTS, _BETWEEN = 20, 0.1  # [s]
 

@@ -312,22 +312,23 @@ def _measure_maps(
 
     A malformed belief of a user's estimator is a failure of its run.
     """
-
-    def attempt(some: list[int]) -> None:
+    pieces = [
+        some
+        for size, alike in _by_size(filtered.beliefs).items()
+        for some in _pieces(
+            alike, (3 + 2 * size) ** 2 if runs.true_ids is None else _AT_ONCE
+        )
+    ]
+    while pieces:
+        some = pieces.pop(0)
         try:
             _write(block, some, _measured_maps(runs, filtered, some, resolution))
         except Exception as error:
             if len(some) > 1:
-                for run in some:
-                    attempt([run])
-                return
+                pieces[:0] = ([run] for run in some)
+                continue
             message = f"the final belief is no map of this world: {error}"
             failures[some[0]] = Failure(runs.visible.shape[1] - 1, message)
-
-    for size, alike in _by_size(filtered.beliefs).items():
-        numbers = (3 + 2 * size) ** 2 if runs.true_ids is None else _AT_ONCE
-        for some in _pieces(alike, numbers):
-            attempt(some)
 
 
 def _by_size(beliefs: Sequence[Belief | None]) -> dict[int, list[int]]:

@@ -180,8 +180,8 @@ def test_a_child_forked_meanwhile_does_not_keep_the_folder(tmp_path):
 @pytest.mark.parametrize(
     ("dies_at", "rest"),
     [
-        ("job", r"\.job\.[0-9a-f]{8}\.json"),
-        ("block", r"blocks/\.runs-0000004-0000008\.[0-9a-f]{8}\.npz"),
+        ("job", r"\.job\.\d+@.+-[0-9a-f]{8}\.json"),
+        ("block", r"blocks/\.runs-0000004-0000008\.\d+@.+-[0-9a-f]{8}\.npz"),
         ("results", r"\.results\.0123abcd\.nc"),
     ],
 )
