@@ -18,7 +18,6 @@ from ...estimator import interface
 from ...estimator.filters.batch import BatchSlam, BatchTrace, can_batch
 from ...estimator.filters.ekf import EkfSlam
 from ...estimator.guards.saved_states import is_semidefinite
-from ...estimator.map_management.managed_slam import filter_in
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.motions import find_motion
 from ...estimator.models.sensors import Sensor, find_sensor
@@ -167,6 +166,8 @@ def _one_by_one(
     settings: FilterSettings, runs: SimulatedRuns, run: int, found: FilteredRuns
 ) -> Failure | None:
     """Filter one run, fill its row of the trace, keep final belief and decisions."""
+    from ...estimator.map_management.managed_slam import filter_in  # noqa: PLC0415 (many)
+
     step, trace = 0, found.trace
     try:
         slam = settings.make(runs.initial_poses[run])
