@@ -440,8 +440,8 @@ SOURCES = {
         "Published numbers beside `invariant` are those of the right SE(2) UKF, which "
         "has the same error and sigma points in place of Jacobians. Noise disturbs "
         "the motion here, and the odometry in the source. The NEES of the position has "
-        "a heavy tail: of 1000 runs, 7 make half of its mean. So ours are 5 times the "
-        "number of runs.",
+        "a heavy tail: few runs make most of its mean. So ours are 5 times as many "
+        "runs.",
     ),
     "symmetries": Source(
         "Brossard, Barrau, Bonnabel: Exploiting symmetries, IEEE Sensors J. 2019",
@@ -455,8 +455,8 @@ SOURCES = {
         bailey,
         "The statements are those of the abstract: consistent while σθ is small, "
         "not beyond a limit, and no cure by iterations, sigma points or noise. The "
-        "limit lies between 1° and 1.7° here. Open are map and path. The NEES is that "
-        "of the invariant error: the additive one, which the paper uses, rejects even "
+        "limit that the rows assume, 1.5°, is ours. Open are map and path. The NEES is "
+        "that of the invariant error: the additive one, of the paper, rejects even "
         "a consistent filter where σθ bends the errors along an arc.",
     ),
     "huang": Source(

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple, TypeVar
 from filelock import FileLock, Timeout
 
 from ..sim_configs.field_types import unknown_choice
-from ..sim_configs.scenario_files import replace_when_written
+from ..sim_configs.scenario_files import WRITER, replace_when_written
 from .run_and_replay.filter_settings import integer, one_blas_thread
 
 Result = TypeVar("Result")
@@ -217,7 +217,7 @@ def _end_with(engaging: int) -> None:
 def _watch(engaging: int) -> None:
     while os.getppid() == engaging:
         time.sleep(_PATIENCE)
-    os.kill(os.getpid(), signal.SIGKILL)
+    os._exit(1)
 
 
 # --------------------------------------------------------------------------------------
@@ -227,7 +227,7 @@ def _watch(engaging: int) -> None:
 _LEFTOVER = re.compile(
     r"\.writing-[0-9a-f]{8}"
     r"|\.{1,2}(job|manifest|results|report|summary|slamgym_files|runs-\d{7,}-\d{7,})"
-    r"(\.(\d+@.+-)?[0-9a-f]{8}){1,2}\.(json|nc|html|npz)"
+    rf"(\.({WRITER}|[0-9a-f]{{8}})){{1,2}}\.(json|nc|html|npz)"
 )
 _ATTEMPTS, _BETWEEN = 20, 0.1  # [s]
 

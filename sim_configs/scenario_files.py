@@ -30,7 +30,9 @@ SCHEMA_FILE = _FOLDER / "scenario.schema.json"
 
 #: Files and folders that this process is writing, to be removed if it must end.
 unfinished: set[Path] = set()
-_UNFINISHED = re.compile(r"\.(?P<process>\d+)@(?P<machine>.+)-[0-9a-f]{8}\.\w+$")
+#: Who writes a file, and a number, as in the name of an unfinished one.
+WRITER = r"(\d{1,9})@(.+)-[0-9a-f]{8}"
+_UNFINISHED = re.compile(rf"\..+\.{WRITER}\.\w+")
 
 
 def list_presets() -> tuple[str, ...]:
@@ -297,10 +299,10 @@ def replace_when_written(path: str | Path) -> Iterator[Path]:
 def remove_unfinished(folder: Path) -> None:
     """Remove what killed processes of this machine have left of files in a folder."""
     for path in folder.glob(".*@*-*.*"):
-        found = _UNFINISHED.search(path.name)
-        if found and found["machine"] == platform.node() and os.name == "posix":
+        found = _UNFINISHED.fullmatch(path.name)
+        if found and found[2] == platform.node() and os.name == "posix":
             try:
-                os.kill(int(found["process"]), 0)  # sends nothing
+                os.kill(int(found[1]), 0)  # sends nothing
             except ProcessLookupError:
                 path.unlink(missing_ok=True)
             except OSError:  # a process of another user

@@ -571,9 +571,8 @@ class Hypothesis:
     @property
     def report(self) -> UpdateReport:
         """The report of the last update."""
-        if self._report is None:  # of a clear scan
-            report: UpdateReport = cast("Any", self.filter).report()
-            self._report = report.completed(row_ids=self._row_ids)
+        if self._report is None:
+            self._report = self._report_of_clear_scan()
         return self._report
 
     @report.setter
@@ -596,11 +595,14 @@ class Hypothesis:
             return None
         self.editor.expire()
         self._report, self._row_ids = None, tuple(ids.tolist())
-        report: UpdateReport = cast("Any", self.filter).report()
-        report = report.completed(row_ids=self._row_ids)
+        report = self._report_of_clear_scan()
         unused = () if clear.is_used else {*report.rejected_ids, *report.skipped_ids}
         self.recent.note_clear(clear.number, readings, self._row_ids, unused)
         return report
+
+    def _report_of_clear_scan(self) -> UpdateReport:
+        report: UpdateReport = cast("Any", self.filter).report()
+        return report.completed(row_ids=self._row_ids)
 
     def _settle(self) -> None:
         """Complete what clear scans have left for later, before the map is edited."""

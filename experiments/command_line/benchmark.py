@@ -5,6 +5,7 @@ from pathlib import Path
 
 from rich.table import Table
 
+from ...sim_configs.scenario_files import replace_when_written
 from . import options
 from .commands import FAILURE, BadInputError, command
 
@@ -64,6 +65,8 @@ def benchmark(*, given: BenchmarkOptions) -> int:
             f"--out must be a new .json file, got {given.out}"
             f"{', which exists' * given.out.exists()}"
         )
+    if given.out and not given.out.absolute().parent.is_dir():
+        raise BadInputError(f"--out: the folder of {given.out} does not exist")
     options.refuse_broken(given.estimators)
     with reporter.warnings(), reporter.progress("running", unit="worlds") as tick:
         found = protocol.score_filters(given.estimators, progress=tick)
@@ -75,7 +78,8 @@ def benchmark(*, given: BenchmarkOptions) -> int:
         table.add_row(label, *("–" if v is None else f"{v:.3g}" for v in values))
     reporter.show(table)
     if given.out:
-        given.out.write_text(as_json_text(found), encoding="utf-8")
+        with replace_when_written(given.out) as partial:
+            partial.write_text(as_json_text(found), encoding="utf-8")
         reporter.show_verbatim(f"Wrote {given.out}")
     reporter.finish(found)
     return 0

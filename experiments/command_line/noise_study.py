@@ -1,6 +1,5 @@
 """``slamgym noise-study``: every noise times 10 and divided by 10."""
 
-import csv
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ import typer
 
 from ...sim_configs import Scenario, list_presets
 from ...sim_configs.field_types import unknown_choice
-from ...sim_configs.scenario_files import naming_file
 from ...suggestions import closest
 from .. import figures
 from . import commands, options
@@ -206,7 +204,7 @@ def write_study(study: PreparedStudy, out: Path | None, reporter: Reporter) -> N
     """Run a study, write its figure, table and summary, and print its results."""
     from ... import __version__
     from ..figures.style import sign
-    from .output_folder import default_folder, output_folder, write_summary
+    from .output_folder import default_folder, output_folder, write_csv, write_summary
     from .tables import written
 
     head = {"slamgym": __version__, "name": study.names[0], **study.about}
@@ -219,7 +217,8 @@ def write_study(study: PreparedStudy, out: Path | None, reporter: Reporter) -> N
             (folder / "maps").mkdir(exist_ok=True)
             sign(drawn, " · ".join((*study.names, name)))
             figures.save_figure(drawn, folder / "maps" / f"{name}.png", dpi=100)
-        _write_csv(folder / "noise_study.csv", found.rows)
+        columns = found.rows[0]._fields
+        write_csv(folder / "noise_study.csv", columns, found.rows)
         rows = [_plain(row) for row in found.rows]
         if found.titles:
             titles = zip(found.titles, rows, strict=True)
@@ -236,14 +235,6 @@ def _file_name(run: "NoiseRun") -> str:
         return "unchanged"
     letter = {"α": "alpha", "β": "beta"}.get(row.sigma[1:], row.sigma[1:])
     return f"sigma_{letter}_{'times' if row.factor > 1 else 'by'}_10"
-
-
-def _write_csv(path: Path, rows: "Sequence[NoiseRow] | Sequence[NoiseEffect]") -> None:
-    """Write rows as CSV below the names of their columns, empty where None."""
-    with naming_file(path), path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(rows[0]._fields)
-        writer.writerows(rows)
 
 
 def _plain(row: "NoiseRow | NoiseEffect") -> dict[str, Any]:

@@ -1,12 +1,13 @@
 """The folder that a command writes: its files appear together or not at all."""
 
 import contextlib
+import csv
 import errno
 import json
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -178,6 +179,16 @@ def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
     with naming_file(folder / SUMMARY):
         (folder / SUMMARY).write_text(as_json_text(complete), encoding="utf-8")
     return complete
+
+
+def write_csv(
+    path: Path, columns: Iterable[str], rows: Iterable[Iterable[Any]]
+) -> None:
+    """Write rows as CSV below the names of their columns, empty where None."""
+    with naming_file(path), path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows)
 
 
 def as_json_text(summary: dict[str, Any]) -> str:

@@ -1,6 +1,5 @@
 """Filter a log for a command: `filter_and_write` writes and prints a run's results."""
 
-import csv
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -14,6 +13,7 @@ from rich.text import Text
 
 from ...leaves import leaf
 from .. import figures
+from ..figures.accuracy import entries
 from ..figures.style import sign
 from ..logs.recording import steps_of
 from ..logs.slamlog import SlamLog, write_slamlog
@@ -23,7 +23,7 @@ from ..run_and_replay.summary import association_failure, summarise
 from ..run_and_replay.trace import RunTrace
 from . import commands, options, tables
 from .commands import Reporter
-from .output_folder import write_summary
+from .output_folder import write_csv, write_summary
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -200,14 +200,10 @@ def write_covariances(folder: Path, trace: RunTrace) -> None:
         ("first", first, trace.first_covariance),
         ("final", trace.last_step, trace.final_covariance),
     ):
-        ids = trace.map_at(step).ids.tolist()
-        entries = ["x", "y", "θ", *(f"l{i}{axis}" for i in ids for axis in "xy")]
+        names = entries(trace.map_at(step).ids)
+        rows = zip(names, covariance.tolist(), strict=True)
         path = folder / f"covariance_{name}.csv"
-        with path.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(["", *entries])
-            rows = zip(entries, covariance.tolist(), strict=True)
-            writer.writerows([entry, *row] for entry, row in rows)
+        write_csv(path, ["", *names], ([entry, *row] for entry, row in rows))
 
 
 def write_figures(

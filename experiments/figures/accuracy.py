@@ -436,6 +436,11 @@ def _draw_correlations(
     return image
 
 
+def entries(ids: NDArray[np.integer]) -> list[str]:
+    """Name the entries of a state: x, y, θ, l0x, l0y, …."""
+    return ["x", "y", "θ", *(f"l{i}{axis}" for i in ids for axis in "xy")]
+
+
 def row_labels(ids: NDArray[np.integer]) -> tuple[list[float], list[str]]:
     """Label the rows x, y, θ, l0x, l0y, …; for large maps only some landmarks.
 
@@ -444,12 +449,9 @@ def row_labels(ids: NDArray[np.integer]) -> tuple[list[float], list[str]]:
     positions, labels : list of float, list of str
         Positions in rows, and texts.
     """
-    rows, labels = [0.0, 1.0, 2.0], ["x", "y", "θ"]
-    if 3 + 2 * len(ids) <= _MOST_LABELS:
-        for k, landmark in enumerate(ids):
-            rows += [3.0 + 2 * k, 4.0 + 2 * k]
-            labels += [f"l{landmark}x", f"l{landmark}y"]
-        return rows, labels
+    labels = entries(ids)
+    if len(labels) <= _MOST_LABELS:
+        return [float(row) for row in range(len(labels))], labels
     stride = -(-len(ids) // (_MOST_LABELS // 2 - 3))
     chosen = range(stride // 2, len(ids), stride)
     return (

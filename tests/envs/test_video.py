@@ -1,3 +1,4 @@
+import platform
 import subprocess
 import sys
 
@@ -30,6 +31,13 @@ def test_gif_holds_every_frame_at_its_time(tmp_path):
     assert [duration for _, duration in shown] == [100] * 5
     for (frame, _), expected in zip(shown, moving_square(), strict=True):
         np.testing.assert_allclose(frame, expected, atol=3)
+
+
+def test_a_file_named_by_a_process_that_cannot_be_stays(tmp_path):
+    path = tmp_path / f".film.{10**20}@{platform.node()}-01234567.gif"
+    path.write_text("of somebody")
+    write_video(moving_square(), tmp_path / "film.gif")
+    assert path.read_text() == "of somebody"
 
 
 def test_the_rest_of_a_killed_film_goes_and_that_of_another_film_stays(tmp_path):

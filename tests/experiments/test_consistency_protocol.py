@@ -60,6 +60,12 @@ def test_scores_are_written_verified_and_refused_with_another_digest(small):
     assert result.stdout.startswith("Other bits: invariant in anchored")
 
 
+def test_a_folder_that_does_not_exist_is_refused_before_the_runs(tmp_path):
+    result = slamgym("benchmark", "--out", tmp_path / "none" / "scores.json")
+    assert result.exit_code == 2
+    assert "--out: the folder of" in result.stderr
+
+
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"protocol": "consistency-1"}'])
 def test_another_file_is_refused_in_one_sentence(text, tmp_path):
     path = tmp_path / "other.json"
