@@ -34,8 +34,6 @@ sys.path[:0] = [str(ROOT / "src"), str(ROOT / "tests" / "support")]
 
 from mutants import Mutant, mutants_of  # noqa: E402
 
-ESTIMATOR, EVALUATION = "tests/estimator/test_", "tests/evaluation/test_"
-
 
 class Tests(NamedTuple):
     """What judges the mutants of a file, and whether kernels run as plain Python."""
@@ -44,31 +42,68 @@ class Tests(NamedTuple):
     plain: bool = False
 
 
-def _of(folder: str, names: str, *, plain: bool = False) -> Tests:
-    return Tests(tuple(f"{folder}{name}.py" for name in names.split()), plain)
-
-
-FILTERS = "ekf_slam filter_family"
 SCANS = "association decisions map_management hypotheses loop_closing"
+LARGE = "estimator/large_maps"
+STUDY = "experiments/monte_carlo_study"
+#: The first tests notice most; those of the longest beginning of a path count.
 TESTS = {
+    "agents/": "active_slam information_reward belief_observation",
+    "agents/active_slam": "active_slam active_slam_pass active_slam_hidden",
+    "agents/active_slam_scores": "active_slam active_slam_honesty active_slam_hidden",
+    "agents/belief_": "belief_observation information_reward state_and_restore",
+    "agents/belief_space_planner": "wall_routes active_slam",
+    "agents/landmark_set": "landmark_set belief_observation",
+    "agents/wall_routes": "wall_routes active_slam",
+    "envs/": "landmark_world streams world_batch models_of_worlds",
+    "envs/bearing_range": "bearing_range_sensor world_batch landmark_world",
+    "envs/controllers": "controllers vector_controllers drawn_worlds",
+    "envs/noise_streams": "bearing_range_sensor streams pose_sensors faults",
+    "envs/random_numbers": "streams bearing_range_sensor drawn_worlds",
+    "envs/rendering": "rendering ellipses",
+    "envs/rendering/video": "video",
+    "envs/robot": "unicycle_body world_batch landmark_world models_of_worlds",
+    "envs/vector": "landmark_world_vector world_batch vector_controllers",
+    "estimator/": "ekf_slam filter_family errors_change_nothing",
     "estimator/models/bearing_range": "motions bearing_range ekf_slam",
     "estimator/models/relative_geometry": "relative_geometry",
     "estimator/models/rigid_motion": "error_frames submaps joining ekf_slam",
     "estimator/models/motions": "motions ekf_slam",
     "estimator/models/model_checks": "sensors motions",
     "estimator/models/sensor": "sensors",
+    "estimator/beliefs": "representations relative_geometry map_editor saved_states",
+    "estimator/check_estimator": "check_estimator",
+    "estimator/covariance_checks": "check_estimator",
     "estimator/kernels/assignment_search": "joint_assignment constellations",
     "estimator/kernels/batch": "batch",
-    "estimator/filters/drive_likelihood": "drive_likelihood",
     "estimator/kernels/imagine": "imagine association map_management",
     "estimator/kernels/sizes_of_covariances": "imagine",
     "estimator/kernels/scan_update": (
-        f"{FILTERS} association joint_assignment map_management"
+        "ekf_slam filter_family association joint_assignment map_management"
     ),
-    "estimator/kernels": FILTERS,
-    "estimator/filters/gaussian_map": f"{FILTERS} filter_memory map_management",
-    "estimator/association/constellations": "constellations loop_closing",
+    "estimator/filters/batch": "batch",
+    "estimator/filters/delayed_landmarks": "sensors saved_states",
+    "estimator/filters/drive_likelihood": "drive_likelihood",
+    "estimator/filters/imagine": "imagine",
+    "estimator/filters/pose_readings": "pose_readings",
+    "estimator/filters/gaussian_map": (
+        "ekf_slam filter_family filter_memory map_management"
+    ),
     "estimator/association": f"{SCANS} joint_assignment",
+    "estimator/association/constellations": "constellations loop_closing",
+    "estimator/association/missed_landmarks": "missed_detections map_management",
+    "estimator/guards": "errors_change_nothing saved_states filter_memory magnitudes",
+    "estimator/interface": "representations ekf_slam pose_readings check_estimator",
+    "estimator/map_management": f"{SCANS} missed_detections map_editor",
+    "estimator/map_management/clear_scans": "clear_scans map_management",
+    "estimator/map_management/map_editor": "map_editor map_management",
+    f"{LARGE}/compressed": "compressed large_maps errors_change_nothing",
+    f"{LARGE}/elimination": "submaps smoother",
+    f"{LARGE}/multifrontal": "sparse_information",
+    f"{LARGE}/sparse_information": "sparse_information large_maps",
+    f"{LARGE}/submaps": "submaps submap_editing joining large_maps",
+    "estimator/peers": "peers",
+    "estimator/registry": "models_of_logs filter_family ekf_slam large_maps peers",
+    "estimator/smoother": "smoother reassociation smooth_command",
     "evaluation/association_scores": "association_scores gospa",
     "evaluation/consistency_report": "consistency_report",
     "evaluation/diagnosis": "diagnosis noise_findings",
@@ -79,30 +114,92 @@ TESTS = {
     "evaluation/noise_findings": "noise_findings diagnosis",
     "evaluation/sequential_tests": "sequential_tests",
     "evaluation/trajectory_error": "trajectory_error",
+    "experiments/command_line": "command_line replay generate",
+    "experiments/command_line/benchmark": "consistency_protocol",
+    "experiments/command_line/fit_noise": "noise_fitting",
+    "experiments/command_line/generate": "generate",
+    "experiments/command_line/judge": "judging strangers_files",
+    "experiments/command_line/monte_carlo": "monte_carlo_command monte_carlo_folder",
+    "experiments/command_line/noise_study": (
+        "noise_study noise_effects_of_many_runs command_line"
+    ),
+    "experiments/command_line/output_folder": "hostile_files signals command_line",
+    "experiments/command_line/render_video": "video command_line",
+    "experiments/command_line/smooth": "smooth_command",
+    "experiments/command_line/tables": "replay monte_carlo_report noise_fitting",
+    "experiments/consistency_protocol": "consistency_protocol",
+    "experiments/estimate_": "judging strangers_files",
+    "experiments/figures": "figures",
+    "experiments/figures/smoothed": "smooth_command",
+    "experiments/job_folders": "monte_carlo_folder generate",
+    "experiments/judging": "judging strangers_files",
+    "experiments/log_conventions": "log_conventions",
+    "experiments/logs": "slamlog importers replay pose_rows",
+    "experiments/logs/ground_truth": "slamlog replay noise_fitting",
+    "experiments/logs/recording": "recording replay pose_rows",
+    "experiments/logs/importers": "importers log_conventions",
+    STUDY: "study_by_hand monte_carlo",
+    f"{STUDY}/figures": "monte_carlo_report html_report",
+    f"{STUDY}/looks": "looks",
+    f"{STUDY}/report": "html_report monte_carlo_report efficiency",
+    f"{STUDY}/results": "study_by_hand monte_carlo monte_carlo_folder",
+    f"{STUDY}/summary": "monte_carlo_report html_report monte_carlo",
+    f"{STUDY}/verdict": "monte_carlo_report causes looks monte_carlo",
+    "experiments/noise_fitting": "noise_fitting",
+    "experiments/noise_study": "noise_study noise_effects_of_many_runs",
+    "experiments/run_and_replay": "replay run_warnings trace simulated_runs",
+    "experiments/run_and_replay/log_smoothing": "smooth_command pose_rows",
+    "experiments/space_poses": "space_poses",
+    "experiments/trajectories": "generate trajectory_formats belief_columns",
+    "experiments/trajectories/formats": "trajectory_formats generate",
+    "experiments/trajectories/parquet": "trajectory_formats",
+    "experiments/viewers/rerun_recording": "rerun_recording",
+    "experiments/viewers/run_page": "run_page",
+    "sim_configs": "scenario layouts controls city randomisation extreme_scenarios",
+    "src/slamgym": "public_names kernel_cache leaves scenario",
+    "src/slamgym/restorable": "state_and_restore",
+    "src/slamgym/suggestions": "scenario command_line",
 }
-KERNELS = ("estimator/filters/drive_likelihood.py", "estimator/filters/gaussian_map.py")
-PLAIN = ("estimator/models", "estimator/kernels", "evaluation/error_bound", *KERNELS)
+PLAIN = (
+    *("estimator/models", "estimator/kernels", "evaluation/error_bound"),
+    *("estimator/filters/drive_likelihood.py", "estimator/filters/gaussian_map.py"),
+)
 NOT_PLAIN = (  # too slow as plain Python, or Python raises where numba divides by zero
     "not (nees_and_nis or 1000_steps or order_of_readings or gate_keeps or far_beyond "
     "or a_pass_that_fails)"
 )
-FOLDERS = ("models", "kernels", "association")
-ROOMS = (*(f"estimator/{name}" for name in FOLDERS), *KERNELS, "evaluation")
+ROOMS = (
+    *("agents", "envs", "estimator", "evaluation", "experiments", "sim_configs"),
+    "src/slamgym",
+)
 EXPLAINED = Path(__file__).with_name("mutants_explained.txt")
 RESULTS = ROOT / "results" / "mutants.jsonl"
 
 
 def tests_of(file: str) -> Tests:
-    """Return the tests of a source file, as the longest entry of the table says."""
-    entry = max((key for key in TESTS if file.startswith(key)), key=len)
-    folder = ESTIMATOR if file.startswith("estimator") else EVALUATION
-    return _of(folder, TESTS[entry], plain=file.startswith(PLAIN))
+    """Return the tests of a source file."""
+    names = TESTS[entry_of(file)].split()
+    files = (test_files()[f"test_{name}.py"] for name in names)
+    return Tests(tuple(files), plain=file.startswith(PLAIN))
+
+
+def entry_of(file: str) -> str:
+    """Return the longest entry of the table that begins a path."""
+    return max((key for key in TESTS if file.startswith(key)), key=len)
+
+
+@cache
+def test_files() -> dict[str, str]:
+    """Return the files of tests by their names."""
+    paths = (ROOT / "tests").glob("*/test_*.py")
+    return {path.name: path.relative_to(ROOT).as_posix() for path in paths}
 
 
 def sources(wanted: list[str]) -> Iterator[str]:
     """Yield the files to change, as paths from the root."""
     for room in ROOMS:
-        for path in sorted((ROOT / room).glob("*.py")) or [ROOT / room]:
+        found = (ROOT / room).glob("*.py" if "/" in room else "**/*.py")
+        for path in sorted(found):
             file = path.relative_to(ROOT).as_posix()
             if not path.name.startswith("__") and (
                 not wanted or any(w in file for w in wanted)
@@ -128,15 +225,22 @@ def preload() -> None:
     import scipy.stats  # noqa: F401
 
 
-def verdict(tests: Tests, file: str = "", text: str = "", limit: float = 600.0) -> str:
+def verdict(
+    tests: Tests,
+    file: str = "",
+    text: str = "",
+    *,
+    function: str = "",
+    limit: float = 600.0,
+) -> str:
     """Run tests in a fork, with another text of a file: killed, survived, or timeout.
 
-    A mutant that cannot be loaded counts as broken: it tells nothing about the tests.
+    A kernel that is changed, and those that call it, are compiled anew.
     """
     child = os.fork()
     if not child:
         os.setsid()
-        _run(tests, file, text)
+        _run(tests, file, text, function)
     began = time.monotonic()
     while time.monotonic() - began < limit:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -149,7 +253,7 @@ def verdict(tests: Tests, file: str = "", text: str = "", limit: float = 600.0) 
     return "timeout"
 
 
-def _run(tests: Tests, file: str, text: str) -> None:
+def _run(tests: Tests, file: str, text: str, function: str) -> None:
     import numba
     import pytest
 
@@ -161,6 +265,7 @@ def _run(tests: Tests, file: str, text: str) -> None:
         os.environ["NUMBA_DISABLE_JIT"] = "1"
     if file:
         _load_instead(ROOT / file, text)
+        _compile_anew(file, function)
     os.chdir(ROOT)
     options = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", "--tb=no"]
     options += ["-k", NOT_PLAIN] if tests.plain else []
@@ -179,6 +284,26 @@ def _load_instead(path: Path, text: str) -> None:
         return usual(self, fullname)
 
     loader.get_code = get_code
+
+
+def _compile_anew(file: str, function: str) -> None:
+    """Load no kernel that calls the changed one, or has a changed constant."""
+    from slamgym.jit import KernelCache
+
+    module = f"slamgym.{file.removeprefix('src/slamgym/')[:-3].replace('/', '.')}"
+
+    @cache
+    def reaches(kernel: object) -> bool:
+        own, names = kernel.py_func, kernel.py_func.__code__.co_names
+        called = (own.__globals__.get(name) for name in names)
+        return (own.__module__ == module and function in ("", own.__name__)) or any(
+            reaches(each) for each in called if hasattr(each, "py_func")
+        )
+
+    usual = KernelCache._files.func
+    KernelCache._files = property(
+        lambda self: None if reaches(self._kernel) else usual(self)
+    )
 
 
 def drawn(arguments: argparse.Namespace) -> list[tuple[str, Mutant]]:
@@ -251,7 +376,7 @@ def main() -> int:
                 line = {"key": key_of(file, mutant), "verdict": outcome}
                 results.write(json.dumps(line) + "\n")
                 results.flush()
-            counts[file, outcome] += 1
+            counts[os.path.dirname(file), outcome] += 1
     _print(counts, time.monotonic() - began)
     return 1 if any(outcome == "survived" for _, outcome in counts) else 0
 
@@ -263,7 +388,8 @@ def _judged(file: str, mutant: Mutant) -> str:
         compile(changed, file, "exec")
     except SyntaxError:
         return "broken"
-    outcome = verdict(tests, file, changed, _time_allowed(tests))
+    limit, name = _time_allowed(tests), mutant.function
+    outcome = verdict(tests, file, changed, function=name, limit=limit)
     if outcome != "survived":
         return outcome
     _, function, line, change = key_of(file, mutant)
@@ -284,15 +410,21 @@ def _time_allowed(tests: Tests) -> float:
 
 def _print(counts: Counter[tuple[str, str]], seconds: float) -> None:
     kinds = ("killed", "timeout", "explained", "survived", "broken")
-    print(f"\n{'file':44}" + "".join(f"{kind:>10}" for kind in kinds))
-    for room in ROOMS:
-        for file in sorted({f for f, _ in counts if f.startswith(room)}):
-            print(f"{file:44}" + "".join(f"{counts[file, k]:10}" for k in kinds))
-    total = {k: sum(n for (_, kind), n in counts.items() if kind == k) for k in kinds}
-    print(f"{'all':44}" + "".join(f"{total[k]:10}" for k in kinds))
-    noticed, ran = total["killed"] + total["timeout"], sum(total.values())
-    judged = max(ran - total["broken"], 1)
-    print(f"{noticed} of {judged} killed, {noticed / judged:.1%}, in {seconds:.0f} s")
+    print(f"\n{'folder':32}" + "".join(f"{kind:>10}" for kind in kinds) + "  noticed")
+    for folder in sorted({folder for folder, _ in counts}):
+        _print_row(folder, [counts[folder, kind] for kind in kinds])
+    total = [sum(n for (_, k), n in counts.items() if k == kind) for kind in kinds]
+    _print_row(f"all, in {seconds:.0f} s", total)
+
+
+def _print_row(name: str, numbers: list[int]) -> None:
+    """Print numbers by outcome, and the share noticed with Wilson's 95 % interval."""
+    from scipy.stats import binomtest
+
+    noticed, judged = sum(numbers[:2]), sum(numbers[:4])
+    low, high = binomtest(noticed, max(judged, 1)).proportion_ci(method="wilson")
+    shares = f"{noticed} of {judged}, {low:.0%} to {high:.0%}"
+    print(f"{name:32}" + "".join(f"{n:10}" for n in numbers) + f"  {shares}")
 
 
 if __name__ == "__main__":

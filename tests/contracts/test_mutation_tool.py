@@ -1,6 +1,7 @@
 """The command for mutation testing knows the tests of every file it changes."""
 
 import sys
+from glob import glob
 from pathlib import Path
 
 import pytest
@@ -19,12 +20,56 @@ def mutate(monkeypatch):
         sys.modules.pop(name, None)
 
 
-def test_every_file_has_tests(mutate):
-    files = list(mutate.sources([]))
-    assert len(files) > 15
-    for file in files:
-        for tests in mutate.tests_of(file).files:
-            assert (ROOT / tests).is_file(), (file, tests)
+def test_every_file_of_the_library_has_tests(mutate):
+    package = ROOT / "src" / "slamgym"
+    files = {(ROOT / file).resolve() for file in mutate.sources([])}
+    every = {
+        path.resolve() for path in map(Path, glob(f"{package}/**/*.py", recursive=True))
+    }
+    assert files == {path for path in every if not path.name.startswith("__")}
+    assert all(mutate.tests_of(file).files for file in mutate.sources([]))
+
+
+def test_every_entry_of_the_table_is_used(mutate):
+    for entry, names in mutate.TESTS.items():
+        files = [file for file in mutate.sources([]) if file.startswith(entry)]
+        used = [file for file in files if mutate.entry_of(file) == entry]
+        assert used, entry
+        assert len(set(names.split())) == len(names.split()), entry
+
+
+SOURCE = """
+class Pose:
+    x: float
+    y: float
+
+
+def turned(pose, end: float, start: float, way=True):
+    a, b = pose.x, pose.copy()
+    way = way and a < b[end:]
+    return swapped(a, b, end + 1) if way else b[row - 1]
+"""
+MISTAKES = {
+    "way=False",
+    "= pose.y, pose.copy()",
+    "pose.x, (pose)",
+    "and a <= b[end:]",
+    "and b < b[end:]",
+    "b[start:]",
+    "b[end + 1:]",
+    "swapped(b, a, end + 1)",
+    "swapped(a, b, end)",
+    "b[row]",
+}
+
+
+def test_mistakes_are_those_that_a_hand_makes(mutate):
+    import mutants
+
+    every = mutants.mutants_of(SOURCE)
+    changed = [" ".join(m.applied(SOURCE).split()) for m in every]
+    for mistake in MISTAKES:
+        assert sum(mistake in text for text in changed) == 1, mistake
 
 
 def test_explanations_are_of_functions_that_exist(mutate):

@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 
-from slamgym.evaluation.error_bound import posterior_bound
 from slamgym.experiments.monte_carlo_study import monte_carlo, summarise_monte_carlo
 from slamgym.experiments.monte_carlo_study.report import (
     html_report,
     measures,
     monte_carlo_table,
 )
-from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
 RUNS = 30
@@ -25,23 +23,6 @@ def results():
 @pytest.fixture(scope="module")
 def summary(results):
     return summarise_monte_carlo(results)
-
-
-def test_bounds_are_those_along_the_true_paths(results):
-    runs = simulate_runs(WORLD, RUNS, 7)
-    bound = posterior_bound(
-        runs.true_poses,
-        runs.landmarks,
-        runs.visible,
-        runs.dt,
-        motion_std=WORLD.motion.std,
-        measurement_std=WORLD.sensor.std,
-        start_std=WORLD.start.std,
-    )
-    for name in ("ekf", "smoother"):
-        found = results.sel(estimator=name)
-        assert found.position_bound.values.tolist() == bound.position.tolist()
-        assert found.map_bound.values.tolist() == bound.map.tolist()
 
 
 def test_efficiency_is_the_bound_by_the_mean_squared_error(results, summary):

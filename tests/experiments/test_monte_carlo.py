@@ -19,11 +19,9 @@ import psutil
 import pytest
 import xarray as xr
 from comparison import tree
-from recordings import recorded
 
 from slamgym.estimator import Belief, EkfSlam, make_estimator
 from slamgym.evaluation import AssociationScores, Gospa, oracle_errors
-from slamgym.evaluation.nees import pose_nees, state_nees
 from slamgym.experiments.command_line.commands import (
     LostSchedulerError,
     _naming_interrupts,
@@ -34,25 +32,14 @@ from slamgym.experiments.monte_carlo_study import (
     runner,
     summarise_monte_carlo,
 )
-from slamgym.experiments.monte_carlo_study.filtered_runs import (
-    bound_runs,
-    filter_runs,
-    noise_of_runs,
-)
 from slamgym.experiments.monte_carlo_study.report import html_report, measures
 from slamgym.experiments.monte_carlo_study.results import load_results, merge_blocks
 from slamgym.experiments.monte_carlo_study.run_measures import (
     HIDDEN_VARIABLES,
     VARIABLES,
-    measure_runs,
 )
 from slamgym.experiments.monte_carlo_study.runner import python_call
-from slamgym.experiments.run_and_replay.filter_settings import (
-    estimator_choices,
-    settings_for,
-    settings_for_scenario,
-)
-from slamgym.experiments.run_and_replay.log_replay import replay
+from slamgym.experiments.run_and_replay.filter_settings import estimator_choices
 from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
@@ -134,46 +121,6 @@ def test_workers_change_no_bit(whole, backend):
 def test_a_filter_that_cannot_batch_gives_the_same_numbers(whole):
     single = monte_carlo("six_landmarks", {"ekf": OneByOne}, 4)
     xr.testing.assert_equal(single, whole.sel(estimator=["ekf"], run=slice(0, 3)))
-
-
-def test_figures_are_those_of_a_replay_of_the_same_drive(whole):
-    run = 3
-    log = recorded(WORLD, run)
-    done = replay(log, settings_for(log, estimator="invariant").make(log.start))
-    row = whole.sel(estimator="invariant", run=run)
-    trace = done.trace
-    nees = pose_nees(
-        trace.true_poses, trace.poses, trace.pose_covariances, frame="invariant"
-    )
-    np.testing.assert_allclose(row.pose_nees_invariant, nees, rtol=1e-9)
-    np.testing.assert_array_equal(row.nis, trace.nis)
-    np.testing.assert_array_equal(row.nis_dof, trace.nis_dof)
-    gap = np.linalg.norm(trace.poses[:, :2] - trace.true_poses[:, :2], axis=1)
-    np.testing.assert_allclose(row.position_error, gap, rtol=1e-12, atol=1e-15)
-    np.testing.assert_allclose(row.ate, np.sqrt((gap**2).mean()), rtol=1e-12)
-    state = np.concatenate([trace.true_poses[-1], trace.true_landmarks.ravel()])
-    final = state_nees(
-        state, done.belief.mean, done.belief.covariance, frame="additive"
-    )
-    np.testing.assert_allclose(row.state_nees_additive, final, rtol=1e-12)
-    assert row.state_dof == 15
-    error = np.linalg.norm(trace.landmarks - trace.true_landmarks, axis=1)
-    by_id = error[np.argsort(trace.landmark_ids)]
-    np.testing.assert_allclose(row.landmark_error, by_id, rtol=1e-12)
-
-
-def test_deviations_and_areas_are_those_of_the_claimed_covariances():
-    """Every variance differs, so that none can stand in for another."""
-    runs = simulate_runs(WORLD, 2, seed=0)
-    filtered = filter_runs(settings_for_scenario(WORLD), runs)
-    variances = np.array([4.0, 9.0, 25.0]) * np.array([1.0, 100.0])[:, None]
-    filtered.trace.pose_covariances[:] = variances[:, None, :, None] * np.eye(3)
-    noise = noise_of_runs(WORLD, WORLD, runs)
-    block = measure_runs(runs, filtered, bound_runs(WORLD, runs), noise)
-    for run, scale in enumerate((1.0, 10.0)):
-        np.testing.assert_allclose(block["position_std"][run], scale * np.sqrt(13.0))
-        np.testing.assert_allclose(block["heading_std"][run], scale * 5.0)
-        np.testing.assert_allclose(block["pose_area"][run], scale**2 * 54 * np.pi)
 
 
 @pytest.fixture(scope="module")

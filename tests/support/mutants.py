@@ -2,10 +2,14 @@
 
 A mutant is the text of the file with one replacement.  Docstrings, annotations, the
 messages of errors and the constants of types are left alone: no test can see them.
+
+Two names are neighbours if they are parameters or fields of one type that follow each
+other, or stand next to each other on the left of an assignment.
 """
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 
@@ -41,6 +45,7 @@ BINARY = {
     ast.BitAnd: ("and → or", "|"),
     ast.BitOr: ("or → and", "&"),
 }
+AT_EQUALITY = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">"}
 COMPARED = {
     ast.Lt: ("< → >=", ">="),
     ast.LtE: ("<= → >", ">"),
@@ -68,7 +73,12 @@ SWAPPED = {
     "ppf": "cdf",
 }
 DROPPED = ("wrap_angle", "wrapped", "sqrt", "abs", "square", "log", "exp")
+COPIED = ("copy", "deepcopy")
+SYMMETRIC = ("min", "max", "minimum", "maximum", "hypot", "allclose", "isinstance")
+INDICES = ("i", "j", "k", "t", "begin", "end", "step", "run", "row", "slot", "index")
 UNSEEN = ("dtype", "order", "copy", "title", "label")
+
+Change = tuple[str, int, int, str]
 
 
 def mutants_of(source: str) -> list[Mutant]:
@@ -87,6 +97,14 @@ class _Search:
             total += len(line)
         self.starts = starts
         self.tree = ast.parse(source)
+        self.fields = _beside(
+            (field.target.id, ast.unparse(field.annotation))
+            for part in ast.walk(self.tree)
+            if isinstance(part, ast.ClassDef)
+            for field in part.body
+            if isinstance(field, ast.AnnAssign)
+        )
+        self.names: dict[str, str] = {}
 
     def found(self) -> Iterator[Mutant]:
         """Yield the mutants of constants of the module and of all functions."""
@@ -96,14 +114,15 @@ class _Search:
         for child in ast.iter_child_nodes(node):
             if _is_unseen(child):
                 continue
-            name = function
+            name, names = function, self.names
             if isinstance(child, ast.FunctionDef):
-                name = child.name
+                name, self.names = child.name, _names_beside(child)
             for operator, start, end, text in self._changes(child):
                 yield Mutant(operator, child.lineno, name, start, end, text)
             yield from self._inside(child, name)
+            self.names = names
 
-    def _changes(self, node: ast.AST) -> Iterator[tuple[str, int, int, str]]:
+    def _changes(self, node: ast.AST) -> Iterator[Change]:
         kind = type(node)
         if kind in CHANGES:
             yield from CHANGES[kind](self, node)
@@ -120,38 +139,43 @@ class _Search:
         start, end = self.span(node)
         return self.raw[start:end].decode()
 
-    def binary(self, node: ast.BinOp) -> Iterator[tuple[str, int, int, str]]:
+    def binary(self, node: ast.BinOp) -> Iterator[Change]:
         """Yield another operation of the same two."""
         if type(node.op) in BINARY and not _is_text(node):
             name, sign = BINARY[type(node.op)]
             # on one line: what follows may rely on its brackets
             yield self._joined(node, node.left, sign, node.right, name)
+        is_sum = isinstance(node.op, ast.Add | ast.Sub)
+        if is_sum and getattr(node.right, "value", None) == 1:
+            yield ("one dropped", *self.span(node), self.text(node.left))
 
-    def augmented(self, node: ast.AugAssign) -> Iterator[tuple[str, int, int, str]]:
+    def augmented(self, node: ast.AugAssign) -> Iterator[Change]:
         """Yield ``-=`` for ``+=``, and the like."""
         if type(node.op) in BINARY:
             name, sign = BINARY[type(node.op)]
             yield self._joined(node, node.target, f"{sign}=", node.value, f"{name} (=)")
 
-    def compared(self, node: ast.Compare) -> Iterator[tuple[str, int, int, str]]:
+    def compared(self, node: ast.Compare) -> Iterator[Change]:
         """Yield the opposite of a comparison, and its neighbour at equality."""
         if len(node.ops) == 1:
             op, right = type(node.ops[0]), node.comparators[0]
             name, sign = COMPARED[op]
             yield self._joined(node, node.left, sign, right, name)
+            if op in AT_EQUALITY:
+                yield self._joined(node, node.left, AT_EQUALITY[op], right, "equality")
 
-    def boolean(self, node: ast.BoolOp) -> Iterator[tuple[str, int, int, str]]:
+    def boolean(self, node: ast.BoolOp) -> Iterator[Change]:
         """Yield ``or`` for ``and``, and ``and`` for ``or``."""
         sign = "or" if isinstance(node.op, ast.And) else "and"
         parts = f" {sign} ".join(f"({self.text(value)})" for value in node.values)
         yield (f"boolean → {sign}", *self.span(node), f"({parts})")
 
-    def unary(self, node: ast.UnaryOp) -> Iterator[tuple[str, int, int, str]]:
+    def unary(self, node: ast.UnaryOp) -> Iterator[Change]:
         """Yield an operand without its sign, or without ``not`` or ``~``."""
         if not isinstance(node.op, ast.UAdd):
             yield ("sign or not dropped", *self.span(node), self.text(node.operand))
 
-    def constant(self, node: ast.Constant) -> Iterator[tuple[str, int, int, str]]:
+    def constant(self, node: ast.Constant) -> Iterator[Change]:
         """Yield another number."""
         if isinstance(node.value, bool):
             yield ("constant", *self.span(node), str(not node.value))
@@ -161,33 +185,69 @@ class _Search:
         elif isinstance(node.value, float):
             yield ("constant", *self.span(node), repr(2 * node.value or 1.0))
 
-    def called(self, node: ast.Call) -> Iterator[tuple[str, int, int, str]]:
-        """Yield another function, or only its argument."""
+    def called(self, node: ast.Call) -> Iterator[Change]:
+        """Yield another function, only its argument, or two arguments exchanged."""
         name = getattr(node.func, "attr", getattr(node.func, "id", ""))
         if name in SWAPPED:
             end = self.span(node.func)[1]
             yield ("function swapped", end - len(name), end, SWAPPED[name])
         if name in DROPPED and len(node.args) == 1:
             yield ("function dropped", *self.span(node), f"({self.text(node.args[0])})")
+        if name in COPIED:
+            copied = node.args[0] if node.args else getattr(node.func, "value", node)
+            yield ("copy dropped", *self.span(node), f"({self.text(copied)})")
+        for a, b in pairwise(node.args if name not in SYMMETRIC else ()):
+            is_alike = type(a) is type(b) and isinstance(a, ast.Name | ast.Attribute)
+            if is_alike and self.text(a) != self.text(b):
+                first, second = self.span(a), self.span(b)
+                between = self.raw[first[1] : second[0]].decode()
+                exchanged = f"{self.text(b)}{between}{self.text(a)}"
+                yield ("arguments exchanged", first[0], second[1], exchanged)
 
-    def attribute(self, node: ast.Attribute) -> Iterator[tuple[str, int, int, str]]:
-        """Yield a matrix that is not transposed."""
+    def attribute(self, node: ast.Attribute) -> Iterator[Change]:
+        """Yield a matrix that is not transposed, or the neighbour of a field."""
         if node.attr == "T":
             yield ("transpose dropped", *self.span(node), self.text(node.value))
+        elif isinstance(node.ctx, ast.Load) and node.attr in self.fields:
+            end = self.span(node)[1]
+            start = end - len(node.attr.encode())
+            yield ("neighbour", start, end, self.fields[node.attr])
 
-    def assigned(self, node: ast.Assign) -> Iterator[tuple[str, int, int, str]]:
+    def name(self, node: ast.Name) -> Iterator[Change]:
+        """Yield the neighbour of a name."""
+        if isinstance(node.ctx, ast.Load) and node.id in self.names:
+            yield ("neighbour", *self.span(node), self.names[node.id])
+
+    def subscript(self, node: ast.Subscript) -> Iterator[Change]:
+        """Yield the entry before."""
+        if isinstance(node.slice, ast.Name) and node.slice.id in INDICES:
+            yield ("index - 1", *self.span(node.slice), f"{node.slice.id} - 1")
+
+    def slice(self, node: ast.Slice) -> Iterator[Change]:
+        """Yield a part that begins or ends one entry later."""
+        for bound in (node.lower, node.upper):
+            if bound is not None and not isinstance(bound, ast.Constant):
+                yield ("bound + 1", *self.span(bound), f"{self.text(bound)} + 1")
+
+    def defined(self, node: ast.FunctionDef) -> Iterator[Change]:
+        """Yield other defaults."""
+        for default in (*node.args.defaults, *node.args.kw_defaults):
+            if isinstance(default, ast.Constant):
+                yield from self.constant(default)
+
+    def assigned(self, node: ast.Assign) -> Iterator[Change]:
         """Yield nothing in place of writing an array's entry."""
         if all(isinstance(target, ast.Subscript) for target in node.targets):
             yield ("assignment dropped", *self.span(node), "pass")
 
-    def expression(self, node: ast.Expr) -> Iterator[tuple[str, int, int, str]]:
+    def expression(self, node: ast.Expr) -> Iterator[Change]:
         """Yield nothing in place of a call for its effect."""
         if isinstance(node.value, ast.Call):
             yield ("call dropped", *self.span(node), "pass")
 
     def _joined(
         self, whole: ast.AST, left: ast.AST, sign: str, right: ast.AST, name: str
-    ) -> tuple[str, int, int, str]:
+    ) -> Change:
         """Replace only what stands between two operands."""
         first, last = self.span(left)[1], self.span(right)[0]
         between = self.raw[first:last].decode()
@@ -208,7 +268,33 @@ CHANGES = {
     ast.Attribute: _Search.attribute,
     ast.Assign: _Search.assigned,
     ast.Expr: _Search.expression,
+    ast.Name: _Search.name,
+    ast.Subscript: _Search.subscript,
+    ast.Slice: _Search.slice,
+    ast.FunctionDef: _Search.defined,
 }
+
+
+def _beside(typed: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Return names by their neighbours: the one that follows, else the one before."""
+    pairs = [(a, b) for (a, kind), (b, other) in pairwise(typed) if kind == other]
+    return {b: a for a, b in pairs} | dict(pairs)
+
+
+def _names_beside(function: ast.FunctionDef) -> dict[str, str]:
+    """Return the neighbours of parameters and of what is assigned together."""
+    given = function.args
+    typed = [
+        (each.arg, ast.unparse(each.annotation))
+        for each in (*given.posonlyargs, *given.args, *given.kwonlyargs)
+        if each.annotation
+    ]
+    found = _beside(typed)
+    for part in ast.walk(function):
+        if isinstance(part, ast.Tuple) and isinstance(part.ctx, ast.Store):
+            together = [each.id for each in part.elts if isinstance(each, ast.Name)]
+            found |= _beside((name, "") for name in together if name != "_")
+    return found
 
 
 def _is_text(node: ast.BinOp) -> bool:
