@@ -121,6 +121,16 @@ def test_a_belief_refuses_what_does_not_fit():
             part[0] = 1.0
 
 
+def test_a_belief_is_a_copy_of_its_arguments():
+    mean, covariance, ids = np.array([0.0, 0.0, 4.0, 5.0, 6.0]), np.eye(5), [3]
+    belief = Belief(mean, covariance, ids)
+    assert belief.pose[2] == 4.0 - 2 * np.pi
+    mean[:], covariance[:], ids[:] = 7.0, 7.0, [7]
+    np.testing.assert_array_equal(belief.landmarks, [[5.0, 6.0]])
+    np.testing.assert_array_equal(belief.covariance, np.eye(5))
+    assert belief.landmark_ids == (3,)
+
+
 def test_a_belief_of_a_diverged_filter_may_be_nan():
     belief = Belief([np.nan, 0.0, np.inf], np.full((3, 3), np.nan), ())
     error = belief.error(np.zeros(3), np.zeros((0, 2)), frame="additive")

@@ -298,6 +298,11 @@ def test_near_its_predictions_the_invariant_filter_linearises_once():
     np.testing.assert_array_equal(once.belief().mean, free.belief().mean)
 
 
+def test_options_in_brackets_count_before_keywords():
+    slam = make("ekf[min_range=3.0]", min_range=0.1)
+    assert slam.update([(0.0, 2.0)], [5]).skipped_ids == (5,)
+
+
 @pytest.mark.parametrize("case", FAMILY)
 def test_reset_equals_a_new_filter(case):
     slam, fresh = make(case), make(case)
