@@ -7,6 +7,7 @@ stated.  Every sum here is over independent numbers: one per run, or innovations
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 
@@ -224,12 +225,50 @@ def evaluate_consistency(
                 for part in (map_nees, map_dof, landmark_nees)
             ),
         )
-    scores, scans, freedom = scores[~failed, first:], scans[~failed], freedom[~failed]
-    averages = scores.mean(axis=1)
-    steps = np.linspace(0, scores.shape[1] - 1, _GRID + 1).round()[1:]
-    grid = np.unique(steps.astype(np.int64))
+    part = scores[~failed, first:], scans[~failed], freedom[~failed]
+    return evaluate_in_parts(
+        lambda: [part], first, failed, maps=maps, dof=dof, frame=frame, rng=rng
+    )
+
+
+def evaluate_in_parts(
+    parts: Callable[[], Iterable[tuple[Array, Array, IntArray]]],
+    first: int,
+    failed: BoolArray,
+    *,
+    maps: map_consistency.MapReport | None,
+    dof: int,
+    frame: ErrorFrame,
+    rng: np.random.Generator,
+) -> ConsistencyReport:
+    """Do the same with some runs at a time, to limit the memory.
+
+    Parameters
+    ----------
+    parts : callable
+        Yields, for some successful runs at a time, NEES from the step ``first`` on, and
+        NIS and degrees of freedom of all steps.
+    first : int
+        First step with a NEES.
+    failed : ndarray, shape (runs,)
+        Which of all runs failed.
+    maps : MapReport, optional
+        Of the successful runs.
+    dof, frame, rng
+        As in :func:`evaluate_consistency`.
+    """
+    each, has_nis = [], False
+    for nees, scans, freedom in parts():
+        steps = np.linspace(0, nees.shape[1] - 1, _GRID + 1).round()[1:]
+        grid = np.unique(steps.astype(np.int64))
+        lags, has_nis = min(_LAGS, scans.shape[1] - 1), has_nis or bool(freedom.any())
+        each.append((nees.mean(axis=1), nees[:, grid]))
+    averages, scores = map(np.concatenate, zip(*each, strict=True))
     deciding, others = _deciding_runs(averages / dof)
-    has_nis, lags = bool(freedom.any()), min(_LAGS, scans.shape[1] - 1)
+
+    def nis() -> Iterable[tuple[Array, IntArray]]:
+        return ((scans, freedom) for _, scans, freedom in parts())
+
     return ConsistencyReport(
         frame=frame,
         degrees_of_freedom=dof,
@@ -239,10 +278,10 @@ def evaluate_consistency(
         final_step=tests.final_step_test(scores[:, -1], dof),
         time_average=tests.time_average_test(averages, dof),
         bootstrap=tests.bootstrap_test(averages, dof, rng=rng),
-        family=tests.family_test(scores[:, grid], dof),
+        family=tests.family_test(scores, dof),
         family_steps=grid + first,
-        nis=tests.nis_test(scans, freedom) if has_nis else _NOTHING,
-        whiteness=tests.whiteness_test(scans, freedom, lags=lags)
+        nis=tests.nis_test_in_parts(nis) if has_nis else _NOTHING,
+        whiteness=tests.whiteness_test_in_parts(nis, lags=lags)
         if has_nis
         else _NOTHING,
         equivalence=tests.equivalence_test(averages, dof),

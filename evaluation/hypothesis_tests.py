@@ -9,6 +9,7 @@ has a ratio of 1.
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,9 @@ from scipy.special import chdtr, chdtrc, gammaincinv, stdtr, stdtrit
 
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.guards import argument_checks
+
+#: NIS and degrees of freedom of some runs at a time; a function, to begin again.
+Scans = Callable[[], Iterable[tuple[Array, IntArray]]]
 
 
 class HypothesisTest(NamedTuple):
@@ -94,12 +98,20 @@ def nis_test(
     error_rate : float
         Probability of rejecting a consistent filter.
     """
-    used = np.asarray(degrees_of_freedom) > 0
-    if not used.any():
+    part = np.asarray(nis), np.asarray(degrees_of_freedom)
+    return nis_test_in_parts(lambda: [part], error_rate=error_rate)
+
+
+def nis_test_in_parts(parts: Scans, *, error_rate: float = 0.05) -> HypothesisTest:
+    """Do the same with some runs at a time."""
+    total, freedom = 0.0, 0
+    for nis, degrees_of_freedom in parts():
+        used = degrees_of_freedom > 0
+        total += float(one_per_run("nis", nis[used], 0).sum())
+        freedom += int(degrees_of_freedom[used].sum())
+    if not freedom:
         raise ValueError("degrees_of_freedom must be > 0 at some step, got none")
-    values = one_per_run("nis", np.asarray(nis)[used], 1)
-    freedom = int(np.asarray(degrees_of_freedom)[used].sum())
-    return _chi_square_test(float(values.sum()), freedom, error_rate)
+    return _chi_square_test(total, freedom, error_rate)
 
 
 def family_test(
@@ -159,7 +171,15 @@ def whiteness_test(
     error_rate : float
         Probability of rejecting a white series.
     """
-    test = ljung_box(normal_scores(nis, degrees_of_freedom), lags=lags)
+    part = nis, degrees_of_freedom
+    return whiteness_test_in_parts(lambda: [part], lags=lags, error_rate=error_rate)
+
+
+def whiteness_test_in_parts(
+    parts: Scans, *, lags: int = 10, error_rate: float = 0.05
+) -> HypothesisTest:
+    """Do the same with some runs at a time."""
+    test = _ljung_box(*autocorrelation_of_nis(parts, lags=lags))
     limit = float(chi_square_quantile(1 - error_rate, lags))
     return HypothesisTest(test.statistic, Band(0.0, limit), test.p_value, error_rate)
 
@@ -241,6 +261,7 @@ class Band(NamedTuple):
 EQUIVALENCE_MARGIN = Band(0.8, 1.25)
 # Smallest number of runs with enough different resamples for a bootstrap.
 FEWEST_RESAMPLED = 5
+_DRAWN = 2**20  # numbers that are drawn together, to limit the memory
 
 
 class EquivalenceTest(NamedTuple):
@@ -315,10 +336,14 @@ def bootstrap_test(
     ratios, mean, error = _ratios(averages, degrees_of_freedom)
     if len(ratios) < FEWEST_RESAMPLED or np.ptp(ratios) == 0:
         return HypothesisTest(mean, Band(-np.inf, np.inf), np.nan, error_rate)
-    drawn = ratios[rng.integers(0, len(ratios), (resamples, len(ratios)))]
-    drawn = drawn[np.ptp(drawn, axis=1) > 0]
-    errors = drawn.std(axis=1, ddof=1) / np.sqrt(len(ratios))
-    scores = np.sort((drawn.mean(axis=1) - mean) / errors)
+    parts, size = [], max(1, _DRAWN // len(ratios))
+    for begin in range(0, resamples, size):
+        shape = min(size, resamples - begin), len(ratios)
+        drawn = ratios[rng.integers(0, len(ratios), shape)]
+        drawn = drawn[np.ptp(drawn, axis=1) > 0]
+        errors = drawn.std(axis=1, ddof=1) / np.sqrt(len(ratios))
+        parts.append((drawn.mean(axis=1) - mean) / errors)
+    scores = np.sort(np.concatenate(parts))
     score = (mean - 1) / error
     below = np.searchsorted(scores, score, "right")
     above = len(scores) - np.searchsorted(scores, score, "left")
@@ -402,13 +427,31 @@ def autocorrelation(series: Array, *, lags: int) -> tuple[Array, Array]:
     correlations, pairs : ndarray, shape (lags,)
         Correlation at lags 1 … ``lags``, and the number of pairs behind each.
     """
-    known = np.isfinite(series)
-    centred = np.where(known, series - np.mean(series[known]), 0.0)
-    power = (centred**2).sum() / known.sum()
-    shifts = range(1, lags + 1)
-    pairs = np.array([(known[:, k:] & known[:, :-k]).sum() for k in shifts], float)
-    sums = np.array([(centred[:, k:] * centred[:, :-k]).sum() for k in shifts])
-    return sums / np.maximum(pairs, 1) / power, pairs
+    return _autocorrelation(lambda: [series], lags)
+
+
+def autocorrelation_of_nis(parts: Scans, *, lags: int) -> tuple[Array, Array]:
+    """Return the autocorrelations of NIS, transformed by :func:`normal_scores`."""
+    return _autocorrelation(lambda: (normal_scores(*part) for part in parts()), lags)
+
+
+def _autocorrelation(
+    parts: Callable[[], Iterable[Array]], lags: int
+) -> tuple[Array, Array]:
+    """Return the autocorrelations from the series of some runs at a time."""
+    total, count = 0.0, 0
+    for series in parts():
+        values = series[np.isfinite(series)]
+        total, count = total + values.sum(), count + len(values)
+    squares, shifts = 0.0, range(1, lags + 1)
+    pairs, sums = np.zeros(lags), np.zeros(lags)
+    for series in parts():
+        known = np.isfinite(series)
+        centred = np.where(known, series - total / count, 0.0)
+        squares += (centred**2).sum()
+        pairs += [(known[:, k:] & known[:, :-k]).sum() for k in shifts]
+        sums += [(centred[:, k:] * centred[:, :-k]).sum() for k in shifts]
+    return sums / np.maximum(pairs, 1) / (squares / count), pairs
 
 
 def ljung_box(series: Array, *, lags: int = 10) -> LjungBox:
@@ -436,9 +479,12 @@ def ljung_box(series: Array, *, lags: int = 10) -> LjungBox:
     """
     if not 1 <= lags < series.shape[-1]:
         raise ValueError(f"lags must be in [1, {series.shape[-1]}), got {lags}")
-    correlations, pairs = autocorrelation(series, lags=lags)
+    return _ljung_box(*autocorrelation(series, lags=lags))
+
+
+def _ljung_box(correlations: Array, pairs: Array) -> LjungBox:
     statistic = float((pairs * correlations**2).sum())
-    return LjungBox(statistic, float(chdtrc(lags, statistic)))
+    return LjungBox(statistic, float(chdtrc(len(pairs), statistic)))
 
 
 def normal_scores(chi_squares: ArrayLike, degrees_of_freedom: ArrayLike) -> Array:

@@ -301,13 +301,13 @@ def _changes(
 
 
 def _effect(place: str, variation: Variation, scores: EstimatorScores) -> NoiseEffect:
-    per_run = scores.ratios("invariant").mean(axis=1)
+    per_run = scores.ratios("invariant")
     found = {
         "nees_per_degree_median": float(np.median(per_run)) if len(per_run) else None,
         "nees_per_degree": mean(per_run),
         "nees_per_degree_error": standard_error(per_run),
         "nis_per_degree": scores.nis_per_degree,
-        "position_rmse": root_mean_square(scores.over_time("position_error")),
+        "position_rmse": scores.rms("position_error"),
         "pose_area": mean(scores.per_run("pose_area")),
         "landmark_area": mean(scores.per_run("landmark_area")),
     }

@@ -1,5 +1,6 @@
 """Figures of many runs: NEES, heading, NIS and errors over time, per estimator."""
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -9,13 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from ...arrays import AnyArray, Array
+from ...arrays import AnyArray, Array, IntArray
 from ...evaluation.hypothesis_tests import (
-    autocorrelation,
+    autocorrelation_of_nis,
     average_band,
     chi_square_quantile,
     family_band,
-    normal_scores,
 )
 from ...suggestions import counted
 from ..figures.style import ALARM, BLUE, GREY, INK, ORANGE, TEAL, dress, new_figure
@@ -149,7 +149,7 @@ def nees_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Fig
     runs = max(int(scores.good.sum()) for scores, _ in shown)
     extremes = [draw_bands(axes, runs, POSE_FREEDOM, grid_steps(summary))]
     for scores, look in shown:
-        average = np.maximum(scores.ratios(frame).mean(axis=0), _LEAST_RATIO)
+        average = np.maximum(scores.anees(frame), _LEAST_RATIO)
         steps = np.arange(scores.first, scores.first + len(average))
         axes.plot(*thinned(steps, average), **look.line(plain(scores.label)))
         _mark_grid(axes, summary["estimators"][scores.label]["decisions"], look)
@@ -203,7 +203,7 @@ def runs_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Fig
     figure = new_figure(study.width, 0.8 + 1.0 * len(shown))
     axes = figure.subplots()
     size = 3.4 if len(shown[0][0].good) <= _FEW_DOTS else 2.6
-    averages = [scores.ratios(frame).mean(axis=1) for scores, _ in shown]
+    averages = [scores.ratios(frame) for scores, _ in shown]
     each = [np.log10(np.maximum(_dots(ratios), _LEAST_RATIO)) for ratios in averages]
     logs = np.concatenate(each)
     edges = np.linspace(min(logs.min(), -0.5), max(logs.max(), 0.6), _BINS + 1)
@@ -247,7 +247,7 @@ def heading_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> 
     panels = figure.subplots(len(shown), 1, sharex=True, sharey=True, squeeze=False)
     for axes, (scores, look) in zip(panels[:, 0], shown, strict=True):
         claimed, true = (
-            np.degrees(_root_mean_square(scores.over_time(name)))
+            np.degrees(_root_mean_square(scores, name))
             for name in ("heading_std", "heading_error")
         )
         axes.plot(*thinned(scores.steps, true), color=INK, lw=1.0, label="true error")
@@ -280,11 +280,11 @@ def rmse_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Fig
     figure = new_figure(study.width, 2.5)
     axes = figure.subplots()
     for scores, look in shown:
-        rms = _root_mean_square(scores.over_time("position_error"))
+        rms = _root_mean_square(scores, "position_error")
         axes.plot(*thinned(scores.steps, rms), **look.line(plain(scores.label)))
     if "position_bound_raw" in shown[0][0].results:
-        bound = shown[0][0].over_time("position_bound_raw").mean(axis=0)
-        least = thinned(shown[0][0].steps, np.sqrt(bound))
+        total = shown[0][0].total(lambda x: x.sum(axis=0), "position_bound_raw")
+        least = thinned(shown[0][0].steps, np.sqrt(total / shown[0][0].good.sum()))
         axes.plot(*least, color=GREY, ls=":", lw=1.5, label="bound of any filter")
     axes.set_ylim(bottom=0)
     return finished(figure, axes, "RMS error, raw [m]", study.title)
@@ -328,10 +328,11 @@ def _mark_grid(
         dots.set_clip_on(False)
 
 
-def _root_mean_square(values: Array) -> Array:
+def _root_mean_square(scores: EstimatorScores, name: str) -> Array:
     """Return the RMS over runs; nan, a gap in a line, where it overflows."""
     with np.errstate(over="ignore"):
-        square = (values**2).mean(axis=0)
+        total = scores.total(lambda values: (values**2).sum(axis=0), name)
+    square = total / scores.good.sum()
     return np.sqrt(np.where(np.isfinite(square), square, np.nan))
 
 
@@ -498,12 +499,16 @@ def pooled_nis(scores: EstimatorScores) -> tuple[Array, Array, Array]:
         Middle of each block, its NIS by degrees of freedom, and its degrees of freedom;
         blocks without a correction are left out.
     """
-    freedom = scores.over_time("nis_dof")
-    nis = np.where(freedom > 0, scores.over_time("nis"), 0.0)
     steps = scores.steps
     blocks = np.array_split(np.arange(len(steps)), min(_MOST_BLOCKS, len(steps)))
-    totals = np.array([nis[:, block].sum() for block in blocks])
-    counts = np.array([freedom[:, block].sum() for block in blocks], dtype=np.float64)
+
+    def sums(nis: Array, freedom: IntArray) -> Array:
+        nis = np.where(freedom > 0, nis, 0.0)
+        return np.array(
+            [[x[:, block].sum() for block in blocks] for x in (nis, freedom)]
+        )
+
+    totals, counts = scores.total(sums, "nis", "nis_dof")
     middles = np.array([steps[block].mean() for block in blocks])
     used = counts > 0
     return middles[used], totals[used] / counts[used], counts[used]
@@ -519,8 +524,8 @@ def nis_autocorrelation(scores: EstimatorScores) -> tuple[Array, Array]:
     correlations, pairs : ndarray, shape (lags,)
         Correlations at lags 1 to 10, and their numbers of pairs.
     """
-    normal = normal_scores(scores.over_time("nis"), scores.over_time("nis_dof"))
-    return autocorrelation(normal, lags=min(_LAGS, normal.shape[1] - 1))
+    scans = functools.partial(scores.parts, "nis", "nis_dof")
+    return autocorrelation_of_nis(scans, lags=min(_LAGS, len(scores.steps) - 1))
 
 
 def _draw_band(axes: Axes, scores: EstimatorScores) -> None:

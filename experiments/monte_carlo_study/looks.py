@@ -50,6 +50,7 @@ from .verdict import (
     map_not_shown,
     map_refusal,
     map_scores,
+    parts_of,
     report_of,
     squared_errors,
     with_failures,
@@ -281,9 +282,10 @@ def is_sequential(scores: EstimatorScores) -> bool:
 def watched(scores: EstimatorScores, frame: ErrorFrame) -> Watch:
     """Apply the sequential tests to all runs of an estimator."""
     watch = Watch(error_rate_after(_looks(scores)))
-    nees = np.asarray(scores.results[f"pose_nees_{frame}"].values)
     maps = map_scores(scores.results, frame)
-    watch.update(nees, scores.good, scores.first, **maps)
+    for rows, [nees] in parts_of(scores.results, [f"pose_nees_{frame}"]):
+        some = {name: each[rows] for name, each in maps.items()}
+        watch.update(nees, scores.good[rows], scores.first, **some)
     return watch
 
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Array, BoolArray, IntArray
+from ...arrays import AnyArray, Array, BoolArray, IntArray
 from ...estimator.interface import Belief
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.rigid_motion import ERROR_FRAMES, invariant_error, seen_from
@@ -246,37 +246,45 @@ def _write(block: Block, rows: list[int], measured: Mapping[str, Value]) -> None
 LARGEST_SCORE = 1e100
 
 
-def gaps_of(block: Any, frame: str = "invariant") -> tuple[int, BoolArray]:
-    """Return the first step that has a NEES, >= 1, and the later steps without one.
+def gaps_of(block: Block) -> tuple[int, BoolArray]:
+    """Return the first step of a block that has a NEES, and the `gaps` after it."""
+    nees = block["pose_nees_invariant"]
+    first = first_step((nees < LARGEST_SCORE).any(axis=0))
+    return first, gaps(first, nees, block["nis"], block["nis_dof"])
+
+
+def first_step(known: BoolArray) -> int:
+    """Return the first step, >= 1, at which the NEES of any run is known, (T,)."""
+    return 1 + int(known[1:].argmax())
+
+
+def gaps(first: int, nees: AnyArray, nis: AnyArray, freedom: AnyArray) -> BoolArray:
+    """Return the steps without a NEES from the first step on.
 
     Steps without a NIS, though they have readings, count as well.
 
     Parameters
     ----------
-    block : mapping or Dataset
-        Results by name, of one estimator.
-    frame : {"invariant", "additive"}
-        Error coordinates of the NEES.
+    first : int
+        First step that has a NEES.
+    nees, nis, freedom : ndarray, shape (B, T)
+        NEES of the pose, NIS and its degrees of freedom.
 
     Returns
     -------
-    int
     ndarray of bool, shape (B, T)
     """
-    nis, freedom = np.asarray(block["nis"]), np.asarray(block["nis_dof"])
-    known = np.asarray(block[f"pose_nees_{frame}"]) < LARGEST_SCORE
-    first = 1 + int(known[:, 1:].any(axis=0).argmax())
-    gaps = ~known
-    gaps[:, :first] = False
-    return first, gaps | (~(nis < LARGEST_SCORE) & (freedom > 0))
+    without = ~(nees < LARGEST_SCORE)
+    without[:, :first] = False
+    return np.asarray(without | (~(nis < LARGEST_SCORE) & (freedom > 0)))
 
 
 def _explain_gaps(block: Block, filtered: FilteredRuns) -> None:
     """Write a message for runs that did not fail, but have steps without a NEES."""
-    _, gaps = gaps_of(block)
+    _, without = gaps_of(block)
     messages = list(block["message"])
-    for run in np.flatnonzero(gaps.any(axis=1) & ~block["failed"].astype(bool)):
-        step = int(gaps[run].argmax())
+    for run in np.flatnonzero(without.any(axis=1) & ~block["failed"].astype(bool)):
+        step = int(without[run].argmax())
         nees_of_step = float(block["pose_nees_invariant"][run, step])
         flaw = covariance_flaw(filtered.trace.pose_covariances[run, step])
         if flaw and not nees_of_step < LARGEST_SCORE:

@@ -25,7 +25,14 @@ from ...estimator import registry
 from ...estimator.guards.argument_checks import one_of, usable_cores
 from ...evaluation.diagnosis import SMALLEST_NOISE
 from ...sim_configs import Scenario, load_scenario
-from ..job_folders import Progress, blocks_at_once, blocks_of, engage_workers, resume
+from ..job_folders import (
+    Progress,
+    blocks_at_once,
+    blocks_of,
+    engage_workers,
+    resume,
+    staging_folder,
+)
 from ..run_and_replay.filter_settings import (
     EstimatorChoice,
     FilterSettings,
@@ -259,8 +266,9 @@ class _Study(NamedTuple):
             _attributes(self.until, earlier_looks(looks, look)),
         )
         write_results(results, job, stored(blocks), runs, command, more)
-        with load_results(results) as whole:
-            added, told = repeat(runs, perf_counter() - begun, whole)
+        took = perf_counter() - begun
+        with load_results(results) as whole, staging_folder(out) as aside:
+            added, told = repeat(runs, took, whole, out=aside / "less_noise")
         if added:
             add_to_results(results, added)
         folder.keep_look(look)
@@ -318,6 +326,8 @@ def _repeated(
     asked: range,
     seconds: float,
     results: xr.Dataset,
+    *,
+    out: Path | None = None,
     **engine: Any,
 ) -> tuple[dict[str, Array], dict[str, float]]:
     """Repeat runs with less noise, to find why a filter is not consistent.
@@ -325,7 +335,8 @@ def _repeated(
     Returns
     -------
     dict
-        `SMALL_NOISE`, shape (estimators, runs); empty if nothing is repeated.
+        `SMALL_NOISE`, shape (estimators, runs); empty if nothing is repeated. The
+        repeated runs are in the folder ``out`` meanwhile, if it is given.
     dict
         `SMALL_NOISE_SHARE`, the share of the time that this took; ``seconds`` is the
         time of the other runs.
@@ -340,17 +351,19 @@ def _repeated(
             count = runs_to_repeat(scores, verdict_of(scores, "invariant"))
             if not count:
                 break
-            small = monte_carlo(
+            with monte_carlo(
                 with_less_noise(job.scenario, factor),
                 {choice.label: (choice.name, choice.options)},
                 asked.start + count,
                 job.seed,
                 assumed=with_less_noise(job.assumed, factor),
+                out=out,
                 block_size=job.block_size,
                 first_run=asked.start,
+                fresh=True,
                 **engine,
-            )
-            averages = averages_of(scores_of(small, choice.label, "invariant"))
+            ) as small:
+                averages = averages_of(scores_of(small, choice.label, "invariant"))
             averages["small_noise_factor"] = np.full(count, factor)
             is_smaller = np.nanmin(found["small_noise_factor"][row], initial=1) > factor
             for name, values in averages.items():

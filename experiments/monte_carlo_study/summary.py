@@ -288,7 +288,7 @@ def _unused_readings(scores: EstimatorScores) -> float | None:
     may_wait |= options.get("landmark_init") == DELAYED
     if KNOWN_IDS_ATE in scores.results or may_wait:
         return None
-    corrected = scores.per_run("nis_dof").sum(axis=1) / 2
+    corrected = scores.each(lambda dof: dof.sum(axis=1), "nis_dof", begin=0) / 2
     added = scores.per_run("relative_map_dof") / 2
     readings = scores.per_run("readings")
     return quotient(readings - corrected - added, readings)
@@ -408,7 +408,7 @@ def _declared(frame: ErrorFrame) -> list[Measure]:
         row(f"pose_nees.{other}.mean", _anees(other), f"NEES / 3, {other} frame"),
         row(f"pose_nees.{other}.end", _anees(other, -1)),
         row(f"pose_nees.{other}.share_inside_band", _inside_band(other)),
-        row("heading_nees.mean", _steps(mean, "heading_nees"),
+        row("heading_nees.mean", lambda scores: scores.average("heading_nees"),
             "NEES of the heading", "1"),
         row("heading_nees.end", _end(mean, "heading_nees")),
         row("nees_end.state", _by_freedom(f"state_nees_{frame}", "state_dof")),
@@ -424,9 +424,9 @@ def _declared(frame: ErrorFrame) -> list[Measure]:
             "heading at the end, claimed", "{least}", in_degrees),
         row("heading_std_end.true", _end(root, "heading_error"),
             "… true error", "= claimed", in_degrees),
-        row("rmse.position", _steps(root, "position_error")),
+        row("rmse.position", lambda scores: scores.rms("position_error")),
         row("rmse.position_end", _end(root, "position_error")),
-        row("rmse.heading", _steps(root, "heading_error"),
+        row("rmse.heading", lambda scores: scores.rms("heading_error"),
             "… RMSE over all steps", "", in_degrees),
         row("efficiency.pose", None, "efficiency of the position", "≤ 1", _with_error),
         row("efficiency.heading", None,
@@ -511,13 +511,8 @@ def _computed(scores: EstimatorScores, frame: ErrorFrame) -> Entry:
 Statistic = Callable[[AnyArray], float | None]
 
 
-def _steps(statistic: Statistic, name: str) -> Computation:
-    """Return the computation of a statistic over all runs and steps that count."""
-    return lambda scores: statistic(scores.over_time(name))
-
-
 def _end(statistic: Statistic, name: str) -> Computation:
-    return lambda scores: statistic(scores.over_time(name)[:, -1])
+    return lambda scores: statistic(scores.at_end(name))
 
 
 def _runs(statistic: Statistic, name: str) -> Computation:
@@ -526,15 +521,14 @@ def _runs(statistic: Statistic, name: str) -> Computation:
 
 def _averages(statistic: Statistic, frame: ErrorFrame) -> Computation:
     """Return the computation of a statistic over the runs' averages of NEES / 3."""
-    return lambda scores: statistic(scores.ratios(frame).mean(axis=1))
+    return lambda scores: statistic(scores.ratios(frame))
 
 
 def _anees(frame: ErrorFrame, first: int | None = None) -> Computation:
     """Return the computation of ANEES / 3 over the steps from `first` on."""
 
     def compute(scores: EstimatorScores) -> float | None:
-        ratios = scores.ratios(frame)
-        return mean(ratios.mean(axis=0)[first:]) if len(ratios) else None
+        return mean(scores.anees(frame)[first:]) if scores.good.any() else None
 
     return compute
 
@@ -543,11 +537,10 @@ def _inside_band(frame: ErrorFrame) -> Computation:
     """Return the computation of the share of steps with ANEES in its 95 % band."""
 
     def compute(scores: EstimatorScores) -> float | None:
-        ratios = scores.ratios(frame)
-        if not len(ratios):
+        if not (runs := int(scores.good.sum())):
             return None
-        average = ratios.mean(axis=0)
-        low, high = np.array(average_band(len(ratios), POSE_FREEDOM)) / POSE_FREEDOM
+        average = scores.anees(frame)
+        low, high = np.array(average_band(runs, POSE_FREEDOM)) / POSE_FREEDOM
         return mean((average > low) & (average < high))
 
     return compute
@@ -555,7 +548,7 @@ def _inside_band(frame: ErrorFrame) -> Computation:
 
 def _position_nees(frame: ErrorFrame) -> Computation:
     name = f"position_nees_{frame}"
-    return lambda scores: mean(scores.over_time(name) / POINT_FREEDOM)
+    return lambda scores: scores.average(name, lambda nees: nees / POINT_FREEDOM)
 
 
 def _by_freedom(name: str, dof: str = "") -> Computation:
@@ -688,12 +681,13 @@ def efficiency_summary(scores: EstimatorScores) -> dict[str, Any] | None:
     found = {"pose": None, "heading": None, "map": _entry(of_the_map)}
     if scores.nis_per_degree is None:
         return found
-    for name, *pair in (
+    for name, least, actual in (
         ("pose", "position_bound", "position_error_invariant"),
         ("heading", "heading_bound", "heading_error"),
     ):
-        bound, error = map(scores.over_time, pair)
-        found[name] = _entry(efficiency(bound, error**2))
+        bound = scores.each(lambda least: least.mean(axis=1), least)
+        squares = scores.each(lambda error: (error**2).mean(axis=1), actual)
+        found[name] = _entry(efficiency(bound, squares))
     return found
 
 

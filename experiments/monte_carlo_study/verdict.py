@@ -6,17 +6,19 @@ summary and sentences. `scores_of` selects the results that count.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
+import operator
 import re
 import textwrap
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ...arrays import Array, BoolArray, IntArray
+from ...arrays import AnyArray, Array, BoolArray, IntArray
 from ...estimator.guards.argument_checks import one_of
 from ...estimator.models.rigid_motion import ERROR_FRAMES, ErrorFrame
 from ...estimator.models.sensors import DELAYED
@@ -24,7 +26,7 @@ from ...evaluation.consistency_report import (
     FEW_AVERAGES,
     FEW_RUNS,
     ConsistencyReport,
-    evaluate_consistency,
+    evaluate_in_parts,
     few_runs,
 )
 from ...evaluation.diagnosis import (
@@ -47,15 +49,17 @@ from ..run_and_replay.summary import (
     coarse_suspicion,
     nis_suspicion,
 )
-from ..run_and_replay.trace import finite, quotient
+from ..run_and_replay.trace import finite
 from .run_measures import (
     DEVIATIONS,
     KNOWN_IDS_ATE,
     KNOWN_IDS_NEES,
     LARGER,
+    LARGEST_SCORE,
     PREFIX,
     SMALL_NOISE,
-    gaps_of,
+    first_step,
+    gaps,
 )
 
 if TYPE_CHECKING:
@@ -675,7 +679,7 @@ def seeds_sentence(scores: EstimatorScores, frame: ErrorFrame, errors: Array) ->
         Path error of each bad run [m], 0 of the others.
     """
     nees = POSE_FREEDOM * scores.ratios(frame)
-    diverged = nees.mean(axis=1) * (diverged_runs(nees) & (not scores.is_fitted))
+    diverged = nees * (diverged_runs(nees[:, None]) & (not scores.is_fitted))
     worst = np.lexsort((-diverged, -errors))[: np.count_nonzero(errors + diverged)]
     rows = [*np.flatnonzero(~scores.good), *np.flatnonzero(scores.good)[worst]]
     if not rows:
@@ -696,12 +700,10 @@ def diagnosis_of(
 
     The answer is "honest" only if the verdict is "consistent".
     """
-    nees = scores.over_time(f"pose_nees_{frame}")[:, scores.first - 1 :]
-    heading = scores.over_time("heading_nees")[:, scores.first - 1 :]
     found = diagnose(
         scores.per_run("noise_sums"),
-        nees,
-        heading,
+        scores.time_averages(f"pose_nees_{frame}")[:, None],
+        scores.time_averages("heading_nees")[:, None],
         nis_ratio=scores.nis_per_degree,
         heading_knowledge=_heading_knowledge(scores),
         mistakes=_mistakes(scores),
@@ -759,20 +761,17 @@ def averages_of(scores: EstimatorScores) -> dict[str, Array]:
         source = name.replace("small_noise_nees", "pose_nees")
         source = source.removeprefix("small_noise_")
         if source in scores.results:
-            values = scores.over_time(source)[:, scores.first - 1 :]
             found[name] = np.full(len(scores.good), np.nan)
-            known = np.isfinite(values).all(axis=0)
-            if known.any():
-                found[name][scores.good] = values[:, known].mean(axis=1)
+            found[name][scores.good] = scores.time_averages(source)
     return found
 
 
 def _heading_knowledge(scores: EstimatorScores) -> Array | None:
     """Divide the variance of the last heading by the least possible one."""
-    bound = scores.per_run("heading_bound")[:, -1]
+    bound = scores.at_end("heading_bound")
     if scores.nis_per_degree is None or not (bound > 0).all():
         return None
-    return np.asarray(scores.per_run("heading_std")[:, -1] ** 2 / bound)
+    return np.asarray(scores.at_end("heading_std") ** 2 / bound)
 
 
 def _mistakes(scores: EstimatorScores) -> Array | None:
@@ -790,8 +789,8 @@ def _known_nees(scores: EstimatorScores, frame: ErrorFrame) -> Array | None:
     name = f"{KNOWN_IDS_NEES}_{frame}"
     if name not in scores.results:
         return None
-    known = scores.over_time(name)[:, scores.first - 1 :]
-    return known if np.isfinite(known).all() else None
+    known = scores.each(lambda nees: nees.mean(axis=1), name, begin=scores.first)
+    return known[:, None] if np.isfinite(known).all() else None
 
 
 # --------------------------------------------------------------------------------------
@@ -814,8 +813,29 @@ class FailedRun(NamedTuple):
     message: str
 
 
+#: Numbers of a variable that are read together, to limit the memory.
+_AT_ONCE = 2**18
+
+
+def parts_of(
+    results: xr.Dataset, names: Sequence[str], begin: int = 0
+) -> Iterator[tuple[slice, list[AnyArray]]]:
+    """Yield variables (run, step) of one estimator from a step on, some runs at a time.
+
+    Results in a file stay there.
+    """
+    size = max(1, _AT_ONCE // results.sizes["step"])
+    for first in range(0, results.sizes["run"], size):
+        rows = slice(first, first + size)
+        some = [results.variables[name][rows, begin:] for name in names]
+        yield rows, [np.asarray(each.values) for each in some]
+
+
 class EstimatorScores(NamedTuple):
-    """One estimator's results: M successful runs, K steps after the start."""
+    """One estimator's results: M successful runs, K steps after the start.
+
+    What has a number per step is read for some runs at a time.
+    """
 
     label: str
     #: First step that has a NEES, >= 1.
@@ -831,18 +851,64 @@ class EstimatorScores(NamedTuple):
         """Numbers of the steps after the start, shape (K,)."""
         return np.arange(_FIRST, self.results.sizes["step"])
 
-    def over_time(self, name: str) -> Array:
-        """Return a variable of the runs and steps that count, shape (M, K)."""
-        return np.asarray(self.results[name].values[self.good, _FIRST:])
-
     def per_run(self, name: str) -> Array:
-        """Return a variable of the runs that count, shape (M, ...)."""
+        """Return a variable with one number per run, or landmark, of those that count.
+
+        Returns
+        -------
+        ndarray, shape (M, ...)
+        """
         return np.asarray(self.results[name].values[self.good])
 
+    def at_end(self, name: str) -> Array:
+        """Return a variable at the last step of the runs that count, shape (M,)."""
+        return np.asarray(self.results.variables[name][:, -1].values[self.good])
+
+    def parts(self, *names: str, begin: int = _FIRST) -> Iterator[list[Array]]:
+        """Yield variables of some runs that count, from a step on, (m, K) each."""
+        for rows, values in parts_of(self.results, names, begin):
+            yield [each[self.good[rows]] for each in values]
+
+    def each(
+        self, compute: Callable[..., Array], *names: str, begin: int = _FIRST
+    ) -> Array:
+        """Compute something of every run that counts, shape (M, ...)."""
+        parts = self.parts(*names, begin=begin)
+        return np.concatenate([compute(*part) for part in parts])
+
+    def total(
+        self, compute: Callable[..., Any], *names: str, begin: int = _FIRST
+    ) -> Any:
+        """Add up what a function computes from some runs."""
+        found = (compute(*part) for part in self.parts(*names, begin=begin))
+        return functools.reduce(operator.add, found)
+
+    def average(self, name: str, compute: Callable[..., Any] = np.asarray) -> Any:
+        """Average over all runs and steps that count; None if none is finite."""
+
+        def known(values: Array) -> Array:
+            computed = np.asarray(compute(values))
+            finite_ones = computed[np.isfinite(computed)]
+            return np.array([finite_ones.sum(), len(finite_ones)])
+
+        total, count = self.total(known, name)
+        return finite(total / count) if count else None
+
+    def rms(self, name: str) -> float | None:
+        """Take the root mean square over all runs and steps that count."""
+        with np.errstate(over="ignore"):
+            square = self.average(name, np.square)
+        return None if square is None else math.sqrt(square)
+
     def ratios(self, frame: ErrorFrame) -> Array:
-        """Return NEES of the pose divided by 3, shape (M, K + 1 − first)."""
-        nees = self.over_time(f"pose_nees_{frame}")[:, self.first - _FIRST :]
-        return np.asarray(nees / POSE_FREEDOM)
+        """Average NEES / 3 of the pose over the steps of each run, shape (M,)."""
+        name = f"pose_nees_{frame}"
+        return self.each(_average_ratio, name, begin=self.first)
+
+    def anees(self, frame: ErrorFrame) -> Array:
+        """Average NEES / 3 over the runs at each step from the first on."""
+        total = self.total(_sum_of_ratios, f"pose_nees_{frame}", begin=self.first)
+        return np.asarray(total / self.good.sum())
 
     @property
     def is_fitted(self) -> bool:
@@ -852,8 +918,42 @@ class EstimatorScores(NamedTuple):
     @property
     def nis_per_degree(self) -> float | None:
         """Sum of NIS divided by that of degrees of freedom; None without readings."""
-        freedom = self.over_time("nis_dof")
-        return quotient(np.where(freedom > 0, self.over_time("nis"), 0.0), freedom)
+        total, freedom = self.total(_sums_of_nis, "nis", "nis_dof")
+        return finite(total / freedom) if freedom else None
+
+    def time_averages(self, name: str) -> Array:
+        """Average a NEES or an error over time, from the first step with a NEES on.
+
+        A step at which any run has no finite value does not count.
+
+        Returns
+        -------
+        ndarray, shape (M,)
+            nan if no step counts.
+        """
+        unknown = self.total(_unknown_steps, name, begin=self.first)
+        known = unknown == 0
+        if not known.any():
+            return np.full(int(self.good.sum()), np.nan)
+        return self.each(lambda x: x[:, known].mean(axis=1), name, begin=self.first)
+
+
+def _average_ratio(nees: Array) -> Array:
+    return np.asarray((nees / POSE_FREEDOM).mean(axis=1))
+
+
+def _sum_of_ratios(nees: Array) -> Array:
+    return np.asarray((nees / POSE_FREEDOM).sum(axis=0))
+
+
+def _sums_of_nis(nis: Array, freedom: IntArray) -> Array:
+    nis = np.where(freedom > 0, nis, 0.0)
+    known = np.isfinite(nis)
+    return np.array([nis[known].sum(), freedom[known].sum()])
+
+
+def _unknown_steps(values: Array) -> IntArray:
+    return np.asarray((~np.isfinite(values)).sum(axis=0))
 
 
 def scores_of(dataset: xr.Dataset, label: str, frame: ErrorFrame) -> EstimatorScores:
@@ -869,11 +969,19 @@ def scores_of(dataset: xr.Dataset, label: str, frame: ErrorFrame) -> EstimatorSc
         Error coordinates whose NEES must be finite, and below 1e100.
     """
     one_of("frame", frame, ERROR_FRAMES)
-    results = dataset.sel(estimator=label)
-    first, gaps = gaps_of(results, frame)
+    results, pose_nees = dataset.sel(estimator=label), f"pose_nees_{frame}"
+    known = [
+        (x < LARGEST_SCORE).any(axis=0) for _, [x] in parts_of(results, [pose_nees])
+    ]
+    first = first_step(np.any(known, axis=0))
+    found = []
+    for _, part in parts_of(results, [pose_nees, "nis", "nis_dof"]):
+        without = gaps(first, *part)
+        found.append((without.any(axis=1), without.argmax(axis=1)))
+    has_gap, gap = map(np.concatenate, zip(*found, strict=True))
     flagged = results["failed"].values.astype(bool)
-    good = ~(flagged | gaps.any(axis=1))
-    at = np.where(flagged, results["failed_at"].values, gaps.argmax(axis=1))
+    good = ~(flagged | has_gap)
+    at = np.where(flagged, results["failed_at"].values, gap)
     runs, messages = dataset["run"].values.tolist(), results["message"].values
     failures = [
         FailedRun(runs[row], int(at[row]), str(messages[row]) or _NO_MESSAGE)
@@ -884,16 +992,19 @@ def scores_of(dataset: xr.Dataset, label: str, frame: ErrorFrame) -> EstimatorSc
 
 def report_of(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport:
     """Decide about the runs of one estimator; at least 2 must have succeeded."""
-    nees = scores.results[f"pose_nees_{frame}"].values[:, 1:].copy()
-    nees[~scores.good] = np.nan
-    return evaluate_consistency(
-        nees,
-        scores.results["nis"].values[:, 1:],
-        scores.results["nis_dof"].values[:, 1:],
+    first, names = scores.first - _FIRST, (f"pose_nees_{frame}", "nis", "nis_dof")
+
+    def parts() -> Iterator[tuple[Array, Array, IntArray]]:
+        return ((nees[:, first:], *nis) for nees, *nis in scores.parts(*names))
+
+    return evaluate_in_parts(
+        parts,
+        first,
+        ~scores.good,
+        maps=maps_of(scores, frame),
         dof=POSE_FREEDOM,
         frame=frame,
         rng=np.random.default_rng(_BOOTSTRAP_SEED),
-        **map_scores(scores.results, frame),
     )
 
 
