@@ -286,13 +286,20 @@ class BlockFolder(NamedTuple):
     #: Of the job.
     digest: str
 
-    def missing(self, blocks: Iterable[range]) -> list[range]:
-        """Return the blocks that are still to be computed; warn of a damaged one."""
-        return [runs for runs in blocks if not self._has(runs)]
+    def missing(self, blocks: Iterable[range], variables: Iterable[str]) -> list[range]:
+        """Return the blocks that are still to be computed; warn of a damaged one.
 
-    def _has(self, runs: range) -> bool:
+        Raises
+        ------
+        ValueError
+            If a block belongs to another job, or lacks a variable of the results.
+        """
+        names = {f"0/{name}" for name in variables}
+        return [runs for runs in blocks if not self._has(runs, names)]
+
+    def _has(self, runs: range, names: set[str]) -> bool:
         for file in self._files_from(runs.start):
-            problem = problem_with(file, self.digest)
+            problem = problem_with(file, self.digest, names)
             if problem:
                 job_folders.set_aside(file, f"{problem}, and its runs are repeated")
             elif int(file.stem.rpartition("-")[2]) >= runs.stop:
@@ -421,24 +428,29 @@ def blocks_in(path: Path) -> list[Path]:
     return sorted((path / BLOCKS).glob("runs-*.npz"))
 
 
-def problem_with(block: Path, digest: str) -> str:
+def problem_with(block: Path, digest: str, names: Iterable[str] = ()) -> str:
     """Return what is wrong with a block of a job; empty if it is complete.
 
     Raises
     ------
     ValueError
-        If it belongs to another job.
+        If it belongs to another job, or lacks an array of these names.
     """
     try:
         with zipfile.ZipFile(block) as archive:
             if archive.testzip() is not None:
                 return "is damaged"
         with np.load(block, allow_pickle=False) as arrays:
-            job = str(arrays["job"])
+            job, lacking = str(arrays["job"]), sorted({*names} - {*arrays.files})
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         return f"is truncated or damaged ({error})"
     if job != digest:
         raise ValueError(f"{block} belongs to another job: move it away")
+    if lacking:
+        raise ValueError(
+            f"{block} was written before {lacking[0].rpartition('/')[2]} was measured: "
+            "choose another folder, or ask for fresh results"
+        )
     return ""
 
 

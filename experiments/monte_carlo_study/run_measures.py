@@ -248,8 +248,8 @@ LARGEST_SCORE = 1e100
 
 def gaps_of(block: Block) -> tuple[int, BoolArray]:
     """Return the first step of a block that has a NEES, and the `gaps` after it."""
-    nees = block["pose_nees_invariant"]
-    first = first_step((nees < LARGEST_SCORE).any(axis=0))
+    nees: AnyArray = block["pose_nees_invariant"]
+    first = first_step(np.any(nees < LARGEST_SCORE, axis=0))
     return first, gaps(first, nees, block["nis"], block["nis_dof"])
 
 

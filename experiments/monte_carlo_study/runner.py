@@ -252,7 +252,8 @@ class _Study(NamedTuple):
         looks, first = [Look(*each) for each in folder.looks()], self.blocks[0].start
 
         def compute(span: list[range], **told: Any) -> None:
-            self.compute(folder.missing(span), folder.add, kept=kept, **told)
+            missing = folder.missing(span, job.variables)
+            self.compute(missing, folder.add, kept=kept, **told)
 
         def stored(span: Sequence[range]) -> Blocks:
             return folder.read(span, job)

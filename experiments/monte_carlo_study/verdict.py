@@ -864,10 +864,10 @@ class EstimatorScores(NamedTuple):
         """Return a variable at the last step of the runs that count, shape (M,)."""
         return np.asarray(self.results.variables[name][:, -1].values[self.good])
 
-    def parts(self, *names: str, begin: int = _FIRST) -> Iterator[list[Array]]:
+    def parts(self, *names: str, begin: int = _FIRST) -> Iterator[tuple[Any, ...]]:
         """Yield variables of some runs that count, from a step on, (m, K) each."""
         for rows, values in parts_of(self.results, names, begin):
-            yield [each[self.good[rows]] for each in values]
+            yield tuple(each[self.good[rows]] for each in values)
 
     def each(
         self, compute: Callable[..., Array], *names: str, begin: int = _FIRST
@@ -995,7 +995,8 @@ def report_of(scores: EstimatorScores, frame: ErrorFrame) -> ConsistencyReport:
     first, names = scores.first - _FIRST, (f"pose_nees_{frame}", "nis", "nis_dof")
 
     def parts() -> Iterator[tuple[Array, Array, IntArray]]:
-        return ((nees[:, first:], *nis) for nees, *nis in scores.parts(*names))
+        for nees, nis, freedom in scores.parts(*names):
+            yield nees[:, first:], nis, freedom
 
     return evaluate_in_parts(
         parts,

@@ -21,7 +21,7 @@ from slamgym.evaluation.hypothesis_tests import equivalence_test, family_band
 from slamgym.experiments import nees_figure
 from slamgym.experiments.command_line.commands import Reporter
 from slamgym.experiments.command_line.monte_carlo import show_study
-from slamgym.experiments.monte_carlo_study import figures, monte_carlo
+from slamgym.experiments.monte_carlo_study import figures, monte_carlo, verdict
 from slamgym.experiments.monte_carlo_study.figures import report_figures, thinned
 from slamgym.experiments.monte_carlo_study.report import (
     html_report,
@@ -94,6 +94,37 @@ def test_averages_equal_the_plain_formulas(label):
     assert entry["nis"] == pytest.approx(raw["nis"].sum() / raw["nis_dof"].sum())
     positions = raw["position_nees_additive"][:, 1:].mean() / 2
     assert entry["position_nees"]["additive"] == pytest.approx(positions)
+
+
+def test_results_read_in_parts_have_the_same_summary_and_figures(monkeypatch):
+    dataset = with_failures(typical(), FAILURES)
+
+    def found():
+        summary = summarise_monte_carlo(dataset)
+        drawn = report_figures(dataset, summary).values()
+        lines = [
+            line for figure in drawn for axes in figure.axes for line in axes.lines
+        ]
+        return [*leaves(summary), *(x for each in lines for x in each.get_ydata())]
+
+    whole = found()
+    monkeypatch.setattr(verdict, "_AT_ONCE", 7 * dataset.sizes["step"])
+    for part, value in zip(found(), whole, strict=True):
+        is_float = isinstance(value, float)
+        assert part == (approximately(value) if is_float else value)
+
+
+def leaves(found):
+    """Yield all values of nested lists and dictionaries."""
+    if isinstance(found, dict | list):
+        for each in found.values() if isinstance(found, dict) else found:
+            yield from leaves(each)
+    else:
+        yield found
+
+
+def approximately(value):
+    return pytest.approx(value, rel=1e-12, abs=1e-12, nan_ok=True)
 
 
 def test_root_mean_squares_equal_the_plain_formulas():
