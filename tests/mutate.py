@@ -42,7 +42,7 @@ class Tests(NamedTuple):
     plain: bool = False
 
 
-SCANS = "association decisions map_management hypotheses loop_closing"
+SCANS = "association decisions symmetries map_management hypotheses loop_closing"
 LARGE = "estimator/large_maps"
 STUDY = "experiments/monte_carlo_study"
 #: The first tests notice most; those of the longest beginning of a path count.
@@ -103,7 +103,7 @@ TESTS = {
     f"{LARGE}/submaps": "submaps submap_editing joining large_maps",
     "estimator/peers": "peers",
     "estimator/registry": "models_of_logs filter_family ekf_slam large_maps peers",
-    "estimator/smoother": "smoother reassociation smooth_command",
+    "estimator/smoother": "smoother reassociation symmetries",
     "evaluation/association_scores": "association_scores gospa",
     "evaluation/consistency_report": "consistency_report",
     "evaluation/diagnosis": "diagnosis noise_findings",
@@ -128,7 +128,8 @@ TESTS = {
     "experiments/command_line/smooth": "smooth_command",
     "experiments/command_line/tables": "replay monte_carlo_report noise_fitting",
     "experiments/consistency_protocol": "consistency_protocol",
-    "experiments/estimate_": "judging strangers_files",
+    "experiments/estimate_conventions": "judging",
+    "experiments/estimate_files": "estimate_files judging",
     "experiments/figures": "figures",
     "experiments/figures/smoothed": "smooth_command",
     "experiments/job_folders": "monte_carlo_folder generate",

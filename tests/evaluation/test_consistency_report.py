@@ -1,14 +1,17 @@
 """The report on many runs: what it counts, says and refuses."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from linear_filter import kalman_scores
 
+from slamgym.evaluation import hypothesis_tests
 from slamgym.evaluation.consistency_report import (
     assert_consistent,
     evaluate_consistency,
 )
-from slamgym.evaluation.hypothesis_tests import final_step_test
 
 RUNS, STEPS = 100, 40
 
@@ -89,6 +92,9 @@ def test_below_10_runs_the_time_averages_have_no_say():
     assert few.accepted
     many = report(*(np.concatenate([a, a[:1]]) for a in (nees, nis, freedom)))
     assert not many.accepted
+    nees = np.vstack([nees, np.full((1, 5), np.nan)])  # a failed run is no tenth
+    failed = report(nees, *(np.concatenate([a, a[:1]]) for a in (nis, freedom)))
+    assert failed.average_p_value == 1.0
 
 
 def test_a_bootstrap_of_too_few_runs_says_so(scores):
@@ -127,6 +133,45 @@ def test_mean_median_and_share_are_those_of_the_runs(scores):
     assert found.share_above_3 == 0.1
 
 
+def test_each_test_has_the_degrees_of_freedom_of_the_nees(scores):
+    nees = scores[0]
+    rng, averages = np.random.default_rng(0), nees.mean(axis=1)
+    options = {"dof": 2, "frame": "additive"}
+    found = evaluate_consistency(*scores, **options, rng=np.random.default_rng(0))
+    assert found.final_step == hypothesis_tests.final_step_test(nees[:, -1], 2)
+    assert found.time_average == hypothesis_tests.time_average_test(averages, 2)
+    assert found.bootstrap == hypothesis_tests.bootstrap_test(averages, 2, rng=rng)
+    assert found.equivalence == hypothesis_tests.equivalence_test(averages, 2)
+    grid = hypothesis_tests.family_test(nees[:, found.family_steps], 2)
+    np.testing.assert_array_equal(found.family.statistic, grid.statistic)
+    assert found.mean_ratio == pytest.approx(averages.mean() / 2)
+    assert found.runs_needed[0][1] == hypothesis_tests.runs_to_detect(
+        found.runs_needed[0][0], 2
+    )
+
+
+def test_a_scan_that_corrects_nothing_needs_no_nis(scores):
+    nees, nis, freedom = scores
+    nis[:, 7], freedom[:, 7] = np.nan, 0
+    assert report(nees, nis, freedom).failed_runs == ()
+
+
+def test_the_runs_that_lift_the_mean_are_counted(scores):
+    _, nis, freedom = scores
+    nees = np.full((RUNS, STEPS), 3.0)
+    nees[:3] *= 40
+    found = report(nees, nis, freedom)
+    assert (found.deciding_runs, found.ratio_of_others) == (3, 1.0)
+
+
+def test_the_map_has_a_tenth_of_the_error_rate(scores):
+    found = report(*scores)
+    assert found.p_value == found.pose_p_value > 0.05
+    found = replace(found, map=SimpleNamespace(p_value=0.004))
+    assert found.p_value == pytest.approx(0.04)
+    assert found.deciding_rate == pytest.approx(0.045 / 3)
+
+
 def test_unknown_frames_and_misfit_shapes_are_refused(scores):
     nees, nis, freedom = scores
     with pytest.raises(ValueError, match="frame must be"):
@@ -138,6 +183,6 @@ def test_unknown_frames_and_misfit_shapes_are_refused(scores):
 def test_the_last_step_is_tested_at_the_last_step(scores):
     nees = scores[0]
     nees[:, -1] *= 2
-    expected = final_step_test(nees[:, -1], 3)
+    expected = hypothesis_tests.final_step_test(nees[:, -1], 3)
     assert report(*scores).final_step == expected
     assert not expected.accepted

@@ -208,6 +208,13 @@ def test_no_interval_of_a_ratio_holds_negative_numbers(averages):
         assert 0 == low < high
 
 
+def test_the_interval_of_symmetric_averages_is_that_of_student():
+    averages = 3 * np.linspace(0.5, 1.5, 11)
+    slack = student.ppf(0.95, 10) * averages.std(ddof=1) / 3 / np.sqrt(11)
+    found = equivalence_test(averages, 3).interval
+    assert found == pytest.approx((1 - slack, 1 + slack))
+
+
 def test_equivalence_has_three_verdicts():
     rng = np.random.default_rng(6)
     averages = rng.chisquare(DOF, 400)

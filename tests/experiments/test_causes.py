@@ -61,6 +61,38 @@ def test_a_wrong_assumption_is_named_by_its_direction():
 
 
 @pytest.mark.usefixtures("_no_figures_in_reports")
+def test_runs_with_less_noise_are_those_of_a_world_with_less_noise():
+    six = load_scenario("six_landmarks")
+
+    def scaled(motion, factor):
+        return six.with_changes(
+            start={"std": [factor * std for std in six.start.std]},
+            motion={"std": [factor * std for std in motion]},
+            sensor={
+                "std": [factor * std for std in six.sensor.std],
+                "range_std_per_metre": factor * 0.01,
+            },
+        )
+
+    def study(factor, last, **options):
+        world, assumed = (
+            scaled((0.25, 0.1, 0.1), factor),
+            scaled((0.24, 0.1, 0.1), factor),
+        )
+        of_runs = {"block_size": 5, "first_run": 5, "assumed": assumed, **options}
+        return monte_carlo(world, "ekf", last, SEED, **of_runs).isel(estimator=0)
+
+    found = study(1.0, 35, small_noise=True)
+    repeated = np.isfinite(found.small_noise_factor.values)
+    (factor,) = np.unique(found.small_noise_factor[repeated])
+    again = study(factor, 5 + repeated.sum())
+    for frame in ("invariant", "additive"):
+        nees = again[f"pose_nees_{frame}"][:, 1:].mean("step")
+        np.testing.assert_allclose(found[f"small_noise_nees_{frame}"][repeated], nees)
+    error = again.position_error[:, 1:].mean("step")
+    np.testing.assert_allclose(found.small_noise_position_error[repeated], error)
+
+
 def test_linearisation_is_the_fault_of_one_filter_and_not_of_the_other():
     found = summary_of("six_landmarks", "ekf,invariant", runs=100)
     assert causes(found) == {"ekf": "linearisation", "invariant": "honest"}

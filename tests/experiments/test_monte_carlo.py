@@ -40,6 +40,7 @@ from slamgym.experiments.monte_carlo_study.run_measures import (
     HIDDEN_VARIABLES,
     VARIABLES,
     Variable,
+    identified,
 )
 from slamgym.experiments.monte_carlo_study.runner import python_call
 from slamgym.experiments.run_and_replay.filter_settings import estimator_choices
@@ -415,12 +416,38 @@ class UnknownMap(OneByOne):
         return Belief(belief.mean, covariance, belief.landmark_ids)
 
 
+class Indefinite(OneByOne):
+    """Its last landmark has a negative variance."""
+
+    def belief(self):
+        belief = super().belief()
+        covariance = belief.covariance.copy()
+        covariance[-1, -1] *= -1
+        return Belief(belief.mean, covariance, belief.landmark_ids)
+
+
+def test_an_indefinite_map_has_an_infinite_nees():
+    results = monte_carlo("six_landmarks", {"wrong": Indefinite}, 2)
+    assert not results.failed.any()
+    assert np.isinf(results.relative_map_nees).all()
+
+
+def test_of_landmarks_that_show_the_same_one_the_first_counts():
+    belief = Belief(np.arange(9.0), np.diag(np.arange(1.0, 10.0)), (4, 7, 9))
+    found = identified(belief, {9: 2, 7: 0, 4: 2})
+    assert found.landmark_ids == (2, 0)
+    np.testing.assert_array_equal(found.landmarks, [[3.0, 4.0], [5.0, 6.0]])
+    np.testing.assert_array_equal(found.covariance.diagonal(), np.arange(1.0, 8.0))
+    assert identified(belief, {7: 0}).landmark_ids == (0,)
+
+
 def test_a_belief_that_is_no_map_of_the_world_ends_its_own_run_only(whole):
     filters = {"foreign": ForeignIds, "gone": LeavesTheProgram, "blind": UnknownMap}
     filters["ekf"] = "ekf"
     results = monte_carlo("six_landmarks", filters, RUNS)
     failed = results.failed.sum("run")
     assert 0 < failed.sel(estimator="foreign") < RUNS
+    assert set(results.failed_at.sel(estimator="foreign").values) == {-1, 29}
     assert failed.sel(estimator="gone") == RUNS
     assert failed.sel(estimator="blind") == RUNS
     said = [set(results.message.sel(estimator=name).values) for name in filters]

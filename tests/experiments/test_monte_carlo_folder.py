@@ -232,8 +232,10 @@ def test_only_what_slamgym_began_is_removed(tmp_path):
 def test_what_was_changed_since_is_set_aside_and_not_lost(fresh, tmp_path, whole):
     first = f"blocks/{BLOCKS[0]}"
     monte_carlo(**JOB, runs=RUNS, out=tmp_path).close()
+    mine = {}
     for name in (first, "results.nc"):
-        (tmp_path / name).write_text("mine")
+        mine[f"{name}.aside"] = b"m" * (tmp_path / name).stat().st_size
+        (tmp_path / name).write_bytes(mine[f"{name}.aside"])
     for times in (1, 2):
         if times == 2:
             (tmp_path / "results.nc").write_text("mine again")
@@ -243,11 +245,7 @@ def test_what_was_changed_since_is_set_aside_and_not_lost(fresh, tmp_path, whole
         ):
             xr.testing.assert_equal(anew.load(), whole)
     aside = {name: data for name, data in tree(tmp_path).items() if "aside" in name}
-    assert aside == {
-        f"{first}.aside": b"mine",
-        "results.nc.aside": b"mine",
-        "results.nc.aside2": b"mine again",
-    }
+    assert aside == mine | {"results.nc.aside2": b"mine again"}
     assert names(tmp_path) == sorted([*finished(), *aside])
 
 
@@ -299,6 +297,13 @@ def test_parts_of_two_machines_are_merged_without_their_rests(tmp_path, whole):
     ) as merged:
         xr.testing.assert_equal(merged.load(), whole)
     assert done == [RUNS]  # there was nothing left to do
+
+
+def test_a_damaged_block_is_not_merged(tmp_path):
+    monte_carlo(**JOB, runs=4, out=tmp_path / "one").close()
+    (tmp_path / "one" / "blocks" / BLOCKS[0]).write_text("mine")
+    with pytest.raises(ValueError, match=rf"{BLOCKS[0]} is truncated or damaged"):
+        merge_blocks([tmp_path / "one"], tmp_path / "both")
 
 
 # one job
