@@ -18,8 +18,8 @@ results = monte_carlo("six_landmarks", "ekf,invariant", runs=100)
 # %%
 # One column
 # ----------
-# The bands contain 95 % of the averages of a consistent filter: the dark one at each step, the pale one at ten steps
-# together.
+# For a consistent filter, 95 % of the averages at one step lie in the grey band, and those at the ten marked steps lie
+# between the two lines, all together, in 95 % of the studies.
 
 column = nees_figure(results, width_mm=85)
 save_figure(column, "results/nees.pdf")
@@ -31,7 +31,7 @@ save_figure(column, "results/nees.pdf")
 # without scaling, so that the size of its text remains.
 
 page = runs_figure(results, width_mm=170)
-page.axes[0].set_ylabel("NEES of a run / 3")
+page.axes[0].set_xlabel("NEES / 3, average over the run")
 save_figure(page, "results/runs.pdf")
 
 # %%

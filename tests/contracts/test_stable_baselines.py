@@ -177,6 +177,15 @@ def test_the_document_leads_from_make_vec_to_a_policy(sb3):
     assert env.action_space.contains(scope["trained"](observation, env))
 
 
+@pytest.mark.slow
+def test_the_tutorial_on_ppo_compares_a_policy_with_a_baseline(sb3, capsys):
+    code = DOCUMENT.with_name("tutorials").joinpath("train_8_ppo.py").read_text()
+    code = code.replace("500_000", "8192").replace("VALIDATION + 20", "VALIDATION + 2")
+    exec(compile(code, "tutorial", "exec"), {"__name__": "reader"})
+    table = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in table] == ["return", "trained", "coverage"]
+
+
 def randomised():
     """Return the two blocks on randomisation: draws per episode, draws per round."""
     found = blocks("Domain randomisation")
