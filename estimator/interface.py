@@ -10,21 +10,22 @@ import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from numpy.typing import ArrayLike
 
 from ..arrays import Array
 from .beliefs import Belief, MapView, ScanDecisions, UpdateReport, part_of
+from .guards.interrupts import Interruptible
 
 __all__ = [
     "Belief",
+    "FilterWrapper",
     "MapView",
     "ScanDecisions",
     "SlamEstimator",
     "SmoothedPath",
     "UpdateReport",
-    "optional_members",
     "restore",
     "taking_poses",
     "with_fix",
@@ -109,13 +110,6 @@ class SmoothedPath(Protocol):
         ...
 
 
-def optional_members(estimator: SlamEstimator) -> dict[str, Any]:
-    """Return what an estimator offers that a wrapper passes on unchanged, by name."""
-    large = "local_view", "join", "smoothed", "belief_limit"
-    offered = (name for name in ("observe_truth", *large) if hasattr(estimator, name))
-    return {name: getattr(estimator, name) for name in offered}
-
-
 def restore(estimator: Any, state: Mapping[str, Any]) -> None:
     """Continue from a state that this process has saved, without checks if possible."""
     getattr(estimator, "restore", estimator.load_state_dict)(state)
@@ -136,11 +130,14 @@ def resume(estimator: Any, before: Any) -> None:
 
 @contextmanager
 def returned_on_error(estimator: Any) -> Iterator[None]:
-    """Return an estimator to its present state if the block raises an error."""
+    """Return an estimator to its present state if the block raises, even an interrupt.
+
+    It serves whatever has a :func:`snapshot`, such as a map.
+    """
     before = snapshot(estimator)
     try:
         yield
-    except Exception:
+    except BaseException:
         resume(estimator, before)
         raise
 
@@ -222,3 +219,44 @@ def _hides_its_belief(kind: Any) -> bool:
 @lru_cache(maxsize=64)
 def _takes_landmark_ids(belief: Callable[..., Belief]) -> bool:
     return "landmark_ids" in inspect.signature(belief).parameters
+
+
+class FilterWrapper(Interruptible):
+    """A filter around another one: its map is that of the filter inside.
+
+    It passes on the members of `passed_on` that the filter inside has.
+    """
+
+    #: Optional members that need no more than the filter inside.
+    passed_on: tuple[str, ...] = (
+        "observe_truth",
+        *("local_view", "join", "smoothed", "belief_limit"),
+    )
+
+    @property
+    def _inside(self) -> SlamEstimator:
+        raise NotImplementedError
+
+    def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
+        """Return the present belief, of the whole map or of pose and some landmarks."""
+        if landmark_ids is None:
+            return self._inside.belief()
+        return marginal(self._inside, landmark_ids)
+
+    def map_view(self) -> MapView:
+        """Return pose and map, without a copy where possible, until the next step."""
+        return view_map(self._inside)
+
+    @property
+    def landmark_ids(self) -> tuple[int, ...]:
+        """The mapped landmarks, in the order of the belief."""
+        return mapped_ids(self._inside)
+
+    if not TYPE_CHECKING:  # else every name would be a member
+
+        def __getattr__(self, name: str) -> Any:
+            """Return a member of the filter inside."""
+            if name in self.passed_on:
+                return getattr(self._inside, name)
+            kind = type(self).__name__
+            raise AttributeError(f"{kind!r} object has no attribute {name!r}")

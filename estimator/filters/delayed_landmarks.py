@@ -39,7 +39,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -48,7 +48,7 @@ from ..beliefs import Belief, MapView, UpdateReport
 from ..guards import saved_states
 from ..guards.argument_checks import LOWEST_ID, RESERVED_IDS, refuse_reserved
 from ..guards.saved_states import NUMBERS, WHOLE, Table, with_prefix, without_prefix
-from ..guards.undo import undone_on_error
+from ..interface import returned_on_error
 from ..kernels.scan_update import (
     AT_ESTIMATE,
     DONE,
@@ -106,6 +106,7 @@ class WaitingMap(GaussianMap):
 
     waiting: Waiting
     _report: UpdateReport | None  # of the last scan, unless the memory holds it
+    _anew: ClassVar = {"_report": None}
 
     def __init__(self, values: Sequence[float], sensor: Sensor) -> None:
         super().__init__(values)
@@ -126,14 +127,10 @@ class WaitingMap(GaussianMap):
         super().reset(pose, pose_covariance)
         self.waiting = Waiting()
 
-    def _become(self, *memory: Any, **named: Any) -> None:
-        super()._become(*memory, **{"_report": None, **named})
-
     def take_in(self, update: UpdateKernel, readings: Array, ids: IntArray) -> int:
         """Update with readings of mapped landmarks; let those of others wait."""
         refuse_reserved(ids.tolist())
-        with undone_on_error(self):
-            self.hold(self.used, self.slots)  # what follows changes a copy
+        with returned_on_error(self):
             status = super().take_in(update, readings, ids)
             if status == DONE:
                 report = super().report()

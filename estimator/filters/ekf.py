@@ -311,6 +311,8 @@ class EkfSlam(MapFilter):
     #: The kernels of both steps.
     _update_map: ClassVar[UpdateKernel] = staticmethod(update_map)
     _move_pose: ClassVar[Callable[..., None]] = staticmethod(move_pose)
+    #: Messages about further statuses of the update.
+    _refusals: ClassVar[Mapping[int, str]] = {}
 
     def __init__(
         self,
@@ -437,6 +439,8 @@ class EkfSlam(MapFilter):
     def _refuse(self, status: int, readings: Array, ids: IntArray) -> NoReturn:
         """Raise the error of an update that failed."""
         given = ids.tolist()
+        if status in self._refusals:
+            raise ValueError(self._refusals[status])
         if status == REPEATED:
             argument_checks.refuse_repeated(given)
         if status == NOT_USABLE:

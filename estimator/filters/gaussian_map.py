@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cached_property
 from itertools import accumulate
-from typing import Any, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 from weakref import ref
 
 import numpy as np
@@ -91,6 +91,7 @@ class GaussianMap:
     parts: Parts
     _slots: dict[int, int]
     _last: Callable[[], Any]  # the last report: a `ScanReport`, or one like it
+    _anew: ClassVar[Mapping[str, Any]] = {}  # attributes that a new memory brings
 
     def __init__(self, values: Sequence[float]) -> None:
         capacity = self.capacity_for(FIRST_LANDMARKS)
@@ -104,7 +105,8 @@ class GaussianMap:
         def newest() -> Any:  # `last`, and None after the next scan
             return None if parts.numbers[SCANNED] else last
 
-        vars(self).update(named, block=block, parts=parts, _slots={}, _last=newest)
+        named = {**self._anew, **named, "_slots": {}, "_last": newest}
+        vars(self).update(named, block=block, parts=parts)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the memory and all else by name, without what follows from them."""

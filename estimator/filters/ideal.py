@@ -12,7 +12,7 @@ from ...arrays import Array
 from ..beliefs import UpdateReport
 from ..guards import argument_checks, saved_states
 from ..guards.argument_checks import LandmarkIds
-from ..guards.undo import undone_on_error
+from ..interface import returned_on_error
 from ..kernels.scan_update import AT_ESTIMATE, AT_TRUTH, BeliefArrays
 from ..models.rigid_motion import composed, pose_rotation
 from ..models.sensors import only_bearing_range
@@ -39,7 +39,7 @@ class IdealEkfSlam(EkfSlam):
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run; it linearises at the estimate until the truth is given."""
         only_bearing_range(self.sensor, "the ideal filter")
-        with undone_on_error(self, self.map):
+        with returned_on_error(self):
             super().reset(pose, pose_std)
             self._linearise_at(AT_ESTIMATE)
 
@@ -52,7 +52,7 @@ class IdealEkfSlam(EkfSlam):
         """Continue from a saved state; the truth of each further step must be given."""
         saved_states.refuse_other_state(state, ())
         at_truth = saved_states.flag("at_truth", state.get("at_truth", False))
-        with undone_on_error(self, self.map):
+        with returned_on_error(self):
             super().load_state_dict(state)
             self._linearise_at(AT_TRUTH if at_truth else AT_ESTIMATE)
 
@@ -101,7 +101,7 @@ class IdealEkfSlam(EkfSlam):
             reference[:3] = truth
         for i, slot in self.map.slots.items():
             reference[3 + 2 * slot : 5 + 2 * slot] = told[i]
-        with undone_on_error(self, self.map):
+        with returned_on_error(self):
             if self.rules.linearisation != AT_TRUTH:
                 self._linearise_at(AT_TRUTH)
             self._true_pose, self._true_landmarks = truth, told

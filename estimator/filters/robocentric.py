@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NoReturn
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -71,6 +71,7 @@ class RobocentricEkfSlam(EkfSlam):
     """
 
     _update_map = staticmethod(update_and_move)
+    _refusals: ClassVar = {TAKEN: f"landmark_ids must be above {RESERVED[1]}"}
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map, at a pose (3,) with deviations (3,)."""
@@ -87,11 +88,6 @@ class RobocentricEkfSlam(EkfSlam):
         covariance[world, world] = moved
         state = {"mean": mean, "covariance": covariance, "reference": reference}
         self.map.restore(state | {"landmark_ids": np.array(RESERVED)})
-
-    def _refuse(self, status: int, readings: Array, ids: IntArray) -> NoReturn:
-        if status == TAKEN:
-            raise ValueError(f"landmark_ids must be above {RESERVED[1]}")
-        super()._refuse(status, readings, ids)
 
     def _observe(
         self, given: PoseReading, mean: Array, covariance: Array

@@ -1,4 +1,4 @@
-"""Argument checks, saved states, memory limits and undo, shared by all estimators."""
+"""Checks of arguments and saved states, and marks of interrupted calls."""
 
 from typing import TYPE_CHECKING
 

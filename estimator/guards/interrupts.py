@@ -1,8 +1,7 @@
 """Calls that change several parts of a filter: an interrupt midway leaves a mark."""
 
+from collections.abc import Callable
 from typing import Any
-
-from .undo import Undo
 
 
 class Interruptible:
@@ -53,7 +52,12 @@ class changing:  # noqa: N801 (reads as a verb, in a with statement)
     """
 
     def __init__(
-        self, slam: Any, call: str, undo: Undo | None = None, *, anew: bool = False
+        self,
+        slam: Any,
+        call: str,
+        undo: Callable[[], object] | None = None,
+        *,
+        anew: bool = False,
     ) -> None:
         self._slam, self._call, self._undo, self._anew = slam, call, undo, anew
 

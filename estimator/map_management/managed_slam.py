@@ -32,17 +32,14 @@ from ..association.scan_association import (
 from ..filters.pose_readings import PoseReading, observe_relative_pose
 from ..guards import argument_checks, saved_states
 from ..guards.argument_checks import LandmarkIds
-from ..guards.interrupts import Interruptible, changing
+from ..guards.interrupts import changing
 from ..guards.saved_states import with_prefix, without_prefix
 from ..interface import (
-    Belief,
+    FilterWrapper,
     MapView,
     ScanDecisions,
     SlamEstimator,
     UpdateReport,
-    mapped_ids,
-    marginal,
-    optional_members,
     resume,
     snapshot,
     taking_poses,
@@ -76,7 +73,7 @@ NIL = 1e-12
 OVERLAP = 0.5
 
 
-class ManagedSlam(Interruptible):
+class ManagedSlam(FilterWrapper):
     """A filter of any kind that associates, confirms, removes and merges landmarks.
 
     A :class:`LandmarkPolicy` decides which landmark each reading belongs to, when a new
@@ -152,9 +149,8 @@ class ManagedSlam(Interruptible):
         self._spare: list[Hypothesis] = []
         #: Number of steps taken.
         self.steps = 0
-        if policy.association != "hypotheses":
-            for name, member in optional_members(first).items():
-                setattr(self, name, member)
+        if policy.association == "hypotheses":
+            self.passed_on = ()
 
     # The results, which are those of the most probable hypothesis.
 
@@ -173,6 +169,8 @@ class ManagedSlam(Interruptible):
     def filter(self) -> SlamEstimator:
         """Its filter."""
         return self.best.filter
+
+    _inside = filter
 
     @property
     def policy(self) -> LandmarkPolicy:
@@ -200,21 +198,6 @@ class ManagedSlam(Interruptible):
     def decisions(self) -> list[ScanDecisions]:
         """The decisions about the scans since the start or the last loaded state."""
         return self.best.recent.decisions
-
-    @property
-    def landmark_ids(self) -> tuple[int, ...]:
-        """The mapped landmarks, in the order of the belief."""
-        return mapped_ids(self.filter)
-
-    def belief(self, landmark_ids: Sequence[int] | None = None) -> Belief:
-        """Return the present belief, of the whole map or of pose and some landmarks."""
-        if landmark_ids is None:
-            return self.filter.belief()
-        return marginal(self.filter, landmark_ids)
-
-    def map_view(self) -> MapView:
-        """Return pose and map, without a copy where possible, until the next step."""
-        return view_map(self.filter)
 
     def report(self) -> UpdateReport:
         """Return the report of the last update once more."""

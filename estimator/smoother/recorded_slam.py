@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from .. import interface
 from ..filters.pose_readings import PoseReading
 from ..guards import argument_checks, saved_states
-from ..guards.interrupts import Interruptible, changing
+from ..guards.interrupts import changing
 from ..map_management.map_editor import MapEditor
 from ..models.motions import UNICYCLE, Motion
 from ..models.sensors import Sensor
@@ -30,7 +30,7 @@ class Event(NamedTuple):
     arguments: tuple[Any, ...]
 
 
-class RecordedSlam(Interruptible):
+class RecordedSlam(interface.FilterWrapper):
     """A filter that also records its drive, for the smoother.
 
     The drive receives the readings that the filter used.  Landmarks that the filter
@@ -66,8 +66,6 @@ class RecordedSlam(Interruptible):
         #: Number of steps taken.
         self.steps = 0
         self._report = interface.UpdateReport()
-        for name, member in interface.optional_members(slam).items():
-            setattr(self, name, member)
 
     def recorded(self) -> Drive:
         """Return the drive until now; its last pose is the present one."""
@@ -142,23 +140,10 @@ class RecordedSlam(Interruptible):
             for kept, gone in pairs:
                 self._record("merge", kept, gone)
 
-    def belief(self, landmark_ids: Sequence[int] | None = None) -> interface.Belief:
-        """Return the filter's belief."""
-        self.refuse_interrupted()
-        if landmark_ids is None:
-            return self._slam.belief()
-        return interface.marginal(self._slam, landmark_ids)
-
-    def map_view(self) -> interface.MapView:
-        """Return pose and map of the filter, until the next step."""
-        self.refuse_interrupted()
-        return interface.view_map(self._slam)
-
     @property
-    def landmark_ids(self) -> tuple[int, ...]:
-        """The filter's landmarks, in the order of its belief."""
+    def _inside(self) -> interface.SlamEstimator:
         self.refuse_interrupted()
-        return interface.mapped_ids(self._slam)
+        return self._slam
 
     def state_dict(self) -> dict[str, Any]:
         """Return the filter's state, and the events until now as one object.

@@ -40,6 +40,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         check_estimator
     """,
     "estimator.large_maps": """
+        undo
         multifrontal
         elimination
         compressed sparse_information submaps

@@ -308,6 +308,26 @@ def test_a_state_that_cannot_be_loaded_leaves_everything_as_it_was(
     assert digest(slam) == before
 
 
+def test_an_error_in_a_later_hypothesis_leaves_everything_as_it_was(slippery_drive):
+    world, scans = slippery_drive
+    slam, (_, readings, ids) = several_hypotheses(scans, world)
+    saved = slam.state_dict()
+    slam.predict((0.1, 0.0))
+    before = digest(slam)
+    saved["1.filter.mean"] = np.full_like(saved["1.filter.mean"], np.nan)
+    with pytest.raises(ValueError, match=r"mean'\] must be finite"):
+        slam.load_state_dict(saved)
+    assert digest(slam) == before
+
+    def refuse(*_):
+        raise ValueError("no such landmark")
+
+    slam.hypotheses[1].as_given = refuse
+    with pytest.raises(ValueError, match="no such landmark"):
+        slam.update(readings, ids)
+    assert digest(slam) == before
+
+
 @pytest.mark.parametrize("costs", [[], [-1.0], [2.0, 0.0]])
 def test_saved_costs_begin_with_the_least(costs):
     slam = make(load_scenario("loop"), association="hypotheses")

@@ -243,6 +243,16 @@ def test_a_filter_of_ones_own_is_edited_through_its_state():
     assert_same_bits(boxed.belief(), open_one.belief())
 
 
+def test_pairs_merged_one_by_one_are_all_merged_or_none():
+    slam = doubled("ekf")
+    methods = "belief", "remove", "merge", "state_dict", "load_state_dict"
+    door = MapEditor(SimpleNamespace(**{name: getattr(slam, name) for name in methods}))
+    before = slam.belief()
+    with pytest.raises(ValueError, match="99"):
+        door.merge_pairs([(0, 6), (1, 99)])
+    assert_same_bits(slam.belief(), before)
+
+
 def test_a_filter_whose_map_cannot_be_edited_is_refused():
     class Sealed(EkfSlam):
         def belief(self):

@@ -20,8 +20,8 @@ from ...filters.ekf import (
 from ...guards import argument_checks, saved_states
 from ...guards.argument_checks import LandmarkIds
 from ...guards.interrupts import Interruptible, changing
-from ...guards.undo import Undo, attributes, undo_all
 from ...models.sensors import only_placing
+from ..undo import Undo, attributes, undo_all
 from .compressed_map import (
     SHORT_PHASE,
     SMALLEST_LOCAL_MAP,

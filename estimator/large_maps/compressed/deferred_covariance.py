@@ -14,8 +14,8 @@ from ....arrays import Array, IntArray
 from ....jit import jit
 from ...guards import saved_states
 from ...guards.argument_checks import covariance_bytes, too_large
-from ...guards.undo import Undo, contents
 from ..multifrontal import symmetric
+from ..undo import Undo, contents
 
 # Rows of one block: 68 landmarks.
 #

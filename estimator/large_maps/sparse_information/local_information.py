@@ -14,10 +14,10 @@ import numpy as np
 from scipy.linalg import cho_solve, lapack, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
-from ...guards.undo import Undo, contents
 from ...models.motions import predict_pose
 from ..elimination import LandmarkElimination, RestFactor
 from ..multifrontal import InformationMatrix, pairs
+from ..undo import Undo, contents
 
 
 class SparseMap:

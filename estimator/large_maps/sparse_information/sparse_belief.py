@@ -10,10 +10,10 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from ....arrays import Array, BoolArray, IntArray
 from ...filters.ekf import EkfSlam
-from ...guards.undo import Undo, contents, undo_all
 from ...interface import Belief, UpdateReport
 from ...models.rigid_motion import as_covariance
 from ..multifrontal import pairs
+from ..undo import Undo, contents, undo_all
 from .local_information import (
     ConditionalPose,
     LocalInformation,

@@ -20,9 +20,9 @@ from ...guards import argument_checks, saved_states
 from ...guards.argument_checks import LandmarkIds
 from ...guards.interrupts import Interruptible, changing
 from ...guards.saved_states import with_prefix, without_prefix
-from ...guards.undo import attributes
 from ...models.bearing_range import wrap_angle
 from ..multifrontal import PLACES, ROWS
+from ..undo import attributes
 from . import local_information
 from .local_information import link_count
 from .scan_update import ESTIMATE, ScanRules, process_scan

@@ -20,9 +20,9 @@ from ...filters.gaussian_map import without_landmarks
 from ...filters.pose_readings import coincide
 from ...guards import argument_checks, saved_states
 from ...guards.argument_checks import LandmarkIds
-from ...guards.undo import Undo, attributes
 from ...interface import Belief, MapView, UpdateReport
 from ...models.rigid_motion import ErrorFrame
+from ..undo import Undo, attributes
 from . import joining
 from .factor import Gaussian, retract
 from .store import LostSubmapError, Submap, SubmapStore

@@ -17,7 +17,6 @@ from scipy.linalg.blas import dsyrk
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
 from ...guards import argument_checks
-from ...guards.undo import Undo, attributes, undo_all
 from ...interface import Belief
 from ...models.bearing_range import wrap_angle
 from ...models.rigid_motion import (
@@ -30,6 +29,7 @@ from ...models.rigid_motion import (
     state_of,
 )
 from ..multifrontal import pairs, symmetric
+from ..undo import Undo, attributes, undo_all
 from .closed_submaps import ClosedSubmaps, Region
 from .factor import Gaussian, retract, times, with_uncertain_start
 from .store import LandmarkIndex, Submap, link_name

@@ -16,7 +16,7 @@ import numpy as np
 
 from ....arrays import Array, IntArray
 from ...guards.argument_checks import LOWEST_ID
-from ...guards.undo import Undo
+from ..undo import Undo
 
 CACHE_SIZE = 8  # number of submaps of a folder that are kept in memory
 MARKER = "submaps.txt"

@@ -22,8 +22,8 @@ from ...guards import argument_checks, saved_states
 from ...guards.argument_checks import LandmarkIds
 from ...guards.interrupts import Interruptible, changing
 from ...guards.saved_states import with_prefix, without_prefix
-from ...guards.undo import Undo, attributes, undo_all
 from ...models.sensors import only_placing
+from ..undo import Undo, attributes, undo_all
 from .closed_submaps import ClosedSubmaps, Neighbourhood, Region, merged
 from .graph import ORIGIN, ActiveSubmap, Chain, ClosingRule, SubmapGraph
 from .joining import summarise

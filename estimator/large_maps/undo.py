@@ -1,29 +1,11 @@
-"""Take back changes: of a call that is refused, or of an interrupted short one."""
+"""Take back what a refused call has changed, where a snapshot is too large."""
 
 from collections.abc import Callable
 
-from .argument_checks import with_copies
+from ..guards.argument_checks import with_copies
 
 #: What takes back later changes; it may be called more than once.
 Undo = Callable[[], object]
-
-
-class undone_on_error:  # noqa: N801 (reads as a verb, in a with statement)
-    """Restore the :func:`attributes` of objects if the block raises, even an interrupt.
-
-    The block may replace their arrays, but not change them in place.
-    """
-
-    def __init__(self, *objects: object) -> None:
-        self._undo = attributes(*objects)
-
-    def __enter__(self) -> None:
-        """Begin the block."""
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Restore the attributes if there is an error."""
-        if kind is not None:
-            self._undo()
 
 
 def undo_all(*undos: Undo) -> Undo:
