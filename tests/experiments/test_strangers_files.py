@@ -9,6 +9,7 @@ import pytest
 from commands import slamgym
 
 from slamgym import read_log
+from slamgym.estimator.models import predict_pose
 from slamgym.experiments.estimate_files import true_path
 from slamgym.experiments.logs.slamlog import LogError, OdometryRow, Scan, write_slamlog
 
@@ -207,7 +208,7 @@ def test_a_log_of_tables_can_be_kept_as_slamlog(folder, tmp_path):
 def test_the_example_of_the_page_runs(folder, monkeypatch, tmp_path):
     page = (Path(__file__).parents[2] / "docs" / "logs.md").read_text(encoding="utf-8")
     section = page.split("## Your own csv files")[1].split("\n## ")[0]
-    odometry, measurements, commands = (
+    odometry, measurements, commands, _ = (
         block.partition("\n")[2] for block in section.split("```")[1::2]
     )
     folder(odometry=odometry, measurements=measurements)
@@ -219,6 +220,23 @@ def test_the_example_of_the_page_runs(folder, monkeypatch, tmp_path):
     summary = json.loads(replayed.read_text(encoding="utf-8"))
     assert summary["readings"]["rejected"] == 0
     assert 0.1 < summary["nis"]["per_degree"] < 3
+
+
+def test_the_page_turns_poses_into_odometry(folder, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs" / "logs.md").read_text(encoding="utf-8")
+    code = page.split("```py\n")[1].split("```")[0]
+    place = folder(odom=TRUTH, measurements=MEASUREMENTS)
+    with pytest.raises(LogError, match=r"differences: t, dx, dy, dtheta$"):
+        read_log(place)
+    monkeypatch.chdir(place)
+    exec(code, {})
+    poses = [np.array([5.0, 6.0, 0.25])]
+    for event in read_log(place).events:
+        if isinstance(event, OdometryRow):
+            moved = predict_pose(poses[-1], (event.d, event.alpha)).pose
+            poses = [*poses, moved] if event.dt else [*poses[:-1], moved]
+    expected = np.loadtxt(TRUTH.splitlines(), delimiter=",", skiprows=1)[:, 1:]
+    np.testing.assert_allclose(poses[-1], expected[-1], atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -455,6 +455,8 @@ def lacking(kind: str, tables: Sequence[Table], source: Path) -> slamlog.LogErro
         for table in tables
     )
     other = "" if source.is_dir() else ", or give the folder of several such files"
+    if kind == "odometry" and any(table.has_path for table in tables):
+        other += "; poses give odometry by their differences: t, dx, dy, dtheta"
     return slamlog.LogError(
         f"{source}: expected {kind}, a table with the columns {form}; got {got}: "
         f"rename or convert the columns{other}"
