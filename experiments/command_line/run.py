@@ -43,9 +43,7 @@ def run(scenario: ScenarioName, *, given: Options) -> None:
         with reporter.progress("driving") as tick:
             log = given.record(world, tick)
         save_scenario(world, folder / "scenario.toml")
-        summary = filter_and_write(
-            log, filters, folder, given, reporter, walls=world.walls
-        )
+        summary = filter_and_write(log, filters, folder, given, reporter, world=world)
     show_run(summary, place, given, reporter)
     changed = [f"--set={change}" for change in given.set_ or ()]
     if given.steps is not None:

@@ -28,6 +28,8 @@ from .output_folder import write_csv, write_summary
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from ...sim_configs import Scenario
+
 
 #: Largest map whose covariance is written: 32 MB.
 _MOST_LANDMARKS = 1000
@@ -64,7 +66,8 @@ def filter_and_write(
     folder: Path,
     given: options.Options,
     reporter: Reporter,
-    walls: Sequence[Sequence[float]] = (),
+    *,
+    world: "Scenario | None" = None,
 ) -> dict[str, Any]:
     """Filter a log, and write figures, run.html, log.csv, belief.npz and summary.json.
 
@@ -83,14 +86,15 @@ def filter_and_write(
         ``every_step``, ``resolution`` and ``rerun``.
     reporter : Reporter
         Shows the progress.
-    walls : sequence of (x0, y0, x1, y1)
-        Walls to draw on the page [m].
+    world : Scenario, optional
+        The world of a simulated log, which breaks no convention; its walls are drawn.
 
     Returns
     -------
     dict
         The summary that was written; ``others`` holds those of the further filters.
     """
+    walls = world.walls if world else ()
     every_step = given.every_step
     if every_step is None:
         every_step = sum(1 for _ in steps_of(log)) <= _FEW_STEPS + 1
@@ -122,7 +126,7 @@ def filter_and_write(
         summarise(run, settings, resolution=given.resolution)
         for run, settings in zip(runs, filters.values(), strict=True)
     ]
-    mistake = mistake_in(log, next(iter(filters.values())))
+    mistake = None if world else mistake_in(log, next(iter(filters.values())))
     if mistake is not None:  # not a matter of noise
         for summary in summaries:
             summary["warnings"] = [str(mistake)]

@@ -129,6 +129,18 @@ def test_a_run_answers_with_the_numbers_of_its_summary_file(finished_run):
     assert np.shape(summary["pose_covariance"]) == (3, 3)
 
 
+def test_a_simulated_log_is_not_searched_for_broken_conventions(
+    here, without_pictures, monkeypatch
+):
+    searched = []
+    monkeypatch.setattr(run_files, "mistake_in", lambda log, _: searched.append(log))
+    summary = answered("run", "six_landmarks", "--steps", 2, "--out", "out")
+    assert summary["mistake"] is None
+    assert not searched
+    answered("replay", "out/log.csv", "--out", "again")
+    assert searched
+
+
 def test_a_run_without_identities_prints_and_saves_its_scores(here, without_pictures):
     world = ("hidden_identities", "--steps", 30, "--estimator", "invariant")
     drive = (*world, "--option", 'management={association="joint"}', "--out", "out")
