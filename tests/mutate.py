@@ -19,11 +19,12 @@ import importlib.machinery
 import json
 import os
 import random
+import resource
 import signal
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -32,6 +33,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT / "src"), str(ROOT / "tests" / "support")]
 
+import pytest  # noqa: E402
 from mutants import Mutant, mutants_of  # noqa: E402
 
 
@@ -173,6 +175,8 @@ ROOMS = (
     *("agents", "envs", "estimator", "evaluation", "experiments", "sim_configs"),
     "src/slamgym",
 )
+CPU_SECONDS = 200  # of the tests of a mutant
+OTHERWISE = defaultdict(lambda: "broken", {0: "survived"})  # by exit code
 EXPLAINED = Path(__file__).with_name("mutants_explained.txt")
 RESULTS = ROOT / "results" / "mutants.jsonl"
 
@@ -218,7 +222,6 @@ def preload() -> None:
     """Load what every test loads, other than slamgym itself."""
     import numba  # noqa: F401
     import numpy.testing  # noqa: F401
-    import pytest  # noqa: F401
     import scipy.linalg
     import scipy.optimize
     import scipy.sparse.linalg
@@ -226,38 +229,50 @@ def preload() -> None:
     import scipy.stats  # noqa: F401
 
 
-def verdict(
-    tests: Tests,
-    file: str = "",
-    text: str = "",
-    *,
-    function: str = "",
-    limit: float = 600.0,
-) -> str:
+def verdict(tests: Tests, file: str = "", text: str = "", function: str = "") -> str:
     """Run tests in a fork, with another text of a file: killed, survived, or timeout.
 
-    A kernel that is changed, and those that call it, are compiled anew.
+    The test that fails must pass without the mutant; else the verdict is broken.  A
+    kernel that is changed, and those that call it, are compiled anew.
     """
-    child = os.fork()
-    if not child:
-        os.setsid()
-        _run(tests, file, text, function)
-    began = time.monotonic()
-    while time.monotonic() - began < limit:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            code = os.waitstatus_to_exitcode(status)
-            return "survived" if code == 0 else "killed"
-        time.sleep(0.02)
-    os.killpg(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return "timeout"
+    with tempfile.NamedTemporaryFile("r") as failed:
+        child = os.fork()
+        if not child:
+            os.setsid()
+            _run(tests, file, text, function, failed.name)
+        began = time.monotonic()
+        while not (ended := os.waitpid(child, os.WNOHANG))[0]:
+            if time.monotonic() - began > 5 * CPU_SECONDS:
+                os.killpg(child, signal.SIGKILL)
+            time.sleep(0.02)
+        code, name = os.waitstatus_to_exitcode(ended[1]), failed.read()
+    if code < 0:
+        return "timeout"
+    return "killed" if code and _passes(name, plain=tests.plain) else OTHERWISE[code]
 
 
-def _run(tests: Tests, file: str, text: str, function: str) -> None:
+@cache
+def _passes(test: str, *, plain: bool) -> bool:
+    """Whether a test passes without a mutant; "" is an error at import."""
+    return not test or verdict(Tests((test,), plain)) == "survived"
+
+
+class _NotesFailure:
+    """Write the name of the test that fails to a file."""
+
+    def __init__(self, file: str) -> None:
+        self._file = Path(file)
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Note a test that fails."""
+        if report.failed:
+            self._file.write_text(report.nodeid)
+
+
+def _run(tests: Tests, file: str, text: str, function: str, failed: str) -> None:
     import numba
-    import pytest
 
+    resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
     nowhere = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(nowhere, stream)
@@ -270,7 +285,7 @@ def _run(tests: Tests, file: str, text: str, function: str) -> None:
     os.chdir(ROOT)
     options = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", "--tb=no"]
     options += ["-k", NOT_PLAIN] if tests.plain else []
-    code = pytest.main([*options, *tests.files])
+    code = pytest.main([*options, *tests.files], [_NotesFailure(failed)])
     os._exit(int(code))
 
 
@@ -389,8 +404,7 @@ def _judged(file: str, mutant: Mutant) -> str:
         compile(changed, file, "exec")
     except SyntaxError:
         return "broken"
-    limit, name = _time_allowed(tests), mutant.function
-    outcome = verdict(tests, file, changed, function=name, limit=limit)
+    outcome = verdict(tests, file, changed, mutant.function)
     if outcome != "survived":
         return outcome
     _, function, line, change = key_of(file, mutant)
@@ -398,15 +412,6 @@ def _judged(file: str, mutant: Mutant) -> str:
         return "explained"
     print(f"{file}:{mutant.line}:{function}: {change}   in   {line}", flush=True)
     return outcome
-
-
-@cache
-def _time_allowed(tests: Tests) -> float:
-    """Return how long a mutant may take; the tests must pass without one."""
-    began = time.monotonic()
-    if verdict(tests) != "survived":
-        sys.exit(f"these tests fail without a mutant: {' '.join(tests.files)}")
-    return 20 + 5 * (time.monotonic() - began)
 
 
 def _print(counts: Counter[tuple[str, str]], seconds: float) -> None:

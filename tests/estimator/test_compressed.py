@@ -272,6 +272,18 @@ def test_a_scale_is_a_root_of_the_covariance_as_far_as_there_is_one():
     np.testing.assert_allclose(scale_of(indefinite), np.diag([2.0, 1.0]))
 
 
+def test_a_landmark_counts_as_near_up_to_five_deviations():
+    slam = run(CompressedEkfSlam(*NOISE, local_size=12), wander(100, 40))
+    pose, whole = slam.belief([]), slam.belief()
+    far = [k for k, i in enumerate(whole.landmark_ids) if i not in slam.local_ids]
+    k = far[-1]
+    away = np.hypot(*(whole.landmarks[k] - pose.pose[:2]))
+    parts = whole.landmark_covariances[k], pose.pose_covariance[:2, :2]
+    std = sum(np.sqrt(np.trace(part)) for part in parts)
+    near = {*map_of(slam).ids_near(pose, away - 4.99 * std)}
+    assert {whole.landmark_ids[k], *slam.local_ids} <= near < {*slam.landmark_ids}
+
+
 @pytest.mark.slow
 def test_over_4000_steps_it_stays_symmetric_and_positive_definite():
     slam = run(CompressedEkfSlam(*NOISE), wander(120, 4000, seen=4))
