@@ -24,7 +24,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -176,7 +176,7 @@ ROOMS = (
     "src/slamgym",
 )
 CPU_SECONDS = 200  # of the tests of a mutant
-OTHERWISE = defaultdict(lambda: "broken", {0: "survived"})  # by exit code
+OUTCOMES = {0: "survived", 1: "killed", 2: "killed", 4: "killed"}  # 2, 4: at import
 EXPLAINED = Path(__file__).with_name("mutants_explained.txt")
 RESULTS = ROOT / "results" / "mutants.jsonl"
 
@@ -238,23 +238,26 @@ def verdict(tests: Tests, file: str = "", text: str = "", function: str = "") ->
     with tempfile.NamedTemporaryFile("r") as failed:
         child = os.fork()
         if not child:
-            os.setsid()
-            _run(tests, file, text, function, failed.name)
+            try:
+                os.setsid()
+                _run(tests, file, text, function, failed.name)
+            finally:
+                os._exit(pytest.ExitCode.INTERNAL_ERROR)
         began = time.monotonic()
         while not (ended := os.waitpid(child, os.WNOHANG))[0]:
             if time.monotonic() - began > 5 * CPU_SECONDS:
                 os.killpg(child, signal.SIGKILL)
             time.sleep(0.02)
         code, name = os.waitstatus_to_exitcode(ended[1]), failed.read()
-    if code < 0:
-        return "timeout"
-    return "killed" if code and _passes(name, plain=tests.plain) else OTHERWISE[code]
+    if code == pytest.ExitCode.TESTS_FAILED and not _passes(name, plain=tests.plain):
+        return "broken"
+    return "timeout" if code < 0 else OUTCOMES.get(code, "broken")
 
 
 @cache
 def _passes(test: str, *, plain: bool) -> bool:
-    """Whether a test passes without a mutant; "" is an error at import."""
-    return not test or verdict(Tests((test,), plain)) == "survived"
+    """Whether a test passes without a mutant."""
+    return verdict(Tests((test,), plain)) == "survived"
 
 
 class _NotesFailure:
