@@ -13,6 +13,7 @@ from slamgym.estimator import (
     make_batch,
     make_estimator,
 )
+from slamgym.estimator.filters.batch import BatchBeliefs
 from slamgym.estimator.kernels.batch import drive_runs
 
 RUNS, STEPS, LANDMARKS = 5, 40, 13
@@ -332,6 +333,14 @@ def test_a_wrong_choice_of_runs_is_refused(data, runs):
         batch.run(*data, runs=runs)
     with pytest.raises(ValueError, match="runs must be 5 booleans, got"):
         batch.reset(np.zeros(3), runs=runs)
+
+
+def test_beliefs_of_single_filters_are_those_of_their_runs(data):
+    batch = make_batch("ekf", runs=RUNS, landmarks=LANDMARKS, **NOISE)
+    run_some(batch, data, slice(0, 4))
+    found = BatchBeliefs.of([batch.belief(run) for run in range(RUNS)], LANDMARKS)
+    for one, other in zip(found, batch.beliefs(), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_the_storage_of_a_batch_is_live_and_cannot_be_written_to(data):

@@ -61,6 +61,7 @@ def test_a_correlation_in_time_has_the_p_value_of_a_normal_score():
         np.log(2 * stats.norm.sf(score)), rel=0.02
     )
     assert found.matters
+    assert found.impact == pytest.approx(np.log((1 + rho) / (1 - rho)), rel=0.01)
     assert "successive errors of σα have a correlation of 0.1" in found.text
     assert not findings_of("turn", draw())["correlated noise"].matters
 
