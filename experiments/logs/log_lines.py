@@ -7,7 +7,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -72,6 +72,15 @@ number, got 'east'
             wanted = f"a number up to {LARGEST:g}" if is_large else "a finite number"
             raise self.error(wanted, shown(field))
         return value
+
+    def to_reals(self, fields: Sequence[str]) -> list[float]:
+        """Read numbers as :meth:`to_real` does, in less time."""
+        try:
+            values = [*map(float, fields)]
+        except ValueError:
+            values = [math.nan]
+        is_plain = sum(map(abs, values)) <= LARGEST and "_" not in self.text
+        return values if is_plain else [*map(self.to_real, fields)]
 
     def to_id(self, field: str) -> int:
         """Read a whole number >= 0; raise LogError for anything else."""

@@ -68,6 +68,10 @@ ROW_FORMS = {
     "pose": "pose,t,x,y,theta,std,std_theta",
     "groundtruth": "groundtruth,t,x,y,theta",
 }
+_COUNTS: dict[str, tuple[int, ...]] = {
+    **{kind: (form.count(","),) for kind, form in ROW_FORMS.items()},
+    "measurement": (4, 5, 6),
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -254,11 +258,12 @@ class _SlamlogParser:
         if line.text.startswith("#"):
             self._take_header(line)
             return
-        kind, *fields = (part.strip() for part in line.text.split(","))
+        kind, *fields = line.text.split(",")
+        if len(line.text.split(None, 1)) > 1:
+            kind, *fields = (part.strip() for part in (kind, *fields))
         if kind not in ROW_FORMS:
             raise line.error("a row of " + ", ".join(ROW_FORMS), shown(kind))
-        counts = (4, 5, 6) if kind == "measurement" else (ROW_FORMS[kind].count(","),)
-        line.check_count(fields, counts, ROW_FORMS[kind])
+        line.check_count(fields, _COUNTS[kind], ROW_FORMS[kind])
         getattr(self, f"_take_{kind}")(line, fields)
 
     def _take_header(self, line: LogLine) -> None:
@@ -279,10 +284,10 @@ class _SlamlogParser:
         self.landmarks[landmark_id] = (line.to_real(fields[1]), line.to_real(fields[2]))
 
     def _take_odometry(self, line: LogLine, fields: list[str]) -> None:
-        self.recorder.add_row(line, OdometryRow(*map(line.to_real, fields)))
+        self.recorder.add_row(line, OdometryRow(*line.to_reals(fields)))
 
     def _take_measurement(self, line: LogLine, fields: list[str]) -> None:
-        t, bearing, distance = map(line.to_real, (fields[0], fields[2], fields[3]))
+        t, bearing, distance = line.to_reals((fields[0], fields[2], fields[3]))
         landmark_id = line.to_id(fields[1]) if fields[1] else None
         size, true_id = None, None
         if len(fields) == 6:
@@ -308,7 +313,7 @@ class _SlamlogParser:
         self.recorder.add_row(line, PoseRow(t, (x, y, heading), (std, heading_std)))
 
     def _take_groundtruth(self, line: LogLine, fields: list[str]) -> None:
-        t, x, y = map(line.to_real, fields[:3])
+        t, x, y = line.to_reals(fields[:3])
         heading = line.to_real(fields[3]) if fields[3] else math.nan
         if self.ground_truth and t < self.ground_truth[-1][0]:
             before = self.ground_truth[-1][0]
@@ -574,6 +579,10 @@ class Reading(NamedTuple):
     true_id: int | None = None
 
 
+#: What all readings of a scan have, or none.
+_OPTIONAL = "ids", "sizes", "true ids"
+
+
 def wrap_bearing(angle: float) -> float:
     """Wrap an angle into [-π, π); an angle inside is unchanged, bit for bit.
 
@@ -607,6 +616,7 @@ class EventRecorder:
         self._readings: list[Reading] = []
         self._seen: set[int] = set()
         self._time = -math.inf
+        self._unknown = (False,) * len(_OPTIONAL)  # in the readings of this scan
 
     def add_row(self, line: LogLine, row: OdometryRow | PoseRow) -> None:
         """Append a row that is no part of a scan; raise LogError if t runs backwards.
@@ -631,8 +641,14 @@ class EventRecorder:
         self._advance(line, reading.t)
         if self._readings and self._readings[-1].t != reading.t:
             self._close_scan()
-        if self._readings:
-            self._check_same_kind(line, reading)
+        ids, size, true = reading.landmark_id, reading.size, reading.true_id
+        unknown = ids is None, size is None, true is None
+        if not self._readings:
+            self._unknown = unknown
+        elif unknown != self._unknown:
+            whether = zip(_OPTIONAL, unknown, self._unknown, strict=True)
+            name = next(name for name, here, first in whether if here != first)
+            raise line.error(f"{name} in all rows of a scan or in none", "both")
         if reading.landmark_id is not None:
             if reading.landmark_id in self._seen:
                 raise line.error(
@@ -651,18 +667,11 @@ class EventRecorder:
             raise line.error(f"t >= {self._time}, the time before", str(t))
         self._time = t
 
-    def _check_same_kind(self, line: LogLine, reading: Reading) -> None:
-        columns = {"landmark_id": "ids", "size": "sizes", "true_id": "true ids"}
-        for name, what in columns.items():
-            first = getattr(self._readings[0], name)
-            if (first is None) != (getattr(reading, name) is None):
-                raise line.error(f"{what} in all rows of a scan or in none", "both")
-
     def _close_scan(self) -> None:
         if not self._readings:
             return
         times, ids, bearings, ranges, sizes, true = zip(*self._readings, strict=True)
-        readings = np.column_stack([bearings, ranges])
+        readings = np.array([bearings, ranges]).T.copy()
         known: list[Any] = [  # of all readings or of none
             None if column[0] is None else column for column in (ids, sizes, true)
         ]

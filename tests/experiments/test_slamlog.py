@@ -96,6 +96,14 @@ def test_fields_land_in_their_places(tmp_path):
     assert (last.t, last.landmark_ids, last.sizes.tolist()) == (2.5, None, [0.35])
 
 
+def test_spaces_around_fields_and_the_largest_numbers_are_read(tmp_path):
+    rows = "odometry , 1, 1e100,\t-1e100,1\nmeasurement,1, 5,0.5 , 1e100"
+    row, scan = read_slamlog(saved(tmp_path, logged(rows))).events
+    assert (row.d, row.alpha, row.dt) == (1e100, -1e100, 1.0)
+    assert scan.landmark_ids.tolist() == [5]
+    assert scan.measurements.tolist() == [[0.5, 1e100]]
+
+
 def test_true_ids_stand_behind_the_size_and_are_no_ids(tmp_path):
     rows = "measurement,0,,0.1,5,,7", "measurement,0,,0.2,4,,-1"
     sized = "measurement,1,,0.1,5,0.3,7"
