@@ -16,6 +16,7 @@ from ..arrays import Array, IntArray, WordArray
 from ..restorable import Restorable
 from ..sim_configs import Scenario
 from ..sim_configs.scenario import SensorTable
+from ..suggestions import imported
 from . import random_numbers
 
 Row = TypeVar("Row")
@@ -96,7 +97,8 @@ class SensorSettings(NamedTuple):
     """Settings of the sensors of K worlds that differ, or of one world, K = 1."""
 
     #: Rows (sβ, sr, σr, k, dropout, max_range, field_of_view), shape (K, 7).
-    #: sβ [rad] and sr [m] scale unit noise; sr = 1 where σr(r) = σr + k r has k > 0.
+    #: sβ [rad] and sr [m] scale unit noise; sr = 1 where σr(r) = σr + k r has k > 0;
+    #: σr = 0 where no number is a range.
     numbers: Array
     counts_below: Array  # P(at most k false readings), shape (K, C)
 
@@ -108,10 +110,20 @@ class SensorSettings(NamedTuple):
             first, std = std, first  # its noise is that of the range
         growth = sensor.range_std_per_metre
         scales = first, 1.0 if growth else std
-        noise = *scales, 0.0 if sensor.kind == "position" else std, growth
-        view = sensor.dropout, sensor.max_range, sensor.field_of_view
+        has_range = ":" not in sensor.kind and sensor.kind != "position"
+        noise = *scales, std if has_range else 0.0, growth
+        view = sensor.dropout, sensor.max_range, field_of_view(sensor)
         below = _poisson_cdf(sensor.clutter, sensor.max_clutter)
         return cls(np.array([[*noise, *view]]), below[None])
+
+
+def field_of_view(sensor: SensorTable) -> float:
+    """Return the angle of view: the world's, or that of a user's sensor if smaller."""
+    own = 2 * math.pi
+    if ":" in sensor.kind:
+        refusal = f"cannot import sensor.kind = '{sensor.kind}': "
+        own = float(imported(f"{sensor.kind}.field_of_view", refusal))
+    return min(sensor.field_of_view, own)
 
 
 class WorldNoise:

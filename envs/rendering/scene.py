@@ -25,6 +25,7 @@ from PIL import ImageFont
 
 from ...arrays import Array, BoolArray
 from ...sim_configs import Scenario
+from ..noise_streams import field_of_view
 from .render_state import (
     AxesLimits,
     BeliefLike,
@@ -54,6 +55,7 @@ class Scene:
         self._scenario = scenario
         hiding = scenario.walls if scenario.sensor.occlusion else ()
         self._hiding = np.reshape(hiding, (-1, 2, 2))
+        self._field_of_view = field_of_view(scenario.sensor)
         self._figure = figure
         self._axes = add_axes(figure, scenario.name)
         width, height = figure.get_size_inches() * AXES_BOX[2:]
@@ -163,17 +165,17 @@ class Scene:
         return max(_ARROW_SHARE * (right - left), 0.8 * self._scenario.robot.radius)
 
     def _view_is_limited(self) -> bool:
-        sensor = self._scenario.sensor
-        return bool(sensor.field_of_view < 2 * np.pi or np.isfinite(sensor.max_range))
+        is_finite = np.isfinite(self._scenario.sensor.max_range)
+        return bool(self._field_of_view < 2 * np.pi or is_finite)
 
     def _area_in_view(self, pose: Array) -> Array:
         """Return the outline of what the sensor sees: a sector or disc, less walls."""
         if not self._view_is_limited():
             return NO_POINT
-        sensor = self._scenario.sensor
         (left, right), (low, high) = self._limits.x, self._limits.y
-        reach = float(min(sensor.max_range, np.hypot(right - left, high - low)))
-        return visible_area(pose, sensor.field_of_view, reach, self._hiding)
+        diagonal = np.hypot(right - left, high - low)
+        reach = float(min(self._scenario.sensor.max_range, diagonal))
+        return visible_area(pose, self._field_of_view, reach, self._hiding)
 
 
 # --------------------------------------------------------------------------------------

@@ -115,7 +115,7 @@ def imagine(
     rules[FIRST_STD:AFTER_STDS] /= max(1.0 - dropout, 1e-9) ** 0.5
     view = as_view(
         float(sensor.max_range),
-        float(sensor.field_of_view),
+        min(float(sensor.field_of_view), filters.sensor.field_of_view),
         ends if sensor.occlusion else ends[:0],
     )
     min_range = float(sensor.min_range)

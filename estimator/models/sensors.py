@@ -20,6 +20,7 @@ Since the robot's frame moves with the pose::
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -86,6 +87,9 @@ class Sensor:
         The distance that `std` gets: the expected one, or the measured one.  The latter
         is common, but gives more weight to readings that are too short.  For a new
         landmark, it is always the measured one.
+    field_of_view : float
+        Full angle of view, centred on the heading [rad], by default all around. Worlds
+        and `check_sensor` use `h` only inside it.
 
     Raises
     ------
@@ -94,7 +98,7 @@ class Sensor:
 
     Notes
     -----
-    Sensors that differ only in the last three parameters are equal: they share kernels.
+    Sensors that differ only in the last four parameters are equal: they share kernels.
 
     Examples
     --------
@@ -112,6 +116,7 @@ class Sensor:
     range_std_per_metre: float = field(default=0.0, compare=False)
     bearing_std_metres: float = field(default=0.0, compare=False)
     range_noise_at: str = field(default="expected", compare=False)
+    field_of_view: float = field(default=2 * math.pi, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("h", "inverse", "std"):
@@ -132,6 +137,10 @@ class Sensor:
         if self.places and self.size == 1:
             raise self._refused(
                 "one number cannot determine a landmark: inverse must be None"
+            )
+        if not 0 < self.field_of_view <= 2 * math.pi:
+            raise self._refused(
+                f"field_of_view must be in (0, 2π] [rad], got {self.field_of_view!r}"
             )
         self._check_noise()
         self._check_returns()

@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 from gymnasium.utils import seeding
 from gymnasium.utils.env_checker import check_env
+from matplotlib.figure import Figure
 
 from slamgym import make_estimator
 from slamgym.envs import LandmarkWorldEnv, LandmarkWorldVectorEnv
 from slamgym.envs.controllers import Waypoints, make_controller, planned_path
 from slamgym.envs.drives import drive_of
 from slamgym.envs.rendering.render_state import drawn_readings
+from slamgym.envs.rendering.scene import Scene
 from slamgym.envs.vector import WorldBatch
+from slamgym.estimator.filters.imagine import imagine
 from slamgym.estimator.models.motions import find_motion
 from slamgym.estimator.models.sensors import find_sensor
 from slamgym.sim_configs import ScenarioError, list_presets, load_scenario
@@ -311,6 +314,65 @@ def test_worlds_simulate_a_sensor_of_the_user_that_reads_one_number(
     together = worlds.reset(seed=3)[0]["landmarks"]
     np.testing.assert_array_equal(together[0], readings)
     assert_a_pickled_world_continues(env)
+
+
+CAMERA = """
+import numpy as np
+from slamgym.estimator import Sensor
+
+def h(x, y):
+    r = np.sqrt(x * x + y * y)
+    return (500 * y / x, r), (-500 * y / (x * x), 500 / x, x / r, y / r)
+
+def inverse(column, r):
+    ahead = r / np.sqrt(1 + (column / 500) ** 2)
+    return ahead, ahead * column / 500
+
+NAMES = ("column", "range"), ("px", "m")
+AHEAD = Sensor("camera:AHEAD", *NAMES, h, inverse, field_of_view=1.5)
+
+def sideways(x, y):
+    (column, r), (a, b, c, d) = h(x, y)
+    return (r, column), (c, d, a, b)
+
+SECOND = Sensor("camera:SECOND", ("r", "column"), ("m", "px"), sideways)
+"""
+
+
+def test_worlds_pictures_and_plans_keep_to_the_field_of_view_of_a_sensor(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "camera.py").write_text(CAMERA)
+    monkeypatch.syspath_prepend(tmp_path)
+    camera = {"kind": "camera:AHEAD", "std": (1.0, 0.1), "max_range": 50.0}
+    for view, expected in ((2 * np.pi, 1.5), (1.0, 1.0)):
+        scenario = LOOP.with_changes(sensor={**camera, "field_of_view": view})
+        env, worlds = LandmarkWorldEnv(scenario), LandmarkWorldVectorEnv(2, scenario)
+        observation, info = env.reset(seed=0)
+        offset = (env.landmarks - info["pose"][:2]) @ np.array([1, 1j])
+        bearings = np.angle(offset * np.exp(-1j * info["pose"][2]))
+        seen = np.abs(bearings) <= expected / 2
+        np.testing.assert_array_equal(observation["mask"], seen)
+        assert 0 < seen.sum() < len(seen)
+        together = worlds.reset(seed=0)[0]["mask"]
+        np.testing.assert_array_equal(together[0], seen)
+        assert Scene(Figure(), scenario, env.landmarks)._field_of_view == expected
+    slam = make_estimator(
+        "ekf", motion_std=(0.1, 0.1, 0.1), measurement_std=(1.0, 0.1),
+        sensor="camera:AHEAD",
+    )  # fmt: skip
+    slam.update([(0.0, 4.0)], [0])
+    turns = [[(0.0, 0.3)], [(0.0, 3.0)]]  # the second plan turns the camera away
+    after = imagine(slam, turns, LOOP.sensor).worst_variances[0, :, 0]
+    assert after[0] < after[1] == pytest.approx(slam.belief().covariance[3, 3])
+
+
+def test_noise_of_a_number_that_is_no_range_hides_no_landmark(tmp_path, monkeypatch):
+    (tmp_path / "camera.py").write_text(CAMERA)
+    monkeypatch.syspath_prepend(tmp_path)
+    wide = {"kind": "camera:SECOND", "std": (0.1, 1e3)}
+    observation, _ = LandmarkWorldEnv("six_landmarks", sensor=wide).reset(seed=0)
+    assert observation["mask"].all()
 
 
 def test_a_sensor_that_cannot_be_imported_is_named():

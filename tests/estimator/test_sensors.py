@@ -445,6 +445,27 @@ def test_check_sensor_does_not_take_the_pole_of_a_camera_for_a_turn(focal_length
     check_sensor(Sensor("camera", ("column",), ("px",), column))
 
 
+def camera(x, y):
+    r = np.sqrt(x * x + y * y)
+    return (500 * y / x, r), (-500 * y / (x * x), 500 / x, x / r, y / r)
+
+
+def before_the_camera(column, distance):
+    ahead = distance / np.sqrt(1 + (column / 500) ** 2)
+    return ahead, ahead * column / 500
+
+
+def test_a_camera_is_checked_in_its_field_of_view_only():
+    names = ("column", "range"), ("px", "m")
+    whole = Sensor("camera", *names, camera, before_the_camera)
+    with pytest.raises(SensorContractError, match=r"inverse of the reading of \(-"):
+        check_sensor(whole)
+    check_sensor(replace(whole, field_of_view=1.5))
+    for wrong in (0.0, 7.0, math.nan):
+        with pytest.raises(ValueError, match=r"field_of_view must be in \(0, 2π\]"):
+            replace(whole, field_of_view=wrong)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -476,7 +497,8 @@ def test_check_sensor_refuses_the_noise_that_filters_refuse(sensor, std):
         make_estimator("ekf", motion_std=MOTION, measurement_std=std, sensor=sensor)
     with pytest.raises(ValueError, match="measurement_std must be"):
         check_sensor(sensor, std)
-    check_sensor(BEARING, (0.1,))
+    for accepted in ((0.1,), (0.1, 0.0)):
+        check_sensor(BEARING, accepted)
 
 
 def test_check_sensor_refuses_slopes_of_the_void_number():
