@@ -81,7 +81,7 @@ def score_filters(
 
 def run_world(name: str, estimators: str, runs: int) -> World:
     """Run the filters in one world."""
-    results = monte_carlo(name, estimators, runs, SEED)
+    results = monte_carlo(name, estimators, runs, SEED, progress=False)
     found = {}
     for label, entry in summarise_monte_carlo(results)["estimators"].items():
         efficiency = (entry["efficiency"] or {}).get("pose")

@@ -276,7 +276,14 @@ def noise_effects(
     effects: list[NoiseEffect] = []
     for done, (place, variation, actual, assumed) in enumerate(jobs_to_do, 1):
         results = monte_carlo(
-            actual, estimators, runs, seed, assumed=assumed, jobs=jobs, backend=backend
+            actual,
+            estimators,
+            runs,
+            seed,
+            assumed=assumed,
+            jobs=jobs,
+            backend=backend,
+            progress=False,
         )
         effects += [
             _effect(place, variation, scores_of(results, label, "invariant"))

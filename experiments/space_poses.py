@@ -288,8 +288,7 @@ def nees_in_space_figure(found: Mapping[str, Any], width_mm: float = 85.0) -> Fi
     from .figures.style import new_figure  # noqa: PLC0415
     from .monte_carlo_study import figures  # noqa: PLC0415
 
-    figure = new_figure(width_mm / 25.4, 2.9)
-    axes = figure.subplots()
+    axes = new_figure(width_mm / 25.4, 2.9).subplots()
     shown = [figures.draw_bands(axes, found["runs"], 6, found["tested_steps"])]
     for place, (name, means) in enumerate(found["nees_over_time"].items()):
         ratios = np.array(means, dtype=np.float64)  # nan for None
@@ -297,7 +296,7 @@ def nees_in_space_figure(found: Mapping[str, Any], width_mm: float = 85.0) -> Fi
         steps = np.arange(len(ratios))
         axes.plot(*figures.thinned(steps, ratios), **figures.look_of(place).line(name))
     figures.scale_ratios(axes, np.concatenate(shown))
-    return figures.finished(figure, axes, "ANEES / n", found["estimator"])
+    return figures.finished(axes, "ANEES / n", found["estimator"])
 
 
 def _name(kind: str, order: str) -> str:

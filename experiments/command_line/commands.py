@@ -27,16 +27,15 @@ from typing import Annotated, Any, NoReturn, TypeVar
 
 import numpy as np
 import typer
-from rich import progress as bars
 from rich.console import Console, RenderableType
 from rich.text import Text
 from typer.core import TyperGroup
 
 from ... import __version__
 from ...sim_configs.scenario_files import unfinished
+from ..progress_bar import Tick, progress_bar
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
-Tick = Callable[[int, int], None]
 
 
 FAILURE, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
@@ -135,7 +134,6 @@ _OF_SCENARIOS = {
 
 #: How long a command may clean up after a signal before it is ended [s].
 _PATIENCE = 1.0
-_BETWEEN = 0.1  # [s] between two updates of a progress bar
 _SHOW_CURSOR = b"\r\x1b[K\x1b[?25h"  # and clear the line of the progress bar
 
 
@@ -462,49 +460,11 @@ class Reporter:
                 text = json.dumps(summary, allow_nan=False)
             sys.stdout.write(text + "\n")
 
-    @contextlib.contextmanager
-    def progress(self, doing: str, unit: str = "") -> Iterator[Tick]:
-        """Show a progress bar on a terminal during the block.
-
-        Parameters
-        ----------
-        doing : str
-            The activity, such as "filtering".
-        unit : str, optional
-            What is counted; the bar then shows the rate and the time left too.
-
-        Yields
-        ------
-        callable
-            Updates the bar with (done, total), at any rate of calls. The rate excludes
-            what is done at the first call, as when a stopped job continues.
-        """
-        columns = (
-            bars.TextColumn("{task.description:<10}"),
-            bars.BarColumn(),
-            bars.MofNCompleteColumn(),
-            *((_Rate(unit), bars.TimeRemainingColumn(compact=True)) if unit else ()),
-        )
-        with bars.Progress(
-            *columns,
-            console=self._notes,
-            transient=True,
-            disable=not self._notes.is_terminal,
-        ) as bar:
-            task = bar.add_task(doing, total=None)
-            next_look: float | None = None
-
-            def tick(done: int, total: int) -> None:
-                nonlocal next_look
-                now = time.monotonic()
-                if next_look is None:
-                    bar.reset(task, completed=done, total=total)
-                elif now < next_look and done != total:
-                    return
-                next_look = now + _BETWEEN
-                bar.update(task, completed=done, total=total)
-
-            yield tick
+    def progress(
+        self, doing: str, unit: str = ""
+    ) -> contextlib.AbstractContextManager[Tick]:
+        """Show a progress bar on a terminal during a block, see `progress_bar`."""
+        return progress_bar(doing, unit, self._notes)
 
     @contextlib.contextmanager
     def warnings(self) -> Iterator[None]:
@@ -533,16 +493,3 @@ class Reporter:
 
         with on_compilation(note):
             yield
-
-
-class _Rate(bars.ProgressColumn):
-    """Column of a progress bar: how many units are done per second."""
-
-    def __init__(self, unit: str) -> None:
-        super().__init__()
-        self._unit = unit
-
-    def render(self, task: bars.Task) -> Text:
-        """Return the rate, empty until it is known."""
-        speed = task.speed or task.finished_speed
-        return Text(f"{speed:,.0f} {self._unit}/s" if speed else "")

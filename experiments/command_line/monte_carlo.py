@@ -224,7 +224,7 @@ def _compile(estimators: str, *, identities: bool) -> None:
         steps=8, sensor={"identities": identities}
     )
     with contextlib.suppress(Exception):  # the job itself fails too, and reports it
-        monte_carlo(small, estimators, 1)
+        monte_carlo(small, estimators, 1, progress=False)
 
 
 # --------------------------------------------------------------------------------------

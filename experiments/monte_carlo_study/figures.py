@@ -2,7 +2,7 @@
 
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import xarray as xr
@@ -122,7 +122,9 @@ def _innovative(shown: Shown) -> Shown:
     return [pair for pair in shown if pair[0].nis_per_degree is not None]
 
 
-def nees_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Figure:
+def nees_figure(
+    results: xr.Dataset | ShownStudy, width_mm: float = 85.0, *, ax: Axes | None = None
+) -> Figure:
     """Draw ANEES / 3 over time, with the 95 % bands of one step and of the grid.
 
     Parameters
@@ -131,11 +133,13 @@ def nees_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Fig
         Results of ``monte_carlo``.
     width_mm : float, default 85
         Width of the figure [mm]: 85 for a column of a paper, 170 for a page.
+    ax : Axes, optional
+        Draw here, in a figure of your own, whose size and layout stay.
 
     Returns
     -------
     Figure
-        For `save_figure`.
+        For `save_figure`; that of `ax` if given.
 
     Raises
     ------
@@ -144,8 +148,7 @@ def nees_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Fig
     """
     study = ShownStudy.of(results, width_mm)
     shown, summary, frame = study.shown, study.summary, study.summary["frame"]
-    figure = new_figure(study.width, 2.9)
-    axes = figure.subplots()
+    axes = ax or new_figure(study.width, 2.9).subplots()
     runs = max(int(scores.good.sum()) for scores, _ in shown)
     extremes = [draw_bands(axes, runs, POSE_FREEDOM, grid_steps(summary))]
     for scores, look in shown:
@@ -155,7 +158,7 @@ def nees_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Fig
         _mark_grid(axes, summary["estimators"][scores.label]["decisions"], look)
         extremes.append(average)
     scale_ratios(axes, np.concatenate(extremes))
-    return finished(figure, axes, "ANEES / 3", study.title)
+    return finished(axes, "ANEES / 3", study.title, ax)
 
 
 def draw_bands(axes: Axes, runs: int, freedom: int, times: int) -> Array:
@@ -193,15 +196,16 @@ def scale_ratios(axes: Axes, ratios: Array) -> None:
         log_ticks(axes, "y")
 
 
-def runs_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Figure:
+def runs_figure(
+    results: xr.Dataset | ShownStudy, width_mm: float = 85.0, *, ax: Axes | None = None
+) -> Figure:
     """Draw the time average of each run's NEES / 3, a row of dots per estimator.
 
     Parameters, result and errors are those of :func:`nees_figure`.
     """
     study = ShownStudy.of(results, width_mm)
     shown, frame = study.shown, study.summary["frame"]
-    figure = new_figure(study.width, 0.8 + 1.0 * len(shown))
-    axes = figure.subplots()
+    axes = ax or new_figure(study.width, 0.8 + 1.0 * len(shown)).subplots()
     size = 3.4 if len(shown[0][0].good) <= _FEW_DOTS else 2.6
     averages = [scores.ratios(frame) for scores, _ in shown]
     each = [np.log10(np.maximum(_dots(ratios), _LEAST_RATIO)) for ratios in averages]
@@ -232,8 +236,7 @@ def runs_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Fig
     axes.grid(visible=False, axis="y")
     axes.set_xlabel("time average of NEES / 3")
     name_world(axes, study.title)
-    legend_above(figure, axes)
-    return figure
+    return with_legend(axes, ax)
 
 
 def heading_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Figure:
@@ -270,15 +273,16 @@ def heading_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> 
     return figure
 
 
-def rmse_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Figure:
+def rmse_figure(
+    results: xr.Dataset | ShownStudy, width_mm: float = 85.0, *, ax: Axes | None = None
+) -> Figure:
     """Draw the root mean square of the position's raw error over time.
 
     Parameters, result and errors are those of :func:`nees_figure`.
     """
     study = ShownStudy.of(results, width_mm)
     shown = study.shown
-    figure = new_figure(study.width, 2.5)
-    axes = figure.subplots()
+    axes = ax or new_figure(study.width, 2.5).subplots()
     for scores, look in shown:
         rms = _root_mean_square(scores, "position_error")
         axes.plot(*thinned(scores.steps, rms), **look.line(plain(scores.label)))
@@ -287,7 +291,7 @@ def rmse_figure(results: xr.Dataset | ShownStudy, width_mm: float = 85.0) -> Fig
         least = thinned(shown[0][0].steps, np.sqrt(total / shown[0][0].good.sum()))
         axes.plot(*least, color=GREY, ls=":", lw=1.5, label="bound of any filter")
     axes.set_ylim(bottom=0)
-    return finished(figure, axes, "RMS error, raw [m]", study.title)
+    return finished(axes, "RMS error, raw [m]", study.title, ax)
 
 
 def name_world(axes: Axes, title: str) -> None:
@@ -295,13 +299,22 @@ def name_world(axes: Axes, title: str) -> None:
     axes.set_title(title, loc="right", fontsize=8, color=GREY, pad=3)
 
 
-def finished(figure: Figure, axes: Axes, ylabel: str, title: str) -> Figure:
-    """Dress and label the axes of a number over the steps."""
+def finished(axes: Axes, ylabel: str, title: str, ax: Axes | None = None) -> Figure:
+    """Dress and label the axes of a number over the steps; `ax` are the caller's."""
     dress(axes)
     name_world(axes, title)
     axes.margins(x=0.01)
     axes.set(xlabel="step", ylabel=ylabel)
-    legend_above(figure, axes)
+    return with_legend(axes, ax)
+
+
+def with_legend(axes: Axes, ax: Axes | None) -> Figure:
+    """Return the figure of axes, its legend above them, or inside the caller's."""
+    figure = cast("Figure", axes.figure)
+    if ax is None:
+        legend_above(figure, axes)
+    else:
+        axes.legend(frameon=False, fontsize=8, labelcolor=INK)
     return figure
 
 

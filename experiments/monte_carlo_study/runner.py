@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -98,7 +99,7 @@ def monte_carlo(
     fresh: bool = False,
     resolution: float = 0.0,
     command: str = "",
-    progress: Progress | None = None,
+    progress: Progress | bool | None = True,
     small_noise: bool = False,
 ) -> xr.Dataset:
     """Run estimators many times over a scenario, and measure every run.
@@ -143,8 +144,9 @@ def monte_carlo(
         world that hides identities.
     command : str, optional
         Command that reproduces the results, to be stored with them.
-    progress : callable, optional
-        Called with (runs done, runs) after every block.
+    progress : bool or callable, default True
+        Whether to show a progress bar, if this is a notebook or a terminal; or a
+        function, called with (runs done, runs) after every block.
     small_noise : bool
         Whether to repeat some runs of a filter that is not consistent with less noise,
         which shows the cause; see :func:`~slamgym.evaluation.diagnose`. The command
@@ -196,21 +198,33 @@ def monte_carlo(
         {choice.name: registry.find_estimator(choice.name) for choice in choices},
         threads=None if workers is None else 1,
     )
-    study = _Study(
-        job,
-        blocks_of(asked, size),
-        partial(resume, work, workers=workers),
-        until,
-        wave=blocks_at_once(jobs, backend),
-        progress=progress,
-    )
     factors = LESS_NOISE if small_noise else ()
     repeat = partial(_repeated, job, factors, jobs=jobs, backend=backend)
-    with one_blas_thread():
+    with one_blas_thread(), _shown(progress) as told:
+        study = _Study(
+            job,
+            blocks_of(asked, size),
+            partial(resume, work, workers=workers),
+            until,
+            wave=blocks_at_once(jobs, backend),
+            progress=told,
+        )
         if out is None:
             return study.in_memory(command, repeat)
         with opened(Path(out), job.identity(), fresh=fresh) as folder:
             return study.in_folder(folder, command, repeat)
+
+
+@contextmanager
+def _shown(progress: Progress | bool | None) -> Iterator[Progress | None]:
+    """Yield the caller's function of progress, that of a new bar, or None."""
+    if progress is not True:
+        yield progress or None
+        return
+    from ..progress_bar import progress_bar  # noqa: PLC0415 (loads rich)
+
+    with progress_bar("running", "runs") as tick:
+        yield tick
 
 
 class _Study(NamedTuple):
@@ -362,6 +376,7 @@ def _repeated(
                 block_size=job.block_size,
                 first_run=asked.start,
                 fresh=True,
+                progress=False,
                 **engine,
             ) as small:
                 averages = averages_of(scores_of(small, choice.label, "invariant"))

@@ -53,7 +53,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         consistency_report
     """,
     "experiments": """
-        logs
+        logs progress_bar
         run_and_replay
         figures job_folders
         viewers

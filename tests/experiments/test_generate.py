@@ -1,12 +1,10 @@
 """Data sets of trajectories: right, reproducible, and indifferent to being killed."""
 
 import hashlib
-import io
 import json
 import os
 import pickle
 import random
-import re
 import subprocess
 import sys
 import time
@@ -21,7 +19,6 @@ from comparison import tree
 from presets import PRESETS
 
 from slamgym.envs.controllers import CONTROLLERS
-from slamgym.experiments.command_line import commands
 from slamgym.experiments.command_line.commands import InterruptedRunError, main
 from slamgym.experiments.command_line.generate import generate as generate_command
 from slamgym.experiments.command_line.options import Options
@@ -615,52 +612,6 @@ def test_the_command_prints_one_object_for_programs(tmp_path, capsys):
     assert summary["bytes"] == sum(
         f.stat().st_size for f in (tmp_path / "out").iterdir()
     )
-
-
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-def terminal(monkeypatch, between):
-    """Have standard error be a terminal, whose bars move every so many seconds."""
-    screen = Terminal()
-    monkeypatch.setattr(sys, "stderr", screen)
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setattr(commands, "_BETWEEN", between)
-    return screen
-
-
-def test_the_bar_shows_speed_and_time_left_on_a_terminal(tmp_path, monkeypatch):
-    screen = terminal(monkeypatch, between=0.0)
-    command(tmp_path / "out", episodes=200, as_json=True)
-    assert "driving" in screen.getvalue()
-    assert "steps/s" in screen.getvalue()
-
-
-def test_what_was_done_earlier_counts_for_no_speed(monkeypatch):
-    screen = terminal(monkeypatch, between=0.0)
-    earlier = 10**9
-    with commands.Reporter(as_json=True).progress("driving", unit="steps") as tick:
-        for done in range(4):
-            tick(earlier + done, earlier + 4)
-            time.sleep(0.1)
-    speeds = re.findall(r"([\d,]+) steps/s", screen.getvalue())
-    assert f"{earlier + 3}/{earlier + 4}" in screen.getvalue()
-    assert speeds
-    assert max(int(speed.replace(",", "")) for speed in speeds) <= 10
-
-
-def test_a_bar_that_is_moved_all_the_time_looks_up_now_and_then(monkeypatch):
-    screen = terminal(monkeypatch, between=60.0)
-    with commands.Reporter(as_json=True).progress("driving", unit="steps") as tick:
-        for done in range(1, 9):
-            tick(done, 9)
-        time.sleep(0.3)
-        assert "1/9" in screen.getvalue()
-        assert not re.search("[2-9]/9", screen.getvalue())
-        tick(9, 9)
-    assert "9/9" in screen.getvalue()
 
 
 def test_an_interrupted_command_says_that_whole_shards_stay(tmp_path, monkeypatch):

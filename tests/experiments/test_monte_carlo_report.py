@@ -8,6 +8,7 @@ import re
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.text import Text
 from monte_carlo_dataset import typical, with_failures
 from rich.console import Console
@@ -726,6 +727,23 @@ def test_a_figure_for_print_is_as_wide_as_asked_and_names_its_world(name, width)
     box = figure.get_tightbbox()
     assert box.x0 > -0.1
     assert box.x1 * 25.4 < width + 2.0
+
+
+@pytest.mark.parametrize("name", ["nees", "runs", "rmse"])
+def test_a_figure_of_one_panel_is_drawn_on_given_axes(name):
+    whole = Figure(figsize=(6, 3))
+    left, right = whole.subplots(1, 2)
+    drawn = getattr(experiments, f"{name}_figure")(typical(), ax=right)
+    assert drawn is whole
+    assert not whole.legends  # the size and layout of the caller's figure stay
+    assert tuple(whole.get_size_inches()) == (6, 3)
+    assert not left.lines
+    (alone,) = getattr(experiments, f"{name}_figure")(typical()).axes
+    assert [line.get_label() for line in right.lines] == [
+        line.get_label() for line in alone.lines
+    ]
+    labels = [text.get_text() for text in right.get_legend().get_texts()]
+    assert labels == alone.get_legend_handles_labels()[1]
 
 
 def test_no_line_is_empty_for_which_the_layout_would_make_room():
