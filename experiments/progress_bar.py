@@ -6,6 +6,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from typing import Any, TextIO
 
 from rich import progress as bars
@@ -109,9 +110,7 @@ def _notebook() -> Callable[..., Any] | None:
     shell = ipython and ipython.get_ipython()
     if type(shell).__name__ != "ZMQInteractiveShell":
         return None
-    from IPython.display import display  # noqa: PLC0415 (only notebooks have it)
-
-    shown: Callable[..., Any] = display
+    shown: Callable[..., Any] = import_module("IPython.display").display
     return shown
 
 

@@ -22,7 +22,7 @@ __dir__ = __all__.copy
 #: program.
 COMMANDS = (
     *("run", "replay", "smooth", "fit_noise", "monte_carlo", "generate", "judge"),
-    *("benchmark", "noise_study", "render_video"),
+    *("benchmark", "noise_study", "explore", "render_video"),
 )
 for _name in COMMANDS:
     leaf(f"experiments.command_line.{_name}")

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...sim_configs import Scenario
-from .commands import Tick, command
+from ..progress_bar import Tick
+from .commands import command
 from .options import REQUIRED, Options, ScenarioName, declared, refuse_broken, takes
 
 if TYPE_CHECKING:

@@ -38,8 +38,8 @@ from ..run_and_replay.log_replay import ThinnedSteps
 from ..run_and_replay.summary import pose_nees
 from ..run_and_replay.trace import RunTrace
 
-_PARTS = Path(__file__).parent / "run_page_parts"
-_SCRIPTS = ("data.js", "map.js", "chart.js", "player.js")
+PARTS = Path(__file__).parent / "run_page_parts"
+_SCRIPTS = ("data.js", "shapes.js", "map.js", "chart.js", "player.js")
 _SHARE = 0.95  # probability of the bands of NEES and NIS
 
 
@@ -86,7 +86,7 @@ def _page(log: SlamLog, runs: Sequence[ViewedRun], walls: list[list[float]]) -> 
     _pack_world(packed, log, runs[0].trace, steps)
     for number, run in enumerate(runs):
         _pack_filter(packed, f"{number}.", run, steps)
-    script = "\n".join((_PARTS / name).read_text("utf-8") for name in _SCRIPTS)
+    script = "\n".join((PARTS / name).read_text("utf-8") for name in _SCRIPTS)
     names = [run.trace.estimator for run in runs]
     facts = {
         "filters": names,
@@ -97,15 +97,15 @@ def _page(log: SlamLog, runs: Sequence[ViewedRun], walls: list[list[float]]) -> 
         "bands": {"nees": [q / 3 for q in chi_square_limits(3, (1 - _SHARE) / 2)]},
         "arrays": packed.table,
     }
-    template = page_environment(_PARTS).get_template("page.html")
+    template = page_environment(PARTS).get_template("page.html")
     return template.render(
         title=f"{log.name}: {', '.join(names)}",
         notes=_notes(steps, runs),
         several=len(runs) > 1,
-        style=Markup((_PARTS / "page.css").read_text("utf-8")),
+        style=Markup((PARTS / "page.css").read_text("utf-8")),
         script=Markup(script),
-        script_hash=_hash(f"\n{script}\n"),
-        facts=_inline_json(facts),
+        script_hash=hash_of(f"\n{script}\n"),
+        facts=inline_json(facts),
         arrays=packed.text(),
     )
 
@@ -243,13 +243,13 @@ def _stride(steps: Sequence[int]) -> int:
     return steps[1] - steps[0] if len(steps) > 1 else 1
 
 
-def _hash(script: str) -> str:
+def hash_of(script: str) -> str:
     """Return the hash by which the page's policy allows this script and no other."""
     digest = hashlib.sha256(script.encode("utf-8")).digest()
     return f"sha256-{base64.b64encode(digest).decode()}"
 
 
-def _inline_json(value: Any) -> Markup:
+def inline_json(value: Any) -> Markup:
     """Write JSON that cannot end the script element around it."""
     text = json.dumps(value, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c"))

@@ -41,6 +41,10 @@ LEAVES: dict[str, tuple[str, ...]] = {
         "experiments.command_line.benchmark",
     ),
     "viewers": ("experiments.viewers",),
+    "page of noises": (
+        "experiments.noise_explorer",
+        "experiments.command_line.explore",
+    ),
     "formats of trajectories": (
         "experiments.trajectories.g2o",
         "experiments.trajectories.parquet",

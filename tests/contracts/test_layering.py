@@ -58,7 +58,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         figures job_folders
         viewers
         monte_carlo_study
-        noise_study noise_fitting
+        noise_study noise_fitting noise_explorer
         trajectories
         estimate_conventions estimate_files log_conventions
         judging space_poses consistency_protocol
