@@ -172,7 +172,7 @@ def _measured(done: Replay, variation: Variation, settings: FilterSettings) -> N
     predicted_area, pose_area = ellipse_areas(np.stack(last)[:, :2, :2]).tolist()
     row = NoiseRow(
         *variation,
-        std=std,
+        std=None if std is None else float(f"{std:.12g}"),  # 0.1 × 0.1 is 0.01
         predicted_area=predicted_area,
         pose_area=pose_area,
         landmark_area=finite(areas.mean()) if len(areas) else None,

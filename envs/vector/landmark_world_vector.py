@@ -141,7 +141,8 @@ class LandmarkWorldVectorEnv(Restorable, VectorEnv[Observations, AnyArray, AnyAr
             generators.
         options : dict, optional
             ``{"reset_mask": mask}``, bool ndarray of shape (B,), chooses worlds. The
-            others do not change and have no info.
+            others do not change and have no info. These worlds share one scenario; for
+            ``pose``, ``landmarks`` and ``scenario``, use ``vectorization_mode="sync"``.
 
         Raises
         ------
@@ -420,7 +421,9 @@ def checked_reset_mask(options: dict[str, Any] | None, count: int) -> BoolArray 
     unknown = set(options) - {"reset_mask"}
     if unknown:
         raise ValueError(
-            f"options of many worlds may hold 'reset_mask' alone, got {sorted(unknown)}"
+            "options of worlds that share one scenario may hold 'reset_mask' alone, "
+            f"got {sorted(unknown)}: worlds of gymnasium.make_vec with "
+            "vectorization_mode='sync' take those of one world"
         )
     mask = options["reset_mask"]
     if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:

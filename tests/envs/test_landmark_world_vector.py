@@ -280,6 +280,18 @@ def test_an_action_that_is_no_number_names_its_world_and_the_worlds_stay():
         same(*(each.step(np.zeros((WORLDS, 2))) for each in (vector, twin)))
 
 
+def test_options_of_one_world_are_taken_by_worlds_side_by_side():
+    options = {"pose": (1.0, 2.0, 0.5)}
+    changes = {"scenario": "six_landmarks", "start": {"std": (0.0, 0.0, 0.0)}}
+    with pytest.raises(ValueError, match="vectorization_mode='sync' take those of one"):
+        gym.make_vec("slamgym/LandmarkWorld-v0", 2, **changes).reset(options=options)
+    apart = {"vectorization_mode": "sync", **changes}
+    _, infos = gym.make_vec("slamgym/LandmarkWorld-v0", 2, **apart).reset(
+        options=options
+    )
+    np.testing.assert_array_equal(infos["pose"], [options["pose"]] * 2)
+
+
 @pytest.mark.parametrize(
     ("options", "error", "word"),
     [

@@ -98,7 +98,7 @@ def test_the_command_replaces_only_its_own_pages(tmp_path, monkeypatch, capsys):
         with pytest.raises(BadInputError, match=r"be an \.html file in a folder"):
             main([*given[:-1], wrong], standalone_mode=False)
     with pytest.raises(BadInputError, match="did you mean 'filter'"):
-        main([*given, "--change", "fliter"], standalone_mode=False)
+        main([*given, "--change", "filtr"], standalone_mode=False)
 
 
 # --------------------------------------------------------------------------------------
