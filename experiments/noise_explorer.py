@@ -78,7 +78,7 @@ def explore_noise(
     """
     choices = estimator_choices(estimators)
     pairs = [(motion, sensor) for sensor in FACTORS for motion in FACTORS]
-    study = _Study(scenario, estimators, choices, runs, seed, change)
+    study = _Exploration(scenario, estimators, choices, runs, seed, change)
     pairs.insert(0, (1.0, 1.0))  # selects the typical run and the size of the map
     cells: list[dict[str, Any]] = []
     for done, pair in enumerate(pairs, 1):
@@ -105,7 +105,7 @@ def explore_noise(
     }
 
 
-class _Frame(NamedTuple):
+class _MapCodes(NamedTuple):
     """How lengths become small integers."""
 
     low: Array
@@ -114,7 +114,7 @@ class _Frame(NamedTuple):
     landmarks: Array
 
     @classmethod
-    def around(cls, trace: RunTrace, landmarks: Array) -> _Frame:
+    def around(cls, trace: RunTrace, landmarks: Array) -> _MapCodes:
         """Return a square around the truth and the map, with a margin."""
         path = trace.true_poses
         points = [landmarks, trace.poses[:, :2], *([] if path is None else [path])]
@@ -155,7 +155,7 @@ def _small(parts: Array) -> list[int]:
     return numbers
 
 
-class _Study(NamedTuple):
+class _Exploration(NamedTuple):
     """A study of one world."""
 
     scenario: Scenario
@@ -166,9 +166,9 @@ class _Study(NamedTuple):
     change: str
     #: Seed of the run that the page draws.
     typical: int = 0
-    frame: _Frame = _Frame(np.zeros(2), 1.0, np.zeros((0, 2)))
+    frame: _MapCodes = _MapCodes(np.zeros(2), 1.0, np.zeros((0, 2)))
 
-    def begun(self) -> _Study:
+    def begun(self) -> _Exploration:
         """Choose the typical run, and the part of the plane to show."""
         results = monte_carlo(
             self.scenario, self.estimators, self.runs, self.seed, progress=False
@@ -179,7 +179,7 @@ class _Study(NamedTuple):
         run = int(good[order[len(order) // 2]]) if len(good) else 0
         study = self._replace(typical=self.seed + run)
         trace, landmarks = study._replay(self.scenario, self.scenario, self.choices[0])
-        return study._replace(frame=_Frame.around(trace, landmarks))
+        return study._replace(frame=_MapCodes.around(trace, landmarks))
 
     def cell(self, motion: float, sensor: float) -> dict[str, Any]:
         """Return what the page shows for a pair of factors."""

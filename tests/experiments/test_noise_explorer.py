@@ -77,7 +77,7 @@ def test_ellipses_and_paths_are_those_of_the_typical_run(monkeypatch):
 
 
 def test_angles_of_ellipses_are_those_of_their_longer_axis():
-    frame = noise_explorer._Frame(np.zeros(2), 100.0, np.zeros((0, 2)))
+    frame = noise_explorer._MapCodes(np.zeros(2), 100.0, np.zeros((0, 2)))
     turned = np.array([[5.0, 4.0], [4.0, 5.0]])  # σ 3 along 45°, 1 across
     x, y, long, short, angle = frame.ellipses(np.array([[10.0, 20.0]]), turned[None])
     assert (x, y, long, short, angle) == (200, 400, 180, 60, 45)
