@@ -6,6 +6,7 @@ PPO of Stable-Baselines3 learns to explore. The agent observes the belief of a f
 site does not run this tutorial, because it needs ``pip install torch==2.13.0 stable-baselines3`` and two minutes of CPU time.
 """
 
+# sphinx_gallery_thumbnail_path = 'images/active_slam_learning_curve.png'  # noqa: ERA001
 # %%
 # Worlds side by side
 # -------------------
