@@ -67,6 +67,7 @@ class Row(NamedTuple):
     local: float  # ms: local_belief()
     join: float  # s: the first belief of a few landmarks, which joins
     again: float  # ms: another
+    whole: float  # ms: the belief of all landmarks, after the join
     filter_mb: float
     process_mb: float
     chain_error: float  # m, of the pose before joining
@@ -141,6 +142,11 @@ def _row(slam: SubmapSlam, times: list[float], pose: Array, landmarks: Array) ->
     began = time.thread_time()
     slam.belief(some)
     again = time.thread_time() - began
+    whole = np.nan
+    if len(known) <= slam.belief_limit:
+        began = time.thread_time()
+        slam.belief()
+        whole = time.thread_time() - began
     error = belief.error(pose, landmarks[some])
     nees = error @ np.linalg.solve(belief.error_covariance(), error) / len(error)
     nbytes = slam.nbytes
@@ -155,6 +161,7 @@ def _row(slam: SubmapSlam, times: list[float], pose: Array, landmarks: Array) ->
         1e3 * at_once,
         joining,
         1e3 * again,
+        1e3 * whole,
         nbytes / 1e6,
         _largest_memory(),
         float(np.hypot(*(local.pose - pose)[:2])),
@@ -186,6 +193,7 @@ COLUMNS = (
     ("local belief, ms", "{:.2f}"),
     ("join, s", "{:.2f}"),
     ("again, ms", "{:.0f}"),
+    ("all, ms", "{:.0f}"),
     ("filter, MB", "{:.0f}"),
     ("process, MB", "{:.0f}"),
     ("chain's error, m", "{:.2f}"),

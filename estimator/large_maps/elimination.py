@@ -32,6 +32,7 @@ from .multifrontal import (
     Node,
     add_update,
     eliminate,
+    inverse,
     marginal_covariance,
     pairs,
     substitute_back,
@@ -433,6 +434,10 @@ class SubmapElimination:
         """Return A H⁻¹ Aᵀ, shape (v, v), for a sparse A, shape (v, N)."""
         return marginal_covariance(self._nodes, rows)[0]
 
+    def inverse(self, more: int) -> tuple[Array, IntArray]:
+        """Return H⁻¹ with room for more variables, and the row of each unknown."""
+        return inverse(self._nodes, len(self._solved), more)
+
     @property
     def nbytes(self) -> int:
         """Memory of the factor [bytes]."""
@@ -476,15 +481,17 @@ def dissect(unknowns: Sequence[IntArray], positions: Array) -> list[Part]:
         Positions of the submaps [m]; they affect only the cost.
     """
     touches = np.bincount(np.concatenate(unknowns))
+    row = np.empty(len(touches), dtype=np.int64)
     parts: list[Part] = []
 
     def close(
         submap: int, pieces: Sequence[tuple[IntArray, IntArray]]
     ) -> tuple[IntArray, IntArray]:
         """Join pieces (unknowns, number of submaps inside that touch each)."""
-        union, places = np.unique(
-            np.concatenate([piece[0] for piece in pieces]), return_inverse=True
-        )
+        every = np.concatenate([piece[0] for piece in pieces])
+        union = np.flatnonzero(among(every, len(touches)))
+        row[union] = np.arange(len(union))
+        places = row[every]
         weights = np.concatenate([piece[1] for piece in pieces])
         inside = np.bincount(places, weights).astype(np.int64)
         done = inside == touches[union]
@@ -499,25 +506,32 @@ def dissect(unknowns: Sequence[IntArray], positions: Array) -> list[Part]:
         if len(chosen) == 1:
             touched = unknowns[chosen[0]]
             return close(int(chosen[0]), [(touched, np.ones_like(touched))])
-        return close(-1, [halve(half) for half in _halves(chosen, unknowns, positions)])
+        halves = _halves(chosen, unknowns, positions, len(touches))
+        return close(-1, [halve(half) for half in halves])
 
     halve(np.arange(len(unknowns)))
     return parts
 
 
 def _halves(
-    chosen: IntArray, unknowns: Sequence[IntArray], positions: Array
+    chosen: IntArray, unknowns: Sequence[IntArray], positions: Array, size: int
 ) -> tuple[IntArray, IntArray]:
     """Cut along x or y, whichever leaves fewer unknowns on both sides."""
     middle = len(chosen) // 2
     cuts = []
     for axis in range(2):
         order = chosen[np.argsort(positions[chosen, axis], kind="stable")]
-        sides = [
-            np.unique(np.concatenate([unknowns[k] for k in half]))
+        one, other = (
+            among(np.concatenate([unknowns[k] for k in half]), size)
             for half in (order[:middle], order[middle:])
-        ]
-        shared = np.intersect1d(sides[0], sides[1], assume_unique=True)
-        cuts.append((len(shared), order))
+        )
+        cuts.append((np.count_nonzero(one & other), order))
     order = min(cuts, key=lambda cut: cut[0])[1]
     return order[:middle], order[middle:]
+
+
+def among(these: IntArray, size: int) -> BoolArray:
+    """Return which of the first numbers, shape (size,), are among these."""
+    found = np.zeros(size, dtype=bool)
+    found[these] = True
+    return found

@@ -27,7 +27,7 @@ from scipy.linalg import lapack
 from scipy.sparse import bsr_array, csc_array
 
 from ...arrays import Array, BoolArray, IntArray
-from ...jit import jit
+from ...jit import jit, jit_in_place
 from ..guards import saved_states
 
 
@@ -99,16 +99,16 @@ def substitute_forward(nodes: Sequence[Node], values: Array) -> None:
         right = values[node.own]
         if not right.any():
             continue
-        solved = _solve(node.lower, right)
-        values[node.own] = solved
-        values[node.rest] -= node.response.T @ solved
+        y = solved(node.lower, right)
+        values[node.own] = y
+        values[node.rest] -= node.response.T @ y
 
 
 def substitute_back(nodes: Sequence[Node], values: Array) -> None:
     """Replace y by x, with Lᵀ x = y, in place; unknowns of no node are given."""
     for node in reversed(nodes):
         right = values[node.own] - node.response @ values[node.rest]
-        values[node.own] = _solve(node.lower, right, transposed=True)
+        values[node.own] = solved(node.lower, right, transposed=True)
 
 
 def marginal_covariance(
@@ -149,7 +149,7 @@ def marginal_covariance(
             if unknown in live:
                 right[place] += live.pop(unknown)
         used = np.flatnonzero(right.any(axis=0))
-        Y = _solve(node.lower, right[:, used])
+        Y = solved(node.lower, right[:, used])
         total[used[:, None], used] += Y.T @ Y
         changed[node.rest] = True
         changes = node.response.T @ Y
@@ -160,13 +160,81 @@ def marginal_covariance(
     return total, live
 
 
-def _solve(lower: Array, right: Array, *, transposed: bool = False) -> Array:
+def inverse(nodes: Sequence[Node], size: int, more: int = 0) -> tuple[Array, IntArray]:
+    """Return H⁻¹, where nodes eliminate all unknowns, from the last node to the first.
+
+    With T = L⁻ᵀ X, the rows of a node follow from those of its rest, for all unknowns o
+    of the nodes after it::
+
+        Σ_po = −T Σ_ro,   Σ_pp = (L Lᵀ)⁻¹ + T Σ_rr Tᵀ
+
+    Parameters
+    ----------
+    nodes : sequence of Node
+        Children first.
+    size, more : int
+        Number of unknowns N, and of the variables that :func:`append` adds.
+
+    Returns
+    -------
+    covariance : ndarray, shape (N + more, N + more)
+        Σ, of the unknowns in another order; further entries are not set.
+    places : ndarray, shape (N,)
+        The row of each unknown.
+    """
+    covariance, places = np.empty((size + more,) * 2), np.empty(size, dtype=np.int64)
+    done = 0
+    for node in reversed(nodes):
+        root = solved(node.lower, np.eye(len(node.own)))
+        T = solved(node.lower, node.response, transposed=True)
+        append(covariance, done, places[node.rest], -T, root.T @ root)
+        places[node.own] = done + np.arange(len(node.own))
+        done += len(node.own)
+    return covariance, places
+
+
+def append(covariance: Array, done: int, at: IntArray, T: Array, noise: Array) -> None:
+    """Add variables y = T x + w to the first variables of a covariance, in place.
+
+    Parameters
+    ----------
+    covariance : ndarray
+        Its first ``done`` rows and columns are set, and then those of y after them.
+    done : int
+    at : ndarray, shape (r,)
+        Rows of x.
+    T : ndarray, shape (p, r)
+    noise : ndarray, shape (p, p)
+        Covariance of w.
+    """
+    rows, new = T @ covariance[at, :done], slice(done, done + len(T))
+    own = noise + rows[:, at] @ T.T
+    covariance[new, :done], covariance[:done, new] = rows, rows.T
+    covariance[new, new] = (own + own.T) / 2
+
+
+def permuted(covariance: Array, order: IntArray) -> Array:
+    """Return rows and columns of a matrix in an order, in one pass over the memory."""
+    found = np.empty((len(order),) * 2)
+    _permute(covariance, order, found)
+    return found
+
+
+@jit_in_place
+def _permute(matrix: Array, order: IntArray, found: Array) -> None:
+    for i in range(len(order)):
+        row = matrix[order[i]]
+        for j in range(len(order)):
+            found[i, j] = row[order[j]]
+
+
+def solved(lower: Array, right: Array, *, transposed: bool = False) -> Array:
     """Return L⁻¹ b, or L⁻ᵀ b."""
     if not right.size:
         return right.copy()
     # solve_triangular calls the same routine, at several times the cost of a small L.
-    solved, _ = lapack.dtrtrs(lower.T, right, lower=0, trans=not transposed)
-    return np.asarray(solved)
+    found, _ = lapack.dtrtrs(lower.T, right, lower=0, trans=not transposed)
+    return np.asarray(found)
 
 
 @jit

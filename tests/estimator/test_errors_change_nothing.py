@@ -154,6 +154,31 @@ def test_an_interrupt_leaves_no_filter_mixed_without_a_mark(name, managed):
     assert found >= {"before", "marked"}
 
 
+TOLD = {i: (r * np.cos(b), r * np.sin(b)) for i, (b, r) in enumerate(READINGS)}
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "call"),
+    [
+        ("ideal", {}, lambda slam: slam.observe_truth((0.1, 0.0, 0.0), TOLD)),
+        (
+            *("ekf", {"landmark_init": "delayed"}),
+            lambda slam: slam.update(READINGS - (0.2, 0.1), range(4)),
+        ),
+    ],
+)
+def test_an_interrupted_filter_without_marks_is_as_before_or_after(name, options, call):
+    slam = make_estimator(name, **NOISE, **options)
+    slam.update(READINGS, range(4))
+    slam.predict((0.6, 0.2))
+
+    def some(total):
+        return np.linspace(0, total - 1, 50).astype(int).tolist()
+
+    found = found_after_interrupts(slam, call, some)
+    assert {"before"} <= found <= {"before", "after"}
+
+
 @pytest.mark.parametrize("name", OPTIONS)
 def test_more_landmarks_than_a_local_map_holds_change_nothing(name):
     slam = driven(name, False)

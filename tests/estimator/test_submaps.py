@@ -205,6 +205,23 @@ def test_a_part_of_the_belief_is_that_part_of_the_whole(driven):
     assert driven.belief([]).landmark_ids == ()
 
 
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_both_ways_to_the_covariance_of_a_map_agree(base, monkeypatch):
+    spread = np.random.default_rng(5).uniform(-9, 15, (60, 2))
+    slam, found = (
+        run(made(base=base, submap_size=15), laps(90, landmarks=spread, reach=5.0)),
+        [],
+    )
+    summaries = closed_submaps(slam).summaries
+    held = np.bincount(np.concatenate([summary.slots for summary in summaries]))
+    assert (held == 1).any()
+    assert (held > 1).any()
+    for few in (0.0, np.inf):
+        monkeypatch.setattr(gauss_newton, "MANY", few)
+        found.append(slam.belief([*slam.landmark_ids]))
+    assert_close_beliefs(*found, 1e-12, 1e-12)
+
+
 def test_the_frame_of_the_present_submap_is_the_chain_of_the_others():
     std = np.array([0.1, 0.2, 0.05])
     slam = run(made(base="ekf", initial_pose_std=std), laps(50))
@@ -409,6 +426,8 @@ def test_elimination_solves_what_a_dense_solver_solves(count):
     np.testing.assert_allclose(
         done.covariance(csc_array(rows)), rows @ np.linalg.solve(H, rows.T), atol=1e-8
     )
+    inverse, rows = done.inverse(0)
+    np.testing.assert_allclose(inverse[np.ix_(rows, rows)], np.linalg.inv(H), atol=1e-8)
     assert done.decrement() == pytest.approx(g @ np.linalg.solve(H, g))
     assert done.cost == count
 

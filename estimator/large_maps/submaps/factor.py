@@ -16,9 +16,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from ....arrays import Array, ComplexArray
+from ....jit import jit_in_place, njit_internal
 from ...models.bearing_range import wrap_angle
 from ...models.rigid_motion import ErrorFrame, points_of, state_of
 
@@ -62,33 +62,45 @@ def factor_error(
     >>> factor_error(np.zeros(3), world, np.array([1.0, 0.0, 0.0, 2.0, 0.0])).error
     array([0., 0., 0., 1., 0.])
     """
-    turned = np.exp(-1j * start[2])
-    seen = turned * (points_of(state) - complex(*start[:2]))
-    turn = float(wrap_angle(state[2] - start[2] - mean[2]))
-    error, scale, slope = _error(seen, points_of(mean), turn, frame)
-    size = len(state)
-    jacobian = np.zeros((size, 3 + size))
-    jacobian[2, 2], jacobian[2, 5] = -1.0, 1.0
-    where = np.r_[0, 3:size:2]
-    by_point = scale * turned
-    for row, part in ((where, np.real), (where + 1, np.imag)):
-        jacobian[row, 0], jacobian[row, 1] = -part(by_point), -part(1j * by_point)
-        jacobian[row, 3 + where] = part(by_point)
-        jacobian[row, 4 + where] = part(1j * by_point)
-        jacobian[row, 2] = part(-1j * scale * seen - slope)
-        jacobian[row, 5] = part(slope)
-    return FactorError(state_of(error, turn), jacobian)
+    turn, size = float(wrap_angle(state[2] - start[2] - mean[2])), len(state)
+    error, jacobian = np.empty(size), np.zeros((size, 3 + size))
+    _fill(start, state, mean, turn, frame == "invariant", error, jacobian)
+    return FactorError(error, jacobian)
 
 
-def _error(
-    seen: Complex, mean: Complex, turn: float, frame: ErrorFrame
-) -> tuple[Complex, complex, Complex]:
-    """Return e of points, and its derivatives by the seen points and the turn."""
-    if frame == "additive":
-        return seen - mean, 1.0 + 0.0j, np.zeros_like(seen)
-    scale, slope = inverse_spread(turn)
-    turned = np.exp(1j * turn) * mean
-    return scale * (seen - turned), scale, slope * (seen - turned) - scale * 1j * turned
+@jit_in_place
+def _fill(  # noqa: PLR0917 (a kernel takes no keywords)
+    start: Array,
+    state: Array,
+    mean: Array,
+    turn: float,
+    invariant: bool,
+    error: Array,
+    jacobian: Array,
+) -> None:
+    """Write e, and its derivatives other than 0."""
+    turned, ahead = np.exp(-1j * start[2]), np.exp(1j * turn)
+    scale, slope = 1.0 + 0.0j, 0.0 + 0.0j
+    if invariant:
+        scale, slope = inverse_spread_jit(turn)
+    across = scale * turned
+    error[2], jacobian[2, 2], jacobian[2, 5] = turn, -1.0, 1.0
+    for row in range(0, len(state) - 1, 2):
+        x = row + (row > 0)  # 0, then 3, 5, …
+        seen = turned * complex(state[x] - start[0], state[x + 1] - start[1])
+        expected = complex(mean[x], mean[x + 1])
+        by_turn = 0.0j
+        if invariant:
+            expected *= ahead
+            by_turn = slope * (seen - expected) - scale * 1j * expected
+        found, by_start = scale * (seen - expected), -1j * scale * seen - by_turn
+        error[x], error[x + 1] = found.real, found.imag
+        for at, sign in ((0, -1.0), (3 + x, 1.0)):
+            jacobian[x, at] = jacobian[x + 1, at + 1] = sign * across.real
+            jacobian[x + 1, at] = sign * across.imag
+            jacobian[x, at + 1] = -sign * across.imag
+        jacobian[x, 2], jacobian[x + 1, 2] = by_start.real, by_start.imag
+        jacobian[x, 5], jacobian[x + 1, 5] = by_turn.real, by_turn.imag
 
 
 def inverse_spread(turn: float) -> tuple[complex, complex]:
@@ -106,6 +118,9 @@ def inverse_spread(turn: float) -> tuple[complex, complex]:
     return complex(half * cot, -half), complex((cot - half / sin**2) / 2, -0.5)
 
 
+inverse_spread_jit = njit_internal(inverse_spread)
+
+
 def retract(mean: Array, error: Array, frame: ErrorFrame) -> Array:
     """Return the state with this error against the mean, shape (3 + 2n,)."""
     if frame == "additive":
@@ -120,12 +135,6 @@ def regularised(P: Array) -> Array:
     """Return a covariance with an increased diagonal, so that it can be solved with."""
     largest = float(np.max(np.diagonal(P)))
     return P + np.eye(len(P)) * max(SMALLEST_RATIO**2 * largest, 1e-18)
-
-
-def whitened(covariance: Array, columns: Array) -> Array:
-    """Return L⁻¹ times columns, where L Lᵀ is the covariance."""
-    lower = np.linalg.cholesky(regularised(covariance))
-    return np.asarray(solve_triangular(lower, columns, lower=True, check_finite=False))
 
 
 # --------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from scipy.sparse import coo_array
 from ....arrays import Array, IntArray
 from ...models.rigid_motion import ErrorFrame, compose, points_of
 from ..elimination import Quadratic, SubmapElimination, dissect
-from ..multifrontal import pairs
+from ..multifrontal import append, pairs, permuted, solved
 from .factor import (
     FactorError,
     Gaussian,
@@ -28,12 +28,15 @@ from .factor import (
     inverse_spread,
     regularised,
     times,
-    whitened,
 )
 from .store import Submap
 
 # Decrement at which to stop: the step is then below 1e-4 standard deviations.
 CONVERGED = 1e-9
+# A part of the map of as many entries per unknown is taken from the covariance of all.
+MANY = 0.75
+# Number of submaps whose factors are kept from one iteration to the next: 20 MB.
+MOST_KEPT = 500
 
 
 class JoinedMap:
@@ -77,6 +80,11 @@ class JoinedMap:
         self._place = np.where(is_shared, np.cumsum(is_shared) - 1, -1)
         shared = np.flatnonzero(is_shared)
         self._shared = [places[places >= 0] for places in map(self._place.take, slots)]
+        # Rows of pose and shared landmarks in the states of the submaps.
+        self._rows = [
+            np.concatenate([np.arange(3), 3 + pairs(np.flatnonzero(places >= 0))])
+            for places in map(self._place.take, slots)
+        ]
         self._count = len(slots)
         self.frames = frames
         self._points = points_seen(summaries, frames, len(holders))[shared]
@@ -84,6 +92,7 @@ class JoinedMap:
             [self._unknowns(k) for k in range(self._count)], frames[:-1, :2]
         )
         self._elimination: SubmapElimination | None = None
+        self._kept: dict[int, tuple[Array, Array]] = {}
         values = np.concatenate([frames[1:].ravel(), self._points.ravel()])
         if not minimise(self._linearise, values, converged):
             raise np.linalg.LinAlgError(
@@ -91,6 +100,7 @@ class JoinedMap:
                 f"{ITERATIONS} iterations: the submaps contradict each "
                 "other, as after a wrong landmark_id, or drifted too far"
             )
+        self._kept.clear()
 
     @property
     def nbytes(self) -> int:
@@ -105,28 +115,62 @@ class JoinedMap:
         slots : ndarray of int, shape (v,)
             Of landmarks in closed submaps.
         """
-        size, cut = 3 + 2 * len(slots), 3 * self._count
-        mean, own = np.zeros(size), np.zeros((size, size))
+        mean, cut = np.zeros(3 + 2 * len(slots)), 3 * self._count
         mean[:3] = self.frames[-1]
         place = self._place[slots]
         fused = np.flatnonzero(place >= 0)
         rows = np.concatenate([np.arange(3), 3 + pairs(fused)])
         columns = np.concatenate([cut - 3 + np.arange(3), cut + pairs(place[fused])])
         mean[rows[3:]] = self._points[place[fused]].ravel()
-        entries = [(columns, rows, np.ones(len(rows)))]
         others = np.flatnonzero(place < 0)
         owners = self._owner[slots[others]]
+        owned: list[Owned] = []
         for k in np.unique(owners).tolist():
             held = others[owners == k]
             private, where = self._private_landmarks(k, slots[held]), 3 + pairs(held)
             mean[where] = private.points
+            owned.append(Owned(where, self._unknowns(k), private))
+        is_large = len(mean) > MANY * (cut + self._points.size)
+        covariance = self._large_covariance if is_large else self._small_covariance
+        return Gaussian(mean, covariance(len(mean), rows, columns, owned))
+
+    def _small_covariance(
+        self, size: int, rows: IntArray, columns: IntArray, owned: Sequence[Owned]
+    ) -> Array:
+        """Return the covariance of a part of the map, by the factor.
+
+        Parameters
+        ----------
+        size : int
+            Length of its state.
+        rows, columns : ndarray, shape (v,)
+            The entries of the state that are unknowns, and which ones.
+        owned : sequence of Owned
+            The others.
+        """
+        own = np.zeros((size, size))
+        entries = [(columns, rows, np.ones(len(rows)))]
+        for where, unknowns, private in owned:
             own[where[:, None], where] = private.covariance
-            at = np.broadcast_arrays(self._unknowns(k), where[:, None])
+            at = np.broadcast_arrays(unknowns, where[:, None])
             entries.append((at[0].ravel(), at[1].ravel(), private.jacobian.ravel()))
-        unknowns, at_rows, values = map(np.concatenate, zip(*entries, strict=True))
-        shape = (size, cut + self._points.size)
-        A = coo_array((values, (at_rows, unknowns)), shape).tocsc()
-        return Gaussian(mean, own + self._factors.covariance(A))
+        at_unknowns, at_rows, values = map(np.concatenate, zip(*entries, strict=True))
+        shape = (size, 3 * self._count + self._points.size)
+        A = coo_array((values, (at_rows, at_unknowns)), shape).tocsc()
+        return own + self._factors.covariance(A)
+
+    def _large_covariance(
+        self, size: int, rows: IntArray, columns: IntArray, owned: Sequence[Owned]
+    ) -> Array:
+        """Return the same, by the covariance of all unknowns."""
+        P, places = self._factors.inverse(size - len(rows))
+        done, order = len(places), np.empty(size, dtype=np.int64)
+        order[rows] = places[columns]
+        for where, unknowns, private in owned:
+            append(P, done, places[unknowns], private.jacobian, private.covariance)
+            order[where] = done + np.arange(len(where))
+            done += len(where)
+        return permuted(P, order)
 
     @property
     def _factors(self) -> SubmapElimination:
@@ -145,14 +189,23 @@ class JoinedMap:
 
     def _normal_equations(self, index: int) -> Quadratic:
         """Return the squared error of a submap as a function of its unknowns."""
-        submap = self._load(index)
-        rows = self._shared_rows(submap)
-        error, jacobian = self._error(index, submap.mean[rows])
-        W = whitened(
-            submap.covariance[rows[:, None], rows], np.column_stack([jacobian, error])
-        )
+        mean, root = self._factor(index)
+        error, jacobian = self._error(index, mean)
+        W = root @ np.column_stack([jacobian, error])
         J, w = W[:, :-1], W[:, -1]
         return J.T @ J, -J.T @ w, float(w @ w)
+
+    def _factor(self, index: int) -> tuple[Array, Array]:
+        """Return m̂ of the shared part of a submap, and L⁻¹, where L Lᵀ = P."""
+        found = self._kept.get(index)
+        if found is None:
+            submap, rows = self._load(index), self._rows[index]
+            P = regularised(submap.covariance[rows[:, None], rows])
+            root = solved(np.linalg.cholesky(P).astype(np.float64), np.eye(len(P)))
+            found = submap.mean[rows], root
+            if self._count <= MOST_KEPT:
+                self._kept[index] = found
+        return found
 
     def _error(self, k: int, mean: Array) -> FactorError:
         """Return the error of the shared part of a submap, and its Jacobian."""
@@ -166,14 +219,9 @@ class JoinedMap:
         frames = np.arange(3 * max(index - 1, 0), 3 * index + 3)
         return np.concatenate([frames, 3 * self._count + pairs(self._shared[index])])
 
-    def _shared_rows(self, submap: Submap) -> IntArray:
-        """Return the rows of pose and shared landmarks in the state of a submap."""
-        shared = np.flatnonzero(self._place[submap.slots] >= 0)
-        return np.concatenate([np.arange(3), 3 + pairs(shared)])
-
     def _private_landmarks(self, index: int, wanted: IntArray) -> PrivateLandmarks:
         submap = self._load(index)
-        rows = self._shared_rows(submap)
+        rows = self._rows[index]
         error = self._error(index, submap.mean[rows])
         start = self.frames[index]
         return private_landmarks(submap, rows, wanted, start, error, self._error_frame)
@@ -354,6 +402,14 @@ def align(start: Array, covariance: Array, seen: Array, landmarks: Array) -> Arr
         right = prior @ (start - pose) + weight * rows.T @ error.view(np.float64)
         pose = pose + np.linalg.solve(H, right)
     return pose
+
+
+class Owned(NamedTuple):
+    """Landmarks of a single submap in a part of the map."""
+
+    where: IntArray  # (2n,) their entries in the state
+    unknowns: IntArray  # (u,) of the submap
+    private: PrivateLandmarks
 
 
 class PrivateLandmarks(NamedTuple):
