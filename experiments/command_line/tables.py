@@ -56,7 +56,7 @@ def landmark_table(summary: dict[str, Any]) -> Table:
     table = _table(headings, title=title, caption=caption)
     for row in shown:
         cells = [str(row["id"]), _number(row["x"], 4), _number(row["y"], 4)]
-        distances = [_number(row["euclidean"], 7), _number(row["mahalanobis"], 5)]
+        distances = [significant(row[k], 4) for k in ("euclidean", "mahalanobis")]
         table.add_row(*cells, *(distances if known else []))
     return table
 
@@ -183,9 +183,9 @@ def _number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def significant(value: float | None) -> str:
-    """Write three significant digits; a dash where unknown."""
-    return "-" if value is None else f"{value:.3g}"
+def significant(value: float | None, digits: int = 3) -> str:
+    """Write some significant digits; a dash where unknown."""
+    return "-" if value is None else f"{value:.{digits}g}"
 
 
 def comparison_table(columns: Mapping[str, Mapping[str, Any]]) -> Table:

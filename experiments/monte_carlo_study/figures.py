@@ -381,8 +381,8 @@ _DASHES: tuple[Any, ...] = (
 )
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 _MOST_POINTS = 400
-_LETTERS = 11  # per inch, in a row of a legend
-_KEY = 6  # width of a key in letters
+_LETTERS = 13  # per inch, in a row of a legend
+_KEY = 7  # width of a key in letters
 _ROW = 0.19  # height of a row of a legend [inch]
 
 
@@ -440,7 +440,8 @@ def log_ticks(axes: Axes, which: str) -> None:
     axis = getattr(axes, f"{which}axis")
     low, high = axis.get_view_interval()
     decades = math.log10(high / low)
-    subs = (1,) if decades > 4 else (1, 3) if decades > 2 else (1, 2, 5)
+    each = (4, (1,)), (2, (1, 3)), (1, (1, 2, 5))
+    subs = next((subs for more, subs in each if decades > more), (1, 2, 3, 5, 7))
     axis.set_major_locator(LogLocator(subs=subs, numticks=12))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
@@ -449,9 +450,9 @@ def log_ticks(axes: Axes, which: str) -> None:
 def legend_above(figure: Figure, axes: Axes) -> None:
     """Put the legend above the axes in as many columns as fit; the figure grows."""
     handles, labels = axes.get_legend_handles_labels()
-    longest = max((len(label) for label in labels), default=0) + _KEY
     letters = int(_LETTERS * figure.get_figwidth())
-    columns = max(1, min(len(labels), letters // longest))
+    fitting = (n for n in range(len(labels), 1, -1) if _width(labels, n) <= letters)
+    columns = next(fitting, 1)
     rows = math.ceil(len(labels) / columns)
     figure.set_figheight(figure.get_figheight() + _ROW * rows)
     figure.legend(
@@ -460,13 +461,19 @@ def legend_above(figure: Figure, axes: Axes) -> None:
         loc="outside upper left",
         ncols=columns,
         frameon=False,
-        fontsize=9.5,
+        fontsize=9,
         labelcolor=INK,
         borderaxespad=0.4,
         borderpad=0.0,
-        handlelength=2.4,
-        columnspacing=1.4,
+        handlelength=1.8,
+        columnspacing=1.2,
     )
+
+
+def _width(labels: list[str], columns: int) -> int:
+    """Return the width of a legend whose columns are filled one by one, in letters."""
+    filled = np.array_split([len(label) + _KEY for label in labels], columns)
+    return int(sum(column.max() for column in filled))
 
 
 _MOST_BLOCKS = 60

@@ -746,6 +746,20 @@ def test_a_figure_of_one_panel_is_drawn_on_given_axes(name):
     assert labels == alone.get_legend_handles_labels()[1]
 
 
+def test_a_narrow_figure_keeps_its_room_for_the_axes_and_labels_them():
+    results = typical().sel(estimator=["ekf", "invariant"])
+    figure = nees_figure(results)
+    (box,) = figure.legends
+    figure.draw_without_rendering()
+    extent = box.get_window_extent()
+    assert extent.width <= figure.bbox.width
+    assert extent.height < 0.16 * figure.bbox.height  # two rows, not four
+    labels = [text.get_text() for text in figure.axes[0].get_yticklabels()]
+    low, high = figure.axes[0].get_ylim()
+    inside = [text for text in labels if text and low <= float(text) <= high]
+    assert len(inside) >= 4
+
+
 def test_no_line_is_empty_for_which_the_layout_would_make_room():
     (axes,) = nees_figure(typical().sel(estimator=["invariant"])).axes
     assert all(len(line.get_xdata()) for line in axes.lines)

@@ -1,6 +1,7 @@
 """The page of a run in Chromium: played, scrubbed, pointed at, touched."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -43,6 +44,27 @@ def page(browser, file):
     yield browser
     assert browser.messages == []
     assert browser.requests == []
+
+
+def test_a_page_of_one_filter_shows_no_empty_chart_and_the_charts_beside_the_map(
+    browser, tmp_path
+):
+    world = load_scenario("loop")
+    log = recorded(world, 0, steps=STEPS)
+    without = {"landmark_ids": (), "landmarks": np.empty((0, 2))}
+    blind = replace(log, **without, ground_truth=np.empty((0, 4)))
+    frames = RunFrames(blind)
+    noise = {"motion_std": world.motion.std, "measurement_std": world.sensor.std}
+    slam = make_estimator("ekf", **noise, initial_pose=log.start)
+    trace = replay(blind, slam, name="ekf", watch=frames.watch).trace
+    write_run_page(tmp_path / "run.html", blind, [ViewedRun(trace, frames)])
+    browser.open(tmp_path / "run.html")
+    titles = "[...document.querySelectorAll('#charts h2')].map(h => h.textContent)"
+    assert browser.evaluate(titles) == ["NIS by degree of freedom"]
+    left, top, width, height = browser.box("#maps canvas")
+    beside, middle, *_ = browser.box("#charts canvas")
+    assert beside > left + width
+    assert top < middle < top + height
 
 
 def step_of(page):

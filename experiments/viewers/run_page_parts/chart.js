@@ -96,9 +96,6 @@ class Chart {
     }
     context.textAlign = "right";
     context.fillText(run.facts.unit, width - MARGIN.right, height - 7);
-    if (!this.isEmpty) return;
-    context.textAlign = "center";
-    context.fillText("unknown at every step", width / 2, height / 2);
   }
 
   drawSeries(filter) {

@@ -102,18 +102,22 @@ class MapView {
     const digits = Math.max(0, -Math.floor(Math.log10(gap)));
     const first = (middle, size) => Math.ceil((middle - size / 2 / scale) / gap);
     const last = (middle, size) => Math.floor((middle + size / 2 / scale) / gap);
-    context.textAlign = "center";
+    const across = [];
+    const up = [];
     for (let i = first(centre.x, width); i <= last(centre.x, width); i++) {
       const x = Math.round(this.px(i * gap)) + 0.5;
       shapes.line(context, x, 0, x, height);
-      if (x > 34 && x < width - 40) context.fillText((i * gap).toFixed(digits), x, height - 5);
+      if (x > 34 && x < width - 40) across.push([(i * gap).toFixed(digits), x, height - 5]);
     }
-    context.textAlign = "left";
     for (let i = first(centre.y, height); i <= last(centre.y, height); i++) {
       const y = Math.round(this.py(i * gap)) + 0.5;
       shapes.line(context, 0, y, width, y);
-      if (y < height - 22 && y > 14) context.fillText((i * gap).toFixed(digits), 5, y - 3);
+      if (y < height - 22 && y > 14) up.push([(i * gap).toFixed(digits), 5, y - 3]);
     }
+    context.textAlign = "center"; // after all lines, which would hide a minus
+    for (const each of across) this.label(...each);
+    context.textAlign = "left";
+    for (const each of up) this.label(...each);
     context.textAlign = "right";
     context.fillText("m", width - 6, height - 5);
   }

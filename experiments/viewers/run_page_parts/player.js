@@ -44,6 +44,7 @@ class Player {
   makeMaps() {
     get("maps").replaceChildren();
     const count = this.shown.length;
+    get("viewer").classList.toggle("single", count === 1);
     this.views = this.shown.map((filter) => {
       const figure = make("figure", get("maps"));
       if (this.run.filters.length > 1) {
@@ -54,7 +55,8 @@ class Player {
       const canvas = make("canvas", figure);
       canvas.setAttribute("role", "img");
       canvas.setAttribute("aria-label", `Map of ${filter.name}; its values stand in the table below`);
-      canvas.style.aspectRatio = String(count === 1 ? Math.max(this.camera.aspect, window.innerWidth < 640 ? 0.9 : 1.7) : this.camera.aspect);
+      const least = window.innerWidth < 640 ? 0.9 : window.innerWidth < 1024 ? 1.7 : 1.2; // charts stand beside it if wide
+      canvas.style.aspectRatio = String(count === 1 ? Math.max(this.camera.aspect, least) : this.camera.aspect);
       canvas.style.maxHeight = count > 2 ? "20rem" : "min(62vh, 38rem)";
       const view = new MapView(this.run, filter, this.camera, canvas);
       this.handleMap(view);
@@ -70,16 +72,18 @@ class Player {
       ["nees", "NEES / 3", "NEES of the pose / 3", () => () => constant],
       ["nis", "NIS / degree", "NIS by degree of freedom", (filter) => (k) => [filter.array("nis_low")[k], filter.array("nis_high")[k]]],
     ];
-    this.charts = specs.map(([key, name, title, band]) => {
+    const charts = specs.map(([key, name, title, band]) => {
       const figure = make("figure", get("charts"));
       make("h2", figure, title);
       const canvas = make("canvas", figure);
       canvas.setAttribute("role", "img");
       canvas.setAttribute("aria-label", `${title} over the steps`);
       const chart = new Chart(run, canvas, key, name, band);
-      this.handleChart(chart);
+      if (chart.isEmpty) figure.remove(); // such as the NEES without truth
+      else this.handleChart(chart);
       return chart;
     });
+    this.charts = charts.filter((chart) => !chart.isEmpty);
   }
 
   makeLegend() {
