@@ -240,14 +240,17 @@ def test_a_tentative_landmark_is_followed_while_the_robot_drives_and_turns():
     np.testing.assert_allclose(slam.belief().landmarks, [(3, 4)], atol=1e-6)
 
 
-def test_a_tentative_landmark_stays_as_it_is_while_a_robot_without_noise_rests():
-    slam = make(management={}, noise_at_rest=False)
+@pytest.mark.parametrize(("options", "stays"), [({"noise_at_rest": False}, 1), ({}, 0)])
+def test_a_tentative_landmark_stays_as_it_is_where_a_resting_robot_has_no_noise(
+    options, stays
+):
+    slam = make(management={}, **options)
     slam.update(polar([(3, 4)]))
     before = slam.state_dict()
     slam.predict((0.0, 0.0))
     after = slam.state_dict()
     key = "0.tentative.covariance"
-    np.testing.assert_array_equal(before[key], after[key])
+    assert np.array_equal(before[key], after[key]) == stays
     slam.predict((0.1, 0.0))
     assert (np.linalg.det(slam.state_dict()[key]) > np.linalg.det(before[key])).all()
 
