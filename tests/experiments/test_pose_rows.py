@@ -14,7 +14,6 @@ from slamgym.experiments.logs.slamlog import (
     read_slamlog,
     write_slamlog,
 )
-from slamgym.experiments.monte_carlo_study import filtered_runs
 from slamgym.experiments.run_and_replay.filter_settings import settings_for
 from slamgym.experiments.run_and_replay.log_replay import replay
 from slamgym.experiments.run_and_replay.log_smoothing import smooth_log
@@ -117,19 +116,6 @@ def test_a_filter_that_takes_no_such_readings_says_so(log):
     settings = settings_for(log, estimator="submaps")
     with pytest.raises(ValueError, match="does not accept readings of the pose"):
         replay(log, settings.make(log.start))
-
-
-@pytest.mark.parametrize("estimator", ["ekf", "invariant"])
-def test_a_batch_equals_runs_one_by_one(scenario, log, estimator, monkeypatch):
-    runs = simulate_runs(scenario, 3, seed=1)
-    settings = settings_for(log, estimator=estimator)
-    together = filtered_runs.filter_runs(settings, runs)
-    monkeypatch.setattr(filtered_runs, "can_batch", lambda _: False)
-    alone = filtered_runs.filter_runs(settings, runs)
-    for one, other in zip(together.trace, alone.trace, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11)
-    dof = together.trace.degrees_of_freedom
-    assert (dof[:, 4] % 2 == 1).all()  # compass, and GPS: 3 components
 
 
 def test_the_same_noise_in_worlds_of_runs_and_in_logs(scenario, log):

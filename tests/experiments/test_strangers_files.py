@@ -136,10 +136,11 @@ def test_velocities_hold_until_the_next_row_and_are_split_at_readings(folder):
 
 
 def test_increments_with_a_part_to_the_left_turn_drive_and_turn(folder):
-    log = own(folder, odometry="t,dx,dy,dtheta\n1,-1,1,0.5\n3,0,0,0\n")
+    log = own(folder, odometry="t,dx,dy,dtheta\n1,-1,2,0.5\n3,0,0,0\n")
     turn, drive = [e for e in log.events if isinstance(e, OdometryRow)][:2]
     assert (turn.d, turn.dt, drive.dt) == (0, 0, 2)  # the first lasts as the second
-    assert drive.d == pytest.approx(-math.sqrt(2))
+    assert turn.alpha == pytest.approx(math.atan2(-2, 1))
+    assert drive.d == pytest.approx(-math.sqrt(5))
     assert turn.alpha + drive.alpha == pytest.approx(0.5)
 
 
