@@ -608,6 +608,7 @@ def test_curves_are_averages_over_runs():
 def test_the_legend_counts_the_steps_that_are_tested():
     dataset = typical(steps=4)
     axes = figure_of(dataset, "nees").axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("step", "ANEES / 3")
     line = line_of(axes, "95 % band, 4 steps")
     assert line.get_ydata()[0] == pytest.approx(family_band(40, 3, 4).low / 3)
     page = html_report(dataset, summarise_monte_carlo(dataset))
