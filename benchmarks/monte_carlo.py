@@ -4,16 +4,20 @@
     python benchmarks/monte_carlo.py --parts [--earlier FOLDER]    # a former checkout
 
 ``--parts`` compares bound and measures with the two filters of a study, in CPU time.
+A second table shows time and memory of whole studies and of log files at growing sizes,
+with exponents of the growth.
 
 One core, one process, interleaved rounds; ratios are medians over the rounds. The world
 has 20 landmarks around a circle, about half of them in view, and 1000 steps.
 """
 
 import argparse
+import math
 import os
 import tempfile
 import tracemalloc
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from statistics import median
@@ -178,6 +182,109 @@ def parts_of(package: str, name: str, runs: int) -> dict[str, Callable[[], objec
     }
 
 
+def peak_of(package: str, runs: int) -> float:
+    """Measure the peak memory of a study in a folder, with its summary [MB].
+
+    The memory is that of Python and numpy, without libraries and kernels.
+    """
+    study = import_module(f"{package}.experiments.monte_carlo_study")
+    loop = import_module(f"{package}.sim_configs").load_scenario("loop")
+    world = loop.with_changes(steps=200)
+    study.monte_carlo(world, list(FILTERS), 1)  # compiles
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "out"
+        tracemalloc.start()
+        with study.monte_carlo(world, list(FILTERS), runs, out=out) as results:
+            study.summarise_monte_carlo(results)
+        peak = tracemalloc.get_traced_memory()[1] / 1e6
+        tracemalloc.stop()
+    return peak
+
+
+def study_of(package: str, runs: int) -> Callable[[], object]:
+    """Return a study of two filters in memory."""
+    study = import_module(f"{package}.experiments.monte_carlo_study")
+    return lambda: study.monte_carlo("six_landmarks", list(FILTERS), runs)
+
+
+def files_of(
+    package: str, episodes: int, *, form: str, what: str, folder: Path
+) -> Callable[[], object]:
+    """Return the writing or the reading of some episodes of 1,005 steps."""
+    module = import_module(f"{package}.experiments.trajectories.driven_episodes")
+    formats = import_module(f"{package}.experiments.trajectories.formats")
+    world = import_module(f"{package}.sim_configs").load_scenario("loop")
+    some = module.drive_episodes(world, "waypoints", range(episodes))
+    chosen, path = formats.trajectory_format(form), Path(tempfile.mkdtemp(dir=folder))
+    chosen.write(some, path / "shard")
+
+    def write() -> None:
+        chosen.write(some, Path(tempfile.mkdtemp(dir=folder)) / "shard")
+
+    return write if what == "write" else lambda: list(chosen.read(path / "shard"))
+
+
+Costs = dict[str, list[float]]  # before and now, at the sizes
+
+
+def costs_of(
+    make: Callable[[str, int], Callable[[], object]],
+    packages: dict[str, str],
+    sizes: tuple[int, int],
+) -> Costs:
+    """Return the CPU seconds of something at two sizes, before and now."""
+    cases = {f"{w} {n}": make(p, n) for w, p in packages.items() for n in sizes}
+    times = time_interleaved(cases, rounds=3)
+    return {w: [median(times[f"{w} {n}"]) for n in sizes] for w in packages}
+
+
+def growth_row(
+    title: str, sizes: tuple[int, int], costs: Costs, most: float, limit: str
+) -> list[str]:
+    """Write the costs at the larger size with the exponents of their growth."""
+
+    def written(cost: list[float]) -> str:
+        power = math.log(cost[1] / cost[0]) / math.log(sizes[1] / sizes[0])
+        return f"{cost[1]:.3g}, n^{power:.2f}"
+
+    before, now = costs.get("before"), costs["now"]
+    found = [title, str(sizes), written(before) if before else "", written(now)]
+    return [*found, f"<= {most:g}", verdict(now[1], most, at_least=False), limit]
+
+
+def compare_growth(packages: dict[str, str], folder: Path) -> None:
+    """Print time and memory at two sizes, before and now, with goals and limits."""
+    table = Table(title="At the larger size, and how the cost grows with the size n")
+    for column in ("what", "sizes", "before", "now", "goal", "", "limit"):
+        table.add_column(column)
+    some = np.random.default_rng(0).standard_normal(10_000).tolist()
+    text = 1e2 * median(time_interleaved({"": lambda: [*map(repr, some)]})[""])
+    runs, episodes = (64, 256), (2, 8)
+    peaks = {when: [peak_of(p, n) for n in runs] for when, p in packages.items()}
+    limit = "a block of 64 runs"
+    table.add_row(*growth_row("loop, 200 steps [MB]", runs, peaks, 40, limit))
+    costs = costs_of(study_of, packages, runs)
+    goal = 8 * runs[1] / 10_000  # 8 s for 10,000 runs
+    table.add_row(*growth_row("six_landmarks, seconds", runs, costs, goal, ""))
+    for form, numbers in (("slamlog", 14), ("g2o", 25)):
+        for what, limit in (
+            ("write", f"{numbers * text:.1f}: {numbers} × repr"),
+            ("read", ""),
+        ):
+            make = partial(files_of, form=form, what=what, folder=folder)
+            seconds = costs_of(make, packages, episodes)
+            steps = load_scenario("loop").steps
+            costs = {
+                when: [
+                    1e6 * s / n / steps for s, n in zip(found, episodes, strict=True)
+                ]
+                for when, found in seconds.items()
+            }
+            title = f"{form}, {what} [µs / step]"
+            table.add_row(*growth_row(title, episodes, costs, 10, limit))
+    Console(width=110).print(table)
+
+
 def compare_parts(earlier: Path | None) -> None:
     """Print the time of each part of a study, before and now, and the goals."""
     packages = {"now": "slamgym"}
@@ -212,6 +319,8 @@ def compare_parts(earlier: Path | None) -> None:
             end_section=True,
         )
     Console(width=100).print(table)
+    with tempfile.TemporaryDirectory() as folder:
+        compare_growth(packages, Path(folder))
 
 
 def main() -> None:
