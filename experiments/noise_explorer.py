@@ -174,7 +174,7 @@ class _Exploration(NamedTuple):
             self.scenario, self.estimators, self.runs, self.seed, progress=False
         )
         scores = scores_of(results, self.choices[0].label, "invariant")
-        order = scores.ratios("invariant").mean(axis=1).argsort()
+        order = scores.ratios("invariant").argsort()
         good = np.flatnonzero(scores.good)
         run = int(good[order[len(order) // 2]]) if len(good) else 0
         study = self._replace(typical=self.seed + run)
@@ -222,8 +222,8 @@ class _Exploration(NamedTuple):
     def _drawn(self, scores: EstimatorScores, trace: RunTrace) -> dict[str, Any]:
         """Return the curve of the NEES, and path and ellipses of the typical run."""
         points, poses, ovals, marks = self._counts()
-        average = scores.ratios("invariant").mean(axis=0) if scores.good.any() else []
-        curve = np.log10(np.clip(_thinned(np.asarray(average), points), 1e-6, 1e9))
+        average = scores.anees("invariant") if scores.good.any() else np.zeros(0)
+        curve = np.log10(np.clip(_thinned(average, points), 1e-6, 1e9))
         rows = _evenly(len(trace.poses), ovals)
         frame, last = self.frame, trace.map_at(trace.last_step)
         kept = _evenly(len(last.ids), marks)
