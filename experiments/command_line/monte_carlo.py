@@ -154,8 +154,8 @@ def monte_carlo(scenario: options.ScenarioName, *, given: MonteCarloOptions) -> 
             write_html_report(results, summary, partial)
         with replace_own(place / SUMMARY) as partial:
             partial.write_text(as_json_text(summary), encoding="utf-8")
-    share = results.attrs.get(SMALL_NOISE_SHARE, 0.0)
-    more = f"Runs with less noise, which show causes, took {share:.0%} of the time."
+    share = 100 * results.attrs.get(SMALL_NOISE_SHARE, 0.0)
+    more = f"Runs with less noise, which show causes, took {share:.0f} % of the time."
     return show_study(reporter, summary, place, *[more] * bool(share))
 
 

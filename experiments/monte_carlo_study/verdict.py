@@ -479,8 +479,8 @@ def _suspicions(entry: Mapping[str, Any]) -> Iterator[str]:
         yield "its reports list no reading that corrected the belief: it has no NIS."
     elif unused > MOST_REJECTED and not is_managed:
         yield (
-            f"{unused:.0%} of the readings corrected nothing, rejected by a gate or "
-            "too near: the filter may diverge."
+            f"{100 * unused:.0f} % of the readings corrected nothing, rejected by a "
+            "gate or too near: the filter may diverge."
         )
     if nis is not None and not NIS_RANGE[0] <= nis <= NIS_RANGE[1]:
         associates = is_managed or bool(entry.get("association"))
@@ -601,7 +601,8 @@ def _common_cause(maps: MapReport, alone: Array, whole: str) -> str:
     if sizes.min() > BIAS_MARGIN and share > _MOSTLY:
         return (
             f"offset: the landmarks are off by {_range(sizes)} deviations on average, "
-            f"which makes {share:.0%} of their squared errors (median landmark)."
+            f"which makes {100 * share:.0f} % of their squared errors (median "
+            "landmark)."
         )
     if alone.max() <= _ALIKE * alone.min() and not low < np.median(alone) < high:
         size = "large" if np.median(alone) < 1 else "small"

@@ -675,7 +675,7 @@ def test_no_two_of_many_estimators_look_alike():
 def test_warnings_name_unused_readings_and_innovations_of_another_size():
     entry = {"good_runs": 40, "failure_groups": [], "unused_readings": 0.12, "nis": 3.0}
     first, second = run_warnings({"ekf": entry}, 40)
-    assert first.startswith("ekf: 12% of the readings corrected nothing")
+    assert first.startswith("ekf: 12 % of the readings corrected nothing")
     assert "NIS is 3 per degree of freedom" in second
     assert "assumes too little noise" in second
     noted = {"diagnosis": {"cause": "heavy tails", "sentence": "heavy tails: …"}}
