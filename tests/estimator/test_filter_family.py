@@ -11,7 +11,13 @@ from dense_family import tell_truth as tell
 from drives import MEASUREMENT_STD, MOTION_STD, NOISE, SIX, drive
 from far_origins import far_origins, rounding, shifted
 
-from slamgym.estimator import EkfSlam, list_estimators, make_batch, make_estimator
+from slamgym.estimator import (
+    EkfSlam,
+    list_estimators,
+    make_batch,
+    make_estimator,
+    register_estimator,
+)
 from slamgym.estimator.smoother.recorded_slam import RecordedSlam
 
 IDS = list(range(6))
@@ -296,6 +302,16 @@ def test_near_its_predictions_the_invariant_filter_linearises_once():
             each.predict(odometry)
             each.update(readings, IDS)
     np.testing.assert_array_equal(once.belief().mean, free.belief().mean)
+
+
+@pytest.mark.usefixtures("own_registry")
+def test_an_error_of_a_constructor_is_its_own():
+    def broken(**options):
+        raise TypeError("one of its own")
+
+    register_estimator("broken", broken)
+    with pytest.raises(TypeError, match=r"^one of its own$"):
+        make("broken")
 
 
 def test_options_in_brackets_count_before_keywords():
