@@ -28,7 +28,6 @@ from ..kernels.assignment_search import (
     largest_change,
 )
 from ..models.bearing_range import (
-    locate_landmark,
     reading_slopes_jit,
     reading_variances_jit,
     wrap_angle_jit,
@@ -136,7 +135,7 @@ def assign_jointly(
     (new_gate, pair_gate, ceiling), (pairs_first, most, nodes) = gates, search
     noise, rows = Noise(*of_sensor), len(readings)
     squared = np.full((rows, landmarks), np.inf)
-    _compare(mean, P, readings, of_sensor, new_gate, (squared, squared.copy()))
+    fill_distances(mean, P, readings, of_sensor, new_gate, (squared, squared.copy()))
     is_near = [np.isfinite(squared[:, j]).any() for j in range(landmarks)]
     explained = np.flatnonzero(np.array(is_near))
     near = len(explained)
@@ -305,18 +304,36 @@ class Noise(NamedTuple):
 
 def with_readings(view: MapView, readings: Array, noise: Noise) -> MapView:
     """Return a map, without room behind it, with a new landmark for each reading."""
-    places, to_pose, to_reading = locate_landmark(view.mean[:3], readings)
-    n, m, variances = len(view.mean), len(readings), noise.variances(readings[:, 1])
-    spread, J = to_reading * variances[:, None] @ to_reading.mT, to_pose.reshape(-1, 3)
-    P = np.empty((n + 2 * m, n + 2 * m))
-    P[:n, :n] = view.covariance
-    P[n:, :n] = J @ view.covariance[:3]
-    P[:n, n:] = P[n:, :n].T
-    own = P[n:, :3] @ J.T
-    own.reshape(m, 2, m, 2)[range(m), :, range(m)] += spread
-    P[n:, n:] = (own + own.T) / 2
-    mean = np.append(view.mean, places)
-    return MapView(mean, P, range(len(view.ids) + m))
+    mean, P = map(np.ascontiguousarray, view[:2])
+    more = extended(mean, P, np.ascontiguousarray(readings), tuple(noise))
+    return MapView(*more, range(len(view.ids) + len(readings)))
+
+
+@jit
+def extended(
+    mean: Array, P: Array, readings: Array, of_sensor: tuple[float, ...]
+) -> tuple[Array, Array]:
+    """Return mean and covariance of a map with a new landmark for each reading."""
+    noise, n, size = Noise(*of_sensor), len(mean), len(mean) + 2 * len(readings)
+    places, C, turned = np.empty(size), np.empty((size, size)), np.empty(size)
+    places[:n], C[:n, :n] = mean, P
+    for i in range(len(readings)):
+        direction, distance = mean[2] + readings[i, 0], readings[i, 1]
+        cos, sin, a = np.cos(direction), np.sin(direction), n + 2 * i
+        places[a], places[a + 1] = mean[0] + distance * cos, mean[1] + distance * sin
+        turned[a], turned[a + 1] = -distance * sin, distance * cos
+        for k in range(2):  # J P, then J (J P)ᵀ
+            C[a + k, :n] = C[:n, a + k] = P[k] + turned[a + k] * P[2]
+        for b in range(n, a + 2):
+            for k in range(2):
+                own = C[b, k] + C[b, 2] * turned[a + k]
+                C[a + k, b] = C[b, a + k] = own
+        q = reading_variances_jit(noise, distance)
+        C[a, a] += turned[a] * turned[a] * q[0] + cos * cos * q[1]
+        C[a + 1, a + 1] += turned[a + 1] * turned[a + 1] * q[0] + sin * sin * q[1]
+        C[a + 1, a] += turned[a] * turned[a + 1] * q[0] + cos * sin * q[1]
+        C[a, a + 1] = C[a + 1, a]
+    return places, C
 
 
 class AssociationSensor(NamedTuple):
@@ -415,12 +432,12 @@ def innovation_distances(
     """
     shape = (len(readings), len(view.ids))
     fit = Distances(np.full(shape, np.inf), np.full(shape, np.inf))
-    _compare(*view[:2], readings, tuple(noise), largest, tuple(fit))
+    fill_distances(*view[:2], readings, tuple(noise), largest, tuple(fit))
     return fit
 
 
 @jit_in_place
-def _compare(
+def fill_distances(
     mean: Array,
     covariance: Array,
     readings: Array,
@@ -428,6 +445,7 @@ def _compare(
     largest: float,
     fit: tuple[Array, ...],
 ) -> None:
+    """Fill the fields of :class:`Distances`, infinite before."""
     noise, (squared, unlikelihood) = Noise(*of_sensor), fit
     P, x, y, heading = covariance, mean[0], mean[1], mean[2]
     for j in range(squared.shape[1]):

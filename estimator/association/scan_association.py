@@ -24,7 +24,6 @@ from .scan_assignments import (
     AssociationSensor,
     Noise,
     assign_scan,
-    innovation_distances,
 )
 from .tentative_landmarks import (
     RINGS,
@@ -32,13 +31,10 @@ from .tentative_landmarks import (
     TENTATIVE,
     TentativeLandmarks,
     UnexplainedDensity,
+    add_tentative,
 )
 
 NO_LABEL = -1
-
-#: ln of the odds beyond which a tentative landmark may enter the map: 20 to 1, a
-#: probability of 95 %.  `benchmarks/association.py` lists the size of the maps.
-ENTRY_ODDS = 3.0
 
 #: A label is the scan of the first sighting, shifted by these bits, plus its row: a
 #: scan has up to a million rows.
@@ -154,7 +150,7 @@ class ScanAssociation:
             tentative = tentative.with_sightings(*sightings)
         chance = self._detections.chance_to_miss(view, self._density.longest)
         tentative = tentative.with_misses(chance)
-        enough = (tentative.sightings >= needed) & (tentative.odds > ENTRY_ODDS)
+        enough = tentative.proven(needed)
         # Rows of no tentative landmark take the last entry.
         entries = np.maximum(slots, -1)
         labels = np.append(tentative.labels, NO_LABEL)[entries]
@@ -240,6 +236,7 @@ class Candidates(NamedTuple):
         ):
             if not np.all(is_so):
                 raise ValueError(f"state['tentative.{name}'] must be {wanted}")
+        saved["seen"] = saved["seen"].astype(np.int64)
         tentative = TentativeLandmarks(**{key: saved[key] for key in TENTATIVE})
         counts = int(saved["next_id"]), int(saved["scan"])
         new = UnexplainedDensity(*density.tolist())._replace(cells=saved["unexplained"])
@@ -309,18 +306,12 @@ def associate(
 def _unexplained_density(
     policy: AssociationPolicy, candidates: Candidates, readings: Array, noise: Noise
 ) -> Array:
-    """Return the density of readings from no landmark of the map, at each reading.
-
-    A tentative landmark of one sighting is a landmark with the probability that the
-    scans so far suggest; one of more sightings surely is.
-    """
+    """Return the density of readings from no landmark of the map, at each reading."""
     density = candidates.density.at(readings, policy.density)
     if policy.association in ("nearest", "compatibility"):  # they use none
         return density
-    tentative = candidates.tentative
-    if not len(tentative.seen):
-        return density
-    fit = innovation_distances(tentative.view(), readings, noise, policy.new_gate)
-    share = np.where(tentative.sightings > 1, 1.0, candidates.density.landmark_share)
-    again = share * np.exp(-fit.unlikelihood / 2) / (2 * np.pi)
-    return np.asarray(density + again.max(axis=1))
+    mean, P, seen = candidates.tentative[:3]
+    if len(seen):
+        share, gate = candidates.density.landmark_share, float(policy.new_gate)
+        add_tentative((mean, P, seen), readings, tuple(noise), gate, share, density)
+    return density

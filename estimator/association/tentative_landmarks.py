@@ -38,9 +38,8 @@ from ...jit import jit, njit_inlined, njit_internal
 from ..guards import saved_states
 from ..interface import MapView
 from ..models.bearing_range import predict_measurement, wrap_angle
-from ..models.relative_geometry import lever_of
 from ..models.rigid_motion import as_covariance, predict, rotation
-from .scan_assignments import Noise, with_readings
+from .scan_assignments import Noise, extended, fill_distances
 
 # What no formula gives is chosen.  `benchmarks/association.py` counts bad runs and
 # landmarks that are mapped twice, and lists the size of the maps.
@@ -65,6 +64,10 @@ ROUNDING = 1e-12
 
 #: Least prior probability of being a landmark: the robot may enter a new region.
 LEAST_SHARE = 0.01
+
+#: ln of the odds beyond which a tentative landmark may enter the map: 20 to 1, a
+#: probability of 95 %.  `benchmarks/association.py` lists the size of the maps.
+ENTRY_ODDS = 3.0
 
 
 class TentativeLandmarks(NamedTuple):
@@ -120,6 +123,10 @@ class TentativeLandmarks(NamedTuple):
         missed = self.seen & 1 == 0
         return self._replace(odds=self.odds + np.where(missed, np.log(chance), 0.0))
 
+    def proven(self, needed: int) -> BoolArray:
+        """Return which are in enough scans and unlikely to be clutter, shape (t,)."""
+        return (self.sightings >= needed) & (self.odds > ENTRY_ODDS)
+
     def with_sightings(
         self, slots: IntArray, readings: Array, noise: Noise, density: Array
     ) -> "TentativeLandmarks":
@@ -163,25 +170,13 @@ class TentativeLandmarks(NamedTuple):
         odds = np.full(len(readings), np.log(share / (1 - share)))
         new = np.ones(len(readings), np.int64), labels, odds
         rest = map(np.concatenate, zip(self[2:], new, strict=True))
-        map_ = with_readings(self.view(), readings, noise)
-        return TentativeLandmarks(map_.mean, map_.covariance, *rest)
+        return TentativeLandmarks(*extended(*self[:2], readings, tuple(noise)), *rest)
 
     def after_scan(self, scans: int) -> "TentativeLandmarks":
         """Return those seen in the last ``scans`` − 1 scans, in a recent frame."""
-        seen = (self.seen << 1) & ((1 << scans) - 1)
-        left = self._replace(seen=seen).chosen(seen > 0)
-        if not len(left.seen):
+        if not len(self.seen):  # the frame begins anew
             return TentativeLandmarks()
-        places, P, back = left.places, left.covariance, rotation(-left.mean[2])
-        if P[2, 2] <= STRAIGHT**2:
-            return left
-        lever = -lever_of(places).reshape(-1, 1)
-        by_pose = np.hstack([np.tile(-back, (len(places), 1)), lever])
-        for _ in range(2):  # T P, then T (T P)ᵀ
-            own = back @ P[3:].reshape(-1, 2, P.shape[1])
-            P = (by_pose @ P[:3] + own.reshape(-1, P.shape[1])).T
-        mean, P = np.append(np.zeros(3), places), np.pad(as_covariance(P), (3, 0))
-        return left._replace(mean=mean, covariance=P)
+        return TentativeLandmarks(*_after_scan(*self, scans))
 
     def chosen(self, which: BoolArray) -> "TentativeLandmarks":
         """Return some of them."""
@@ -190,6 +185,81 @@ class TentativeLandmarks(NamedTuple):
         map_ = self.view().part(np.flatnonzero(which).tolist())
         rest = self.seen[which], self.labels[which], self.odds[which]
         return TentativeLandmarks(map_.mean, map_.covariance, *rest)
+
+
+@jit
+def _after_scan(
+    mean: Array, P: Array, seen: IntArray, labels: IntArray, odds: Array, scans: int
+) -> tuple[Array, Array, IntArray, IntArray, Array]:
+    """Return the parts of `TentativeLandmarks.after_scan`."""
+    shifted = (seen << 1) & ((1 << scans) - 1)
+    kept = np.flatnonzero(shifted)
+    n, rest = len(kept), (shifted[kept], labels[kept], odds[kept])
+    if n == 0:
+        return np.zeros(3), np.zeros((3, 3)), *rest
+    columns = np.arange(3 + 2 * n)
+    columns[3::2], columns[4::2] = 3 + 2 * kept, 4 + 2 * kept
+    mean, P = mean[columns], P[columns][:, columns].copy()
+    if P[2, 2] <= STRAIGHT**2:
+        return mean, P, *rest
+    cos, sin = np.cos(mean[2]), np.sin(mean[2])
+    for j in range(3, 3 + 2 * n, 2):
+        dx, dy = mean[j] - mean[0], mean[j + 1] - mean[1]
+        mean[j], mean[j + 1] = cos * dx + sin * dy, cos * dy - sin * dx
+    mean[:3] = 0.0
+    for _ in range(2):  # T P, then T (T P)ᵀ
+        for j in range(3, 3 + 2 * n, 2):
+            dx, dy = P[j] - P[0], P[j + 1] - P[1]
+            P[j] = cos * dx + sin * dy + mean[j + 1] * P[2]
+            P[j + 1] = cos * dy - sin * dx - mean[j] * P[2]
+        P[:3] = 0.0
+        P = P.T.copy()
+    P = (P + P.T) / 2
+    for k in range(len(P)):
+        P[k, k] = max(P[k, k], 0.0)
+    return mean, P, *rest
+
+
+@jit
+def add_tentative(
+    tentative: tuple[Array, Array, IntArray],
+    readings: Array,
+    of_sensor: tuple[float, ...],
+    gate: float,
+    share: float,
+    density: Array,
+) -> None:
+    """Add the density of the readings of tentative landmarks.
+
+    One of a single sighting is a landmark with the probability ``share``; one of more
+    sightings surely is.
+
+    Parameters
+    ----------
+    tentative : tuple
+        Mean, covariance and ``seen`` of `TentativeLandmarks`.
+    readings : ndarray, shape (m, 2)
+        Rows (β, r) [rad, m].
+    of_sensor : tuple
+        The fields of a :class:`Noise`.
+    gate : float
+        Largest νᵀ S⁻¹ ν of a reading and a landmark that may be its own.
+    share : float
+        Probability that a reading of no landmark of the map is of a landmark.
+    density : ndarray, shape (m,)
+        Of the readings [1 / (rad m)].
+    """
+    mean, P, seen = tentative
+    squared = np.full((len(readings), len(seen)), np.inf)
+    unlikelihood = squared.copy()
+    fill_distances(mean, P, readings, of_sensor, gate, (squared, unlikelihood))
+    for k in range(len(readings)):
+        most = 0.0
+        for j in range(len(seen)):
+            is_again = seen[j] & (seen[j] - 1) != 0
+            chance = 1.0 if is_again else share
+            most = max(most, chance * np.exp(-unlikelihood[k, j] / 2) / (2 * np.pi))
+        density[k] += most
 
 
 class UnexplainedDensity(NamedTuple):

@@ -1,11 +1,10 @@
-"""Take in a clear scan by compiled calls: all of its readings are of the map.
+"""Take in clear scans by compiled calls: none of their readings decides anything.
 
-A scan is clear if its best association gives every reading a landmark, and any other
-leaves the same belief.
+A scan is clear if every other association that a hypothesis would follow leaves nearly
+the same belief and the same tentative landmarks as the best one, which confirms none.
 `associate_clear` associates it, and `count_clear` counts what it has shown and missed,
 as `associate` and the pruner do with any scan.  Every other scan is left to these: one
-with a new or an ambiguous reading, one while landmarks are tentative, or of a robot
-that may be lost.
+that splits a hypothesis or confirms a landmark, or of a robot that may be lost.
 
 `ClearScans` keeps what the kernels count in a block of memory.  The records that all
 other steps use, `Candidates` and `LandmarkRecords`, are renewed from it when needed.
@@ -30,13 +29,21 @@ from ..association.missed_landmarks import (
     evidence_of_misses_jit,
     evidence_of_readings_jit,
 )
-from ..association.scan_assignments import NEW, SAME, AssociationSensor, assign_jointly
-from ..association.scan_association import Candidates
+from ..association.scan_assignments import (
+    AMBIGUOUS,
+    NEW,
+    SAME,
+    AssociationSensor,
+    assign_jointly,
+)
+from ..association.scan_association import LABEL_BITS, NO_LABEL, Candidates
 from ..association.tentative_landmarks import (
     MEMORY,
     RINGS,
     SECTORS,
+    TentativeLandmarks,
     UnexplainedDensity,
+    add_tentative,
     count_readings,
     fill_density,
     longest_jit,
@@ -66,6 +73,21 @@ from .pruning import LandmarkRecords, add_sightings, noise_of_sightings
 SPREAD = 40.0
 
 
+class ClearScan(NamedTuple):
+    """A scan as one hypothesis associates it."""
+
+    #: −2 ln of the likelihood of the associations to consider, the best first, (M,).
+    costs: Array
+    #: Slot of the map of each reading, `NEW` or `AMBIGUOUS`, shape (M, m).
+    slots: IntArray
+    #: Place of the tentative landmark of each reading, or below 0, shape (m,).
+    again: IntArray
+    #: Probability to miss each tentative landmark, shape (t,).
+    chance: Array
+    #: Density of readings of no known landmark at each reading, (m,) [1 / (rad m)].
+    density: Array
+
+
 class ClearScans:
     """The memory of one hypothesis for clear scans.
 
@@ -81,72 +103,155 @@ class ClearScans:
         self, slam: Any, policy: LandmarkPolicy, sensor: AssociationSensor
     ) -> None:
         self._slam, self._settings = slam, settings_of(policy, sensor)
-        self._capacity = policy.capacity or math.inf
-        self._tally: Array | None = None
+        self._filter = filter_inside(slam)
+        self._policy, self._noise = policy, sensor.noise
+        self._tally: Any = None  # an array, where it holds the records
         self._path: list[list[float]] = []
         #: Number of scans taken in since the records were renewed.
         self.ahead = 0
-        #: Number of the last one, and whether the filter has used all its readings.
+        #: Number of the present scan, and whether the filter has used all its readings.
         self.number, self.is_used = 0, True
+        #: The landmark of each of its readings, and the label of its tentative one.
+        self.row_ids: tuple[int | None, ...] = ()
+        self.labels: tuple[int, ...] = ()
+        #: Its rows of tentative landmarks, and those that are ambiguous.
+        self.rows: tuple[tuple[int, ...], tuple[int, ...]] = (), ()
+        self._scan: ClearScan | None = None
+        #: The tentative landmarks, and those after the present scan.
+        self.tentative = self.following = TentativeLandmarks()
 
     @staticmethod
     def serve(slam: SlamEstimator, policy: LandmarkPolicy) -> bool:
         """Return whether this filter and policy do with a scan what the kernel does."""
+        inside: Any = filter_inside(slam)
         return (
-            isinstance(slam, EkfSlam)
-            and type(slam).predict is EkfSlam.predict
-            and type(slam).update is EkfSlam.update
-            and type(slam)._update_map is update_map
-            and type(slam.map) is GaussianMap
-            and slam.sensor == BEARING_RANGE
-            and slam.rules.gate == math.inf
-            and not hides_its_belief(slam)
+            isinstance(inside, EkfSlam)
+            and type(inside).predict is EkfSlam.predict
+            and type(inside).update is EkfSlam.update
+            and type(inside)._update_map is update_map
+            and type(inside.map) is GaussianMap
+            and inside.sensor == BEARING_RANGE
+            and inside.rules.gate == math.inf
+            and not hides_its_belief(inside)
             and policy.association in ("hypotheses", "joint")
             and policy.remove_after is None
             and policy.merge_within is None
         )
 
-    def take(
-        self,
-        candidates: Candidates,
-        records: LandmarkRecords,
-        readings: Array,
-        ids: IntArray,
-        *,
-        given: bool,
-    ) -> bool:
-        """Take in a scan if it is clear; return whether it was.
-
-        Parameters
-        ----------
-        candidates, records
-            As renewed last.
-        readings : ndarray, shape (m, 2)
-            Rows (β, r) [rad, m].
-        ids : ndarray of int64, shape (m,)
-            Their landmarks, which are filled unless given.
-        given : bool
-            Whether the landmarks are given.
-        """
-        gaussian = self._slam.map
+    def load(self, candidates: Candidates, records: LandmarkRecords) -> bool:
+        """Hold the records, as renewed last; return whether scans may be clear."""
         if self._tally is None:
-            mapped = gaussian.parts.ids[: gaussian.parts.numbers[LANDMARKS]].tolist()
-            is_full = len(mapped) > self._capacity
+            parts = self._filter.map.parts
+            mapped = parts.ids[: parts.numbers[LANDMARKS]].tolist()
+            is_full = len(mapped) > (self._policy.capacity or math.inf)
             if is_full or not may_be_clear(candidates, records, mapped):
                 return False
             self._tally = new_tally(candidates, records, self._settings)
-        if given:
-            if not all(map(gaussian.slots.__contains__, ids.tolist())):
+            self.tentative, self._first = candidates.tentative, candidates.scan
+        self.number = self._first + self.ahead
+        return True
+
+    def associate(self, readings: Array, ceiling: float) -> float | None:
+        """Associate a scan (m, 2); return its cost, or None if it is not clear.
+
+        Above a cost of ``ceiling``, only the best association is of interest.
+        """
+        parts, known = self._filter.map.parts, self.tentative[:3]
+        block, tally = self._filter.map.block, self._tally
+        scan = ClearScan(*associate_clear(block, tally, known, readings, ceiling))
+        if not len(scan.costs):
+            return None
+        self._scan, best = scan, scan.slots[0]
+        marks, self._ids = best.tolist(), parts.ids[best]
+        ids = self._ids.tolist()
+        self.row_ids = tuple(ids)
+        self.labels, self.following = (NO_LABEL,) * len(ids), self.tentative
+        self.rows = (), ()
+        if min(marks, default=0) < 0:
+            every = np.flatnonzero(best == NEW), np.flatnonzero(best == AMBIGUOUS)
+            self.rows = tuple(every[0].tolist()), tuple(every[1].tolist())
+            pairs = zip(ids, marks, strict=True)
+            self.row_ids = tuple([i if slot >= 0 else None for i, slot in pairs])
+        is_tried = len(scan.chance) or self.rows[0]
+        if is_tried and not self._follow_tentative(readings):
+            return None
+        return float(scan.costs[0])
+
+    def _follow_tentative(self, readings: Array) -> bool:
+        """Find the tentative landmarks after the scan; return whether none is proven.
+
+        See `ScanAssociation`.
+        """
+        needed, scans = self._policy.confirm
+        known, scan = self.tentative, self._scan
+        assert scan is not None
+        again = scan.again
+        rows = np.flatnonzero(again >= 0)
+        if len(rows):
+            shown, density = readings[rows], scan.density[rows]
+            known = known.with_sightings(again[rows], shown, self._noise, density)
+        known = known.with_misses(scan.chance)
+        fresh = [row for row in self.rows[0] if again[row] < 0]
+        if (len(rows) and known.proven(needed).any()) or (fresh and needed == 1):
+            return False
+        labels = np.append(known.labels, NO_LABEL)[np.maximum(again, -1)]
+        labels[fresh] = [(self.number << LABEL_BITS) + row for row in fresh]
+        self.labels = tuple(labels.tolist())
+        if fresh:
+            added = readings[fresh], self._noise, labels[fresh]
+            landmarks, unknown = tally_of(self._tally).numbers[[SHARE, SUMS]].tolist()
+            known = known.with_new(*added, min(landmarks / unknown, 1.0))
+        self.following = known.after_scan(scans)
+        return True
+
+    def associate_given(self, ids: IntArray) -> bool:
+        """Take landmarks as given; return whether the map holds all."""
+        self._scan, self._ids, self.row_ids = None, ids, tuple(ids.tolist())
+        self.labels, self.rows = (NO_LABEL,) * len(ids), ((), ())
+        self.following = self.tentative.after_scan(self._policy.confirm[1])
+        return all(map(self._filter.map.slots.__contains__, self.row_ids))
+
+    def has_rivals(self, ceiling: float) -> bool:
+        """Return whether another association costs no more than this."""
+        return self._scan is not None and int((self._scan.costs <= ceiling).sum()) > 1
+
+    def tried(self, readings: Array, ceiling: float) -> list[tuple[float, MapView]]:
+        """Return the costs of the associations up to one, and the beliefs after them.
+
+        The best one comes first.  Those that the filter refuses are left out.
+        """
+        gaussian, scan, found = self._filter.map, self._scan, []
+        assert scan is not None
+        ids, names = gaussian.parts.ids, [*gaussian.slots]
+        for cost, slots in zip(scan.costs.tolist(), scan.slots, strict=True):
+            rows, copy = slots >= 0, aligned_copy(gaussian.block)
+            if cost <= ceiling and (
+                update_map(copy, readings[rows], ids[slots[rows]]) == DONE
+            ):
+                after = parts_of(copy)
+                found.append((cost, MapView(after.mean, after.covariance, names)))
+        return found
+
+    def take(self, readings: Array) -> bool:
+        """Take in the scan as associated; return False if the filter refuses it."""
+        gaussian, scan, ids, used = self._filter.map, self._scan, self._ids, readings
+        slots = again = np.zeros(len(ids), np.int64)
+        if scan is not None:
+            slots, again = scan.slots[0], scan.again
+            if None in self.row_ids:
+                used, ids = readings[slots >= 0], ids[slots >= 0]
+        if self._filter is self._slam:
+            if gaussian.take_in(update_map, used, ids) != DONE:
                 return False
         else:
-            slots = associate_clear(gaussian.block, self._tally, readings, ids)
-            if len(slots) == 0 or (len(slots) > 1 and self._splits(slots, readings)):
+            try:
+                self._slam.update(used, ids)
+            except (ValueError, np.linalg.LinAlgError):
                 return False
-        if gaussian.take_in(update_map, readings, ids) != DONE:
-            return False
-        done = count_clear(gaussian.block, self._tally, readings, given)
+        block, tally, given = gaussian.block, self._tally, scan is None
+        done = count_clear(block, tally, readings, slots, again, given)
         is_afar, self.is_used = done
-        self.number, self.ahead = candidates.scan + self.ahead, self.ahead + 1
+        self.tentative, self.ahead = self.following, self.ahead + 1
         if is_afar:
             mean, P = gaussian.parts.mean[:3], gaussian.parts.covariance[:3, :3]
             self._path.append([self.number, *mean.tolist(), *P.ravel().tolist()])
@@ -154,33 +259,19 @@ class ClearScans:
 
     @property
     def is_loaded(self) -> bool:
-        """Whether the memory holds the records, and no landmark is tentative."""
+        """Whether the memory holds the records."""
         return self._tally is not None
 
     def forget(self) -> None:
         """Forget all scans, since other records begin."""
         self._tally, self._path, self.ahead = None, [], 0
 
-    def _splits(self, slots: IntArray, readings: Array) -> bool:
-        """Return whether a hypothesis would follow another association than the best.
-
-        It would not, if both leave nearly the same belief.
-        """
-        gaussian, views = self._slam.map, []
-        ids, size = gaussian.parts.ids, gaussian.size
-        for each in slots:
-            rows, copy = each >= 0, aligned_copy(gaussian.block)
-            if update_map(copy, readings[rows], ids[each[rows]]) != DONE:
-                return True
-            after = parts_of(copy)
-            views.append(MapView(after.mean, after.covariance, range(size // 2 - 1)))
-        return not all(is_near(views[0], view) for view in views[1:])
-
     def renew(self, before: Candidates, records: LandmarkRecords) -> Candidates:
         """Return the candidates after the scans taken in; renew the records."""
         if self._tally is None:
             return before
         tally, self._tally = tally_of(self._tally), None
+        before = before._replace(tentative=self.tentative)
         if not self.ahead:
             return before
         records.misses, records.information = tally.misses, tally.information
@@ -196,9 +287,14 @@ class ClearScans:
             path=path,
         )
         sums = zip(UnexplainedDensity._fields, numbers[SUMS:PLACE], strict=False)
-        density = before.density._replace(**dict(sums))
+        density = before.density._replace(**dict(sums), cells=tally.cells)
         scan, self.ahead, self._path = before.scan + self.ahead, 0, []
         return before._replace(scan=scan, density=density, detections=detections)
+
+
+def filter_inside(slam: Any) -> Any:
+    """Return the filter that a recorder follows; any other one itself."""
+    return getattr(slam, "inside", slam)
 
 
 def may_be_clear(
@@ -207,7 +303,6 @@ def may_be_clear(
     """Return whether scans of a map of these landmarks may be clear."""
     return (
         [*records.ids] == mapped
-        and not len(candidates.tentative.seen)
         and not records.doubtful
         and candidates.next_id > max(mapped, default=-1)
     )
@@ -247,7 +342,7 @@ COUNT, FIRST_NEW, NEWEST, HAS_PLACE, WHOLE = 0, 1, 2, 3, 4
 
 # The numbers after these: evidence that the run is lost, the sums of the density, the
 # last place on the path, the evidence of the scan that waits, and the settings.
-EVIDENCE, SUMS, PLACE, FEWER, SETTINGS, NUMBERS = 0, 8, 13, 15, 16, 40
+EVIDENCE, SUMS, SHARE, PLACE, FEWER, SETTINGS, NUMBERS = 0, 8, 11, 13, 15, 16, 40
 
 
 class Tally(NamedTuple):
@@ -378,9 +473,13 @@ settings_jit = njit_inlined(settings_in)
 
 @jit
 def associate_clear(
-    block: Array, tally_block: Array, readings: Array, ids: IntArray
-) -> IntArray:
-    """Associate a scan if all its readings are of the map, and count what it shows.
+    block: Array,
+    tally_block: Array,
+    tentative: tuple[Array, Array, IntArray],
+    readings: Array,
+    ceiling: float,
+) -> tuple[Array, IntArray, IntArray, Array, Array]:
+    """Associate a scan, and count what it shows; return the parts of `ClearScan`.
 
     Parameters
     ----------
@@ -388,51 +487,72 @@ def associate_clear(
         The memory of the filter, which stays as it is.
     tally_block : ndarray
         That of its hypothesis (:class:`Tally`): the counts of the scan wait in it.
+    tentative : tuple
+        Mean, covariance and ``seen`` of the `TentativeLandmarks`.
     readings : ndarray, shape (m, 2)
         Rows (β, r) [rad, m].
-    ids : ndarray of int64, shape (m,)
-        Filled with the landmark of each reading.
+    ceiling : float
+        Cost beyond which only the best association is of interest.
 
     Returns
     -------
-    ndarray of int64, shape (M, m)
-        Slots of the associations to consider, the best one first; none if the scan is
-        not clear.
+    tuple of ndarray
+        Without any association, if the scan is not clear.
     """
-    parts, tally = parts_jit(block), tally_jit(tally_block)
-    settings = settings_jit(tally)
-    density, none = np.empty(len(readings)), np.empty((0, len(readings)), np.int64)
+    parts, tally, rows = parts_jit(block), tally_jit(tally_block), len(readings)
+    settings, (mean, P, seen) = settings_jit(tally), tentative
+    density, again, chance = np.empty(rows), np.full(rows, NEW), np.ones(len(seen))
+    none = np.empty(0), np.empty((0, rows), np.int64), again, chance, density
     is_known = tally.whole[COUNT] == parts.numbers[LANDMARKS]
     if not (is_known and _is_usable(readings, settings.min_range)):
         return none
     if _may_be_lost(parts, settings):
         return none
     _, per_scan, longest = _of_density(tally)
-    fill_density(tally.cells, readings, longest, per_scan, density)
-    costs, slots, explained = _assign(parts, readings, density, settings)
+    density[:] = settings.density
+    if np.isnan(settings.density):
+        fill_density(tally.cells, readings, longest, per_scan, density)
+    every, gate = density.copy(), settings.new_gate
+    if len(seen) > 0:
+        share = min(tally.numbers[SHARE] / tally.numbers[SUMS], 1.0)
+        add_tentative(tentative, readings, settings.noise, gate, share, every)
+    belief = parts.mean, parts.covariance, parts.numbers[LANDMARKS]
+    costs, slots, explained = _assign(
+        belief, readings, every, settings, ceiling, int(settings.most)
+    )
     best = _count_best(parts, tally, readings, costs, slots, explained)
-    if (slots[best] < 0).any():
-        return none
-    for i in range(len(ids)):
-        ids[i] = parts.ids[slots[best, i]]
-    return _with_rivals(costs, slots, best)
+    costs, slots = _with_rivals(costs, slots, best, ceiling)
+    if len(costs) == 0 or len(seen) == 0:
+        return costs, slots, again, chance, density
+    new = np.flatnonzero(slots[0] == NEW)
+    if len(new) > 0:
+        view = mean, P, len(seen)
+        _, found, _ = _assign(view, readings[new], density[new], settings, np.inf, 1)
+        for k in range(len(new)):
+            again[new[k]] = found[0, k]
+    counts = tally.next_detected.copy().reshape(tally.detected.shape)
+    nothing = new[:0], new[:0], readings[:0]
+    is_telling = np.zeros(len(seen), np.bool_)
+    count_scan((mean, P), nothing, is_telling, longest, counts, chance)
+    return costs, slots, again, chance, density
 
 
 @njit_allocating
-def _with_rivals(costs: Array, slots: IntArray, best: int) -> IntArray:
+def _with_rivals(
+    costs: Array, slots: IntArray, best: int, ceiling: float
+) -> tuple[Array, IntArray]:
     """Return the best association and those not far less probable; none to leave it.
 
     An unpaired reading that is new begins another tentative landmark.
     """
-    kept, count = np.empty_like(slots), 1
-    kept[0] = slots[best]
+    kept, count = np.zeros(len(costs), np.int64), 1
+    kept[0], most = best, min(costs[best] + SPREAD, ceiling)
     for k in range(len(slots)):
-        if k != best and costs[k] <= costs[best] + SPREAD:
-            if (slots[k] == NEW).any():
-                return kept[:0]
-            kept[count] = slots[k]
-            count += 1
-    return kept[:count]
+        if k != best and costs[k] <= most:
+            if ((slots[k] == NEW) != (slots[best] == NEW)).any():
+                return costs[:0], slots[:0]
+            kept[count], count = k, count + 1
+    return costs[kept[:count]], slots[kept[:count]]
 
 
 @njit_allocating
@@ -449,7 +569,10 @@ def _count_best(
     See `Detections.after`.
     """
     best, is_telling = 0, np.empty(len(tally.missed), np.bool_)
-    belief, (_, _, longest) = (parts.mean, parts.covariance), _of_density(tally)
+    belief = parts.mean, parts.covariance
+    _, per_scan, longest = _of_density(tally)
+    # The Poisson probability of no other reading.
+    others = 2 * per_scan if np.isnan(settings_jit(tally).density) else 0.0
     for k in range(len(slots)):
         for j in range(len(is_telling)):
             is_older = parts.ids[j] < tally.whole[FIRST_NEW]
@@ -457,7 +580,7 @@ def _count_best(
         detected, missed = tally.detected.copy(), tally.missed.copy()
         scan = slots[k], explained, readings
         cost, fewer = count_scan(belief, scan, is_telling, longest, detected, missed)
-        costs[k] += cost
+        costs[k] += cost + others
         if k == 0 or costs[k] < costs[best]:
             best, tally.numbers[FEWER] = k, fewer
             _copy(detected.ravel(), tally.next_detected)
@@ -492,16 +615,18 @@ def _may_be_lost(parts: Parts, settings: ClearRules) -> bool:
 
 @njit_allocating
 def _assign(
-    parts: Parts, readings: Array, density: Array, settings: ClearRules
+    belief: tuple[Array, Array, int],
+    readings: Array,
+    density: Array,
+    settings: ClearRules,
+    ceiling: float,
+    most: int,
 ) -> tuple[Array, IntArray, IntArray]:
     """Assign a scan as `assign_scan` does."""
-    missing, limits = np.empty(len(density)), np.full(len(density) + 1, np.inf)
-    for k in range(len(density)):
-        rho = density[k] if np.isnan(settings.density) else settings.density
-        missing[k] = -2 * np.log(rho) - 2 * np.log(2 * np.pi)
-    gates = settings.new_gate, settings.pair_gate, np.inf
-    search = False, int(settings.most), int(settings.nodes)
-    belief = parts.mean, parts.covariance, parts.numbers[LANDMARKS]
+    missing = -2 * np.log(density) - 2 * np.log(2 * np.pi)
+    limits = np.full(len(density) + 1, np.inf)
+    gates = settings.new_gate, settings.pair_gate, ceiling
+    search = False, most, int(settings.nodes)
     scan = readings, missing, limits
     return assign_jointly(belief, scan, settings.noise, gates, search)
 
@@ -521,9 +646,14 @@ def _of_density(tally: Tally) -> tuple[float, float, float]:
 
 @jit
 def count_clear(
-    block: Array, tally_block: Array, readings: Array, given: bool
+    block: Array,
+    tally_block: Array,
+    readings: Array,
+    slots: IntArray,
+    again: IntArray,
+    given: bool,
 ) -> tuple[bool, bool]:
-    """Count a scan of mapped landmarks that the filter has taken in.
+    """Count a clear scan that the filter has taken in.
 
     Parameters
     ----------
@@ -531,6 +661,8 @@ def count_clear(
         As of `associate_clear`.
     readings : ndarray, shape (m, 2)
         Rows (β, r) [rad, m].
+    slots, again : ndarray of int64, shape (m,)
+        The best association, and the tentative landmarks, as in `ClearScan`.
     given : bool
         Whether the landmarks were given; else the counts of the scan wait.
 
@@ -539,39 +671,49 @@ def count_clear(
     is_afar : bool
         Whether the path of the run is to remember the pose.
     is_used : bool
-        Whether the filter has used all readings.
+        Whether the filter has used all readings that it was given.
     """
     parts, tally = parts_jit(block), tally_jit(tally_block)
     settings, lost, count = settings_jit(tally), lost_jit(tally), len(readings)
     scans, per_scan, longest = _of_density(tally)
-    slots, outcomes, is_afar = parts.ledger[SLOT], parts.ledger[OUTCOME], False
+    outcomes, is_afar = parts.ledger[OUTCOME], False
+    seen, new, shown = np.empty((2, count), np.int64), 0, np.empty((count, 2))
+    fed, used, strange = 0, 0, 0
+    for k in range(count):
+        if slots[k] < 0:
+            if again[k] < 0:
+                seen[1, new], new = k, new + 1
+                strange += slots[k] == NEW
+            continue
+        j = parts.ledger[SLOT, fed]
+        if not given:
+            tally.shown[j] = min(tally.shown[j] + 1, PROVEN)
+        if outcomes[fed] == USED:
+            seen[0, used] = j
+            shown[used, 0], shown[used, 1] = readings[k, 0], readings[k, 1]
+            used += 1
+        fed += 1
     if not given:
         _copy(tally.next_detected, tally.detected.ravel())
         _copy(tally.next_missed, tally.missed)
-        for k in range(count):
-            tally.shown[slots[k]] = min(tally.shown[slots[k]] + 1, PROVEN)
         newest = tally.whole[NEWEST]
         lost = evidence_of_misses_jit(lost, tally.numbers[FEWER], newest)
         is_afar = settings.keeps_path > 0 and _is_afar(parts, tally, longest / RINGS)
     has_map = tally.whole[COUNT] > 0
     lost = evidence_of_heading_jit(lost, parts.covariance[2, 2], has_map)
     if not given:
-        lost = evidence_of_readings_jit(lost, 0, count, per_scan, scans)
+        lost = evidence_of_readings_jit(lost, strange, count - new, per_scan, scans)
     e, tally.whole[FIRST_NEW] = tally.numbers[EVIDENCE:SUMS], lost.first_new
     e[0], e[1], e[2], e[4] = lost.present, lost.lasting, lost.largest, lost.surest
     e[5], e[6], e[7] = lost.unknown, lost.unexplained, lost.explained
-    sums, none = tally.numbers[SUMS:PLACE], np.empty(0, np.int64)
-    sums[2], sums[4] = count_readings(tally.cells, readings, none, (sums[2], sums[4]))
-    sums[0], sums[1], sums[3] = MEMORY * sums[0], MEMORY * sums[1] + 1, MEMORY * sums[3]
-    counts, used, heading = (tally.misses, tally.information), 0, parts.mean[2]
-    seen, shown = np.empty(count, np.int64), np.empty((count, 2))
-    for k in range(count):
-        if outcomes[k] == USED:
-            seen[used] = slots[k]
-            shown[used, 0], shown[used, 1] = readings[k, 0], readings[k, 1]
-            used += 1
-    add_sightings(counts, seen[:used], shown[:used], heading, settings.sighting)
-    return is_afar, used == count
+    sums = tally.numbers[SUMS:PLACE]
+    lengths = sums[2], sums[4]
+    sums[2], sums[4] = count_readings(tally.cells, readings, seen[1, :new], lengths)
+    sums[0], sums[1] = MEMORY * sums[0] + new, MEMORY * sums[1] + 1
+    sums[3] = MEMORY * sums[3]
+    counts, heading = (tally.misses, tally.information), parts.mean[2]
+    add_sightings(counts, seen[0, :used], shown[:used], heading, settings.sighting)
+    return is_afar, used == fed
 
 
 @njit_internal

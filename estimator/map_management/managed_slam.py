@@ -29,6 +29,7 @@ from ..association.scan_association import (
     ScanAssociation,
     associate,
 )
+from ..association.tentative_landmarks import TentativeLandmarks
 from ..filters.pose_readings import PoseReading, observe_relative_pose
 from ..guards import argument_checks, saved_states
 from ..guards.argument_checks import LandmarkIds
@@ -243,12 +244,10 @@ class ManagedSlam(FilterWrapper):
             all is then as before.
         """
         readings = argument_checks.scan(measurements)
-        if len(self._hypotheses) == 1:
-            with changing(self, "update"):
-                report = self._hypotheses[0].take_clear(readings, landmark_ids)
-                if report is not None:
-                    self.steps += 1
-                    return report
+        with changing(self, "update"):
+            report = self._take_clear(readings, landmark_ids)
+            if report is not None:
+                return report
         with self._changing("update"):
             if landmark_ids is None:
                 return self._take(self._branches(readings))
@@ -352,6 +351,46 @@ class ManagedSlam(FilterWrapper):
         count = len(self.hypotheses)
         several = f", best of {count} hypotheses" if count > 1 else ""
         return f"Managed {self.filter!r}{several}"
+
+    def _take_clear(
+        self, readings: Array, landmark_ids: LandmarkIds | None
+    ) -> UpdateReport | None:
+        """Take in a scan if it is clear in every hypothesis: see `ClearScans`."""
+        ceiling, found = np.inf, []
+        for h in self._hypotheses:
+            cost = h.associate_clear(readings, landmark_ids, ceiling - h.cost)
+            if cost is None:
+                return None
+            found.append((h.cost + cost, h))
+            ceiling = min(ceiling, h.cost + cost + SPREAD)
+        ranked = sorted([f for f in found if f[0] <= ceiling], key=itemgetter(0))
+        every = [h for _, h in ranked]
+        if self._is_split(every, readings, ceiling):
+            return None
+        taken = [pair for pair in ranked if pair[1].take_clear(readings)]
+        if not taken:
+            return None
+        self.steps += 1
+        if len(self._hypotheses) == 1:
+            return every[0].report
+        chosen = distinct([h for _, h in taken], self.policy.hypotheses)
+        return self._take_over([pair for pair in taken if pair[1] in chosen])
+
+    def _is_split(
+        self, every: Sequence[Hypothesis], readings: Array, ceiling: float
+    ) -> bool:
+        """Return whether a scan that seemed clear splits one of these hypotheses."""
+        if not any(h.has_rivals(ceiling - h.cost) for h in every):
+            return False
+        tried = [
+            (h.cost + cost, k, (view, h.labels_after))
+            for h in every
+            for k, (cost, view) in enumerate(h.tried(readings, ceiling - h.cost))
+        ]
+        tried.sort(key=itemgetter(0))
+        beliefs = [belief for *_, belief in tried]
+        kept = differing(beliefs, self.policy.hypotheses)
+        return any(tried[n][1] for n in kept)
 
     # One scan: all ways to associate it.  The most probable ones continue.
 
@@ -536,7 +575,8 @@ class Hypothesis:
         self._candidates = Candidates()
         #: None after a clear scan: the filter can return it once more.
         self._report: UpdateReport | None = UpdateReport()
-        self._row_ids: tuple[int, ...] = ()
+        self._row_ids: tuple[int | None, ...] = ()
+        self._rows: tuple[tuple[int, ...], tuple[int, ...]] = (), ()
 
     @property
     def candidates(self) -> Candidates:
@@ -554,38 +594,69 @@ class Hypothesis:
     @property
     def report(self) -> UpdateReport:
         """The report of the last update."""
-        if self._report is None:
-            self._report = self._report_of_clear_scan()
-        return self._report
+        return self._report_of_clear_scan() if self._report is None else self._report
 
     @report.setter
     def report(self, report: UpdateReport) -> None:
         self._report = report
 
-    def take_clear(
-        self, readings: Array, landmark_ids: LandmarkIds | None
-    ) -> UpdateReport | None:
-        """Take in a scan (m, 2) if it is clear: see `ClearScans`; return its report."""
-        clear, given = self._clear, landmark_ids is not None
-        if clear is None:
+    @property
+    def tentative(self) -> TentativeLandmarks:
+        """The landmarks without an identity that are not in the map yet."""
+        clear = self._clear
+        if clear is not None and clear.is_loaded:
+            return clear.tentative
+        return self._candidates.tentative
+
+    def associate_clear(
+        self, readings: Array, landmark_ids: LandmarkIds | None, ceiling: float
+    ) -> float | None:
+        """Associate a scan (m, 2); return its cost, or None unless it is clear."""
+        clear = self._clear
+        if clear is None or not clear.load(self._candidates, self.pruner.records):
             return None
-        if given:
-            ids = argument_checks.identity_array(landmark_ids, len(readings), None)
-        else:
-            ids = np.empty(len(readings), np.int64)
-        before = self._candidates, self.pruner.records
-        if not clear.take(*before, readings, ids, given=given):
-            return None
+        if landmark_ids is None:
+            return clear.associate(readings, ceiling)
+        ids = argument_checks.identity_array(landmark_ids, len(readings), None)
+        return 0.0 if clear.associate_given(ids) else None
+
+    def has_rivals(self, ceiling: float) -> bool:
+        """Return whether a clear scan has another association up to this cost."""
+        return self._clear is not None and self._clear.has_rivals(ceiling)
+
+    @property
+    def labels_after(self) -> bytes:
+        """Labels of the tentative landmarks after a clear scan."""
+        assert self._clear is not None
+        return self._clear.following.labels.tobytes()
+
+    def tried(self, readings: Array, ceiling: float) -> list[tuple[float, MapView]]:
+        """Return the costs and the beliefs after all associations of a clear scan."""
+        assert self._clear is not None
+        return self._clear.tried(readings, ceiling)
+
+    def take_clear(self, readings: Array) -> bool:
+        """Take in a clear scan as associated; return False if the filter refuses it."""
+        clear = self._clear
+        assert clear is not None
+        decided = clear.row_ids, clear.labels
+        scan = self.recent.new_scan(clear.number, readings, *decided)
+        if not clear.take(readings):
+            return False
         self.editor.expire()
-        self._report, self._row_ids = None, tuple(ids.tolist())
-        report = self._report_of_clear_scan()
-        unused = () if clear.is_used else {*report.rejected_ids, *report.skipped_ids}
-        self.recent.note_clear(clear.number, readings, self._row_ids, unused)
-        return report
+        self._report, self._row_ids, self._rows = None, clear.row_ids, clear.rows
+        unused: set[int] = set()
+        if not clear.is_used:
+            unused.update(self.report.rejected_ids, self.report.skipped_ids)
+        self.recent.note_clear(scan, unused)
+        return True
 
     def _report_of_clear_scan(self) -> UpdateReport:
         report: UpdateReport = cast("Any", self.filter).report()
-        return report.completed(row_ids=self._row_ids)
+        tentative, ambiguous = self._rows
+        return report.completed(
+            row_ids=self._row_ids, tentative_rows=tentative, ambiguous_rows=ambiguous
+        )
 
     def _settle(self) -> None:
         """Complete what clear scans have left for later, before the map is edited."""
@@ -612,11 +683,14 @@ class Hypothesis:
         """Move by odometry (d, α), which is a displacement in the robot's frame."""
         self.filter.predict(reading, dt)
         self.editor.expire()
-        is_clear = self._clear is not None and self._clear.is_loaded
-        if not is_clear and len((tentative := self.candidates.tentative).seen):
+        tentative, clear = self.tentative, self._clear
+        if len(tentative.seen):
             variance = self.motion_noise.over(displacement, dt)
             moved = tentative.moved(displacement, variance)
-            self.candidates = self.candidates._replace(tentative=moved)
+            if clear is not None and clear.is_loaded:
+                clear.tentative = moved
+            else:
+                self._candidates = self._candidates._replace(tentative=moved)
         self.recent.note_motions((*reading, dt))
 
     def observe_pose(self, given: PoseReading) -> UpdateReport:
@@ -772,27 +846,32 @@ class Hypothesis:
 
 
 def distinct(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
-    """Return the hypotheses that differ from all that are more probable.
+    """Return the hypotheses that differ from all that are more probable."""
+    if len(hypotheses) == 1:
+        return [*hypotheses]
+    beliefs = [(h.map_view(), h.tentative.labels.tobytes()) for h in hypotheses]
+    return [hypotheses[k] for k in differing(beliefs, most)]
+
+
+def differing(beliefs: Sequence[tuple[MapView, bytes]], most: int) -> list[int]:
+    """Return which beliefs differ from those before: maps, and tentative landmarks.
 
     The effect of readings that were left out fades with time.  Of hypotheses with
     overlapping poses, which are variants of one decision, the most probable are
     returned only, so that they leave room for another decision.
     """
-    if len(hypotheses) == 1:
-        return [*hypotheses]
-    views = [h.map_view() for h in hypotheses]
+    views = [view for view, _ in beliefs]
     variances = np.maximum([v.covariance.diagonal()[:3] for v in views], 0.0) + NIL
     poses = np.hstack([[v.mean[:3] for v in views], variances]).tolist()
-    labels = [h.candidates.tentative.labels.tobytes() for h in hypotheses]
     chosen: list[int] = []
-    for k, view in enumerate(views):
+    for k, (view, labels) in enumerate(beliefs):
         if len(chosen) == most:
             break
         overlapping = sum(_overlap(poses[n], poses[k]) for n in chosen)
-        alike = (views[n] for n in chosen if labels[n] == labels[k])
+        alike = (views[n] for n in chosen if beliefs[n][1] == labels)
         if overlapping < PER_BASIN and not any(is_near(v, view) for v in alike):
             chosen.append(k)
-    return [hypotheses[k] for k in chosen]
+    return chosen
 
 
 def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:

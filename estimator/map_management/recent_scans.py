@@ -90,14 +90,25 @@ class RecentScans(Restorable):
     def with_scan(self, plan: ScanAssociation) -> FedScans:
         """Return what to feed to the filter: a new scan, and earlier ones to repeat."""
         decided = tuple(plan.row_ids), tuple(plan.labels)
-        # The caller may reuse the array of readings.
-        scan = RecentScan(plan.scan, self.motions, plan.readings.copy(), *decided)
-        newest = max(scan.labels, default=NO_LABEL)
-        if self._window and newest >= scan.number << LABEL_BITS:  # its first sighting
-            scan = scan._replace(before=self._slam.state_dict())
+        scan = self.new_scan(plan.scan, plan.readings, *decided)
         scans = [*self.scans, scan][-self._window - 1 :]
         first = _relabel(scans, plan.confirmed) if plan.confirmed else None
         return FedScans(plan, scans, first)
+
+    def new_scan(
+        self,
+        number: int,
+        readings: Array,
+        row_ids: tuple[int | None, ...],
+        labels: tuple[int, ...],
+    ) -> RecentScan:
+        """Return the next scan, before the filter takes it in."""
+        before = None
+        if self._window and max(labels, default=NO_LABEL) >= number << LABEL_BITS:
+            before = self._slam.state_dict()  # a tentative landmark begins in it
+        # The caller may reuse the array of readings.
+        parts = self.motions, readings.copy(), row_ids, labels, before
+        return RecentScan(number, *parts)
 
     def feed(self, fed: FedScans) -> UpdateReport:
         """Update the filter with the last scan, and with earlier sightings if any.
@@ -129,20 +140,11 @@ class RecentScans(Restorable):
                 ids = tuple(new if label != NO_LABEL else i for i, new, label in pairs)
                 self.decisions[place] = made._replace(row_ids=ids)
 
-    def note_clear(
-        self,
-        number: int,
-        readings: Array,
-        row_ids: tuple[int, ...],
-        unused: Collection[int],
-    ) -> None:
-        """Remember a scan, its landmarks, and those whose readings were not used."""
+    def note_clear(self, scan: RecentScan, unused: Collection[int]) -> None:
+        """Remember a clear scan, but the landmarks whose readings were not used."""
         if self._window:
-            labels = (NO_LABEL,) * len(row_ids)
-            parts = number, self.motions, readings.copy(), row_ids, labels
-            self.scans = [*self.scans[-self._window :], RecentScan(*parts)]
-            self.motions = ()
-        self.decisions.append(ScanDecisions(_without(unused, row_ids)))
+            self.scans, self.motions = [*self.scans[-self._window :], scan], ()
+        self.decisions.append(ScanDecisions(_without(unused, scan.row_ids)))
 
     def _repeat(self, scans: list[RecentScan], first: int) -> list[UpdateReport]:
         """Repeat the scans since one, and renew the states kept before them."""

@@ -67,6 +67,11 @@ class RecordedSlam(interface.FilterWrapper):
         self.steps = 0
         self._report = interface.UpdateReport()
 
+    @property
+    def inside(self) -> interface.SlamEstimator:
+        """The filter, which only this recorder may change."""
+        return self._slam
+
     def recorded(self) -> Drive:
         """Return the drive until now; its last pose is the present one."""
         drive = Drive(**self._noise)
@@ -173,6 +178,17 @@ class RecordedSlam(interface.FilterWrapper):
         with changing(self, "load_state_dict", anew=True):
             self._slam.load_state_dict(state)
             self._last, self._report = history.item(), interface.UpdateReport()
+
+    def snapshot(self) -> tuple[Any, Event | None, interface.UpdateReport]:
+        """Return the present state for :meth:`resume`."""
+        self.refuse_interrupted()
+        return interface.snapshot(self._slam), self._last, self._report
+
+    def resume(self, before: tuple[Any, Event | None, interface.UpdateReport]) -> None:
+        """Return to a :meth:`snapshot` of a recorder with the same settings."""
+        with changing(self, "resume", anew=True):
+            interface.resume(self._slam, before[0])
+            _, self._last, self._report = before
 
     def report(self) -> interface.UpdateReport:
         """Return the report of the last update once more."""

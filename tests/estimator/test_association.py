@@ -191,6 +191,14 @@ def test_tentative_landmarks_keep_their_frame_while_the_heading_is_certain():
     np.testing.assert_array_equal(settled.covariance, both.covariance)
 
 
+def test_the_frame_begins_anew_when_no_tentative_landmark_is_left():
+    moved = tracked([(0.0, 5.0)]).moved((1.0, 0.0, 0.2), np.full(3, 0.01))
+    for left in (moved, moved.chosen(np.zeros(1, bool))):
+        gone = left.after_scan(1)
+        assert not gone.mean.any()
+        assert gone.covariance.tolist() == np.zeros((3, 3)).tolist()
+
+
 def test_a_tentative_landmark_that_is_dropped_leaves_the_others_as_they_are():
     both = moved_and_seen_again((0.3, 0.2, 0.1))
     one, kept = both.chosen(np.array([True, False])), np.ix_(range(5), range(5))

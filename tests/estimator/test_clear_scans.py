@@ -8,20 +8,24 @@ import pytest
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import UpdateReport, make_estimator
 from slamgym.estimator.map_management.clear_scans import ClearScans
+from slamgym.estimator.map_management.managed_slam import ManagedSlam
+from slamgym.experiments.run_and_replay.filter_settings import SMOOTHER
 from slamgym.sim_configs import action_sequence, load_scenario
 
 
 @pytest.fixture
 def count(monkeypatch):
-    """Return a list that holds, for each attempt, whether the scan was clear."""
-    attempts, take = [], ClearScans.take
+    """Return a list that holds, for each scan of the first twin, if it is clear."""
+    clear, take = [], ManagedSlam._take_clear
 
-    def counted(*args, **options):
-        attempts.append(take(*args, **options))
-        return attempts[-1]
+    def counted(slam, *args):
+        report = take(slam, *args)
+        if slam._hypotheses[0]._clear is not None:
+            clear.append(report is not None)
+        return report
 
-    monkeypatch.setattr(ClearScans, "take", counted)
-    return attempts
+    monkeypatch.setattr(ManagedSlam, "_take_clear", counted)
+    return clear
 
 
 def make(name="invariant", world=None, *, clear=True, **management):
@@ -90,6 +94,7 @@ def compare(twins, scans, *, given=False, renew=7):
         ("loop", {}, 0.5),
         ("corridor", {}, 0.6),
         ("dropout", {}, 0.4),
+        ("hidden_identities", {}, 0.5),
         ("six_landmarks", {"constellations": None}, 0.5),
         ("corridor", {"association": "joint", "density": 0.05}, 0.6),
         ("corridor", {"backdate": False, "capacity": 12}, 0.2),
@@ -150,6 +155,19 @@ def test_changes_between_clear_scans_leave_the_same_filter(count, change):
     count.clear()
     compare(twins, scans[100:], renew=1)
     assert any(count)
+
+
+def test_a_recorder_takes_clear_scans_and_records_the_same_drive(count):
+    world = load_scenario("loop")
+    twins = [make(SMOOTHER, world, clear=clear) for clear in (True, False)]
+    for odometry, readings, _ in scans_of("loop", 120):
+        for slam in twins:
+            slam.predict(odometry)
+        assert_same_report(*[slam.update(readings) for slam in twins])
+    assert np.mean(count) > 0.5
+    one, other = (slam.filter.smoothed() for slam in twins)
+    np.testing.assert_array_equal(one.landmarks, other.landmarks)
+    np.testing.assert_array_equal(one.poses, other.poses)
 
 
 def test_reading_the_report_later_changes_nothing():
