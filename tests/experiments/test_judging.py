@@ -757,9 +757,12 @@ def test_an_indefinite_covariance_is_a_failed_run(elsewhere):
     rows = np.loadtxt(path)
     rows[7, 8:] = np.array([[1, 0.9, 0.9], [0.9, 1, -0.9], [0.9, -0.9, 1]]).ravel()
     np.savetxt(path, rows, fmt="%.17g")
-    (failed,) = entry_of(judge(mine, truth=truth))["failed_runs"]
+    results = judge(mine, truth=truth)
+    (failed,) = entry_of(results)["failed_runs"]
     assert "the covariance is indefinite" in failed["message"]
     assert failed["step"] == 7
+    for name in ("ate", "ate_aligned", "pose_area"):
+        assert (np.isnan(results[name]) == results.failed).all(), name
 
 
 def additive_studies(rng, runs, steps=30, turn=0.1):
