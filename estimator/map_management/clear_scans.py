@@ -213,7 +213,10 @@ class ClearScans:
 
     def has_rivals(self, ceiling: float) -> bool:
         """Return whether another association costs no more than this."""
-        return self._scan is not None and int((self._scan.costs <= ceiling).sum()) > 1
+        scan = self._scan
+        if scan is None or len(scan.costs) == 1:
+            return False
+        return int((scan.costs <= ceiling).sum()) > 1
 
     def tried(self, readings: Array, ceiling: float) -> list[tuple[float, MapView]]:
         """Return the costs of the associations up to one, and the beliefs after them.

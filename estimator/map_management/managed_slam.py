@@ -363,7 +363,9 @@ class ManagedSlam(FilterWrapper):
                 return None
             found.append((h.cost + cost, h))
             ceiling = min(ceiling, h.cost + cost + SPREAD)
-        ranked = sorted([f for f in found if f[0] <= ceiling], key=itemgetter(0))
+        ranked = found
+        if len(found) > 1:
+            ranked = sorted([f for f in found if f[0] <= ceiling], key=itemgetter(0))
         every = [h for _, h in ranked]
         if self._is_split(every, readings, ceiling):
             return None
