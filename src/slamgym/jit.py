@@ -336,7 +336,7 @@ def _forget_old_states(root: Path) -> None:
             shutil.rmtree(state, ignore_errors=True)
 
 
-class _Locator(caching._CacheLocator):
+class _Locator:
     """Give numba the folder of a kernel's files, and what distinguishes their names."""
 
     def __init__(self, function: FunctionType) -> None:
