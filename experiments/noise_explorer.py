@@ -178,7 +178,7 @@ class _Exploration(NamedTuple):
         good = np.flatnonzero(scores.good)
         run = int(good[order[len(order) // 2]]) if len(good) else 0
         study = self._replace(typical=self.seed + run)
-        trace, landmarks = study._replay(self.scenario, self.scenario, self.choices[0])
+        trace, landmarks = study.replayed(self.scenario, self.scenario, self.choices[0])
         return study._replace(frame=_MapCodes.around(trace, landmarks))
 
     def cell(self, motion: float, sensor: float) -> dict[str, Any]:
@@ -198,7 +198,7 @@ class _Exploration(NamedTuple):
         filters, truth = [], None
         for choice in self.choices:
             entry = summary["estimators"][choice.label]
-            trace, _ = self._replay(actual, assumed, choice)
+            trace, _ = self.replayed(actual, assumed, choice)
             scores = scores_of(results, choice.label, "invariant")
             filters.append(
                 {
@@ -235,7 +235,7 @@ class _Exploration(NamedTuple):
             "map": frame.ellipses(last.means[kept], last.covariances[kept]),
         }
 
-    def _replay(
+    def replayed(
         self, actual: Scenario, assumed: Scenario, choice: EstimatorChoice
     ) -> tuple[RunTrace, Array]:
         """Filter the typical run; return its trace and the true landmarks."""
