@@ -171,6 +171,7 @@ def whiteness_test(
     error_rate : float
         Probability of rejecting a white series.
     """
+    _check_lags(lags, np.shape(nis)[-1])
     part = nis, degrees_of_freedom
     return whiteness_test_in_parts(lambda: [part], lags=lags, error_rate=error_rate)
 
@@ -477,9 +478,13 @@ def ljung_box(series: Array, *, lags: int = 10) -> LjungBox:
     ValueError
         If there are no more steps than lags.
     """
-    if not 1 <= lags < series.shape[-1]:
-        raise ValueError(f"lags must be in [1, {series.shape[-1]}), got {lags}")
+    _check_lags(lags, series.shape[-1])
     return _ljung_box(*autocorrelation(series, lags=lags))
+
+
+def _check_lags(lags: int, steps: int) -> None:
+    if not 1 <= lags < steps:
+        raise ValueError(f"lags must be in [1, {steps}), got {lags}")
 
 
 def _ljung_box(correlations: Array, pairs: Array) -> LjungBox:

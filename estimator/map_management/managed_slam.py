@@ -369,14 +369,27 @@ class ManagedSlam(FilterWrapper):
         every = [h for _, h in ranked]
         if self._is_split(every, readings, ceiling):
             return None
-        taken = [pair for pair in ranked if pair[1].take_clear(readings)]
+        taken = self._taken(ranked, readings)
         if not taken:
             return None
-        self.steps += 1
         if len(self._hypotheses) == 1:
             return every[0].report
         chosen = distinct([h for _, h in taken], self.policy.hypotheses)
         return self._take_over([pair for pair in taken if pair[1] in chosen])
+
+    def _taken(
+        self, ranked: Sequence[tuple[float, Hypothesis]], readings: Array
+    ) -> list[tuple[float, Hypothesis]]:
+        """Let hypotheses take in a clear scan; return those that do.
+
+        The first one counts the step, so that an error in a later one leaves the mark.
+        """
+        taken: list[tuple[float, Hypothesis]] = []
+        for cost, h in ranked:
+            if h.take_clear(readings):
+                self.steps += not taken
+                taken.append((cost, h))
+        return taken
 
     def _is_split(
         self, every: Sequence[Hypothesis], readings: Array, ceiling: float

@@ -13,6 +13,7 @@ from slamgym.estimator.interface import MapView
 from slamgym.estimator.map_management.managed_slam import (
     OVERLAP,
     PER_BASIN,
+    Hypothesis,
     ManagedSlam,
     distinct,
     is_near,
@@ -406,6 +407,27 @@ def test_an_interrupted_reading_of_the_pose_leaves_no_hypothesis_behind(slippery
     gps = place, np.eye(2, 3), 0.01 * np.eye(2)
     found = found_after_interrupts(slam, lambda s: s.observe_pose(*gps))
     assert found >= {"before", "marked"}
+
+
+def test_an_error_after_one_hypothesis_has_taken_a_clear_scan_leaves_a_mark(
+    slippery_drive, monkeypatch
+):
+    world, scans = slippery_drive
+    slam, _ = several_hypotheses(scans, world)
+    take, taken = Hypothesis.take_clear, []
+
+    def only_once(hypothesis, readings):
+        if taken:
+            raise MemoryError
+        taken.append(hypothesis)
+        return take(hypothesis, readings)
+
+    monkeypatch.setattr(Hypothesis, "take_clear", only_once)
+    mapped = [{*h.map_view().mapped} for h in slam.hypotheses]
+    with pytest.raises(MemoryError):
+        slam.update([(0.0, 5.0)], [min(set.intersection(*mapped))])
+    with pytest.raises(RuntimeError, match="interrupted in update"):
+        slam.predict((0.1, 0.0))
 
 
 class WithoutInnovations(EkfSlam):

@@ -236,6 +236,9 @@ def test_what_is_not_one_number_per_run_is_refused():
         runs_to_detect(1.0, DOF)
     with pytest.raises(ValueError, match="lags must be in"):
         ljung_box(np.ones((2, 5)), lags=5)
+    for lags in (0, 5):
+        with pytest.raises(ValueError, match=r"lags must be in \[1, 5\), got"):
+            whiteness_test(np.ones((2, 5)), np.ones((2, 5), int), lags=lags)
 
 
 @pytest.mark.parametrize("runs", [10, 40])
