@@ -198,8 +198,11 @@ class _Exploration(NamedTuple):
         filters, truth = [], None
         for choice in self.choices:
             entry = summary["estimators"][choice.label]
-            trace, _ = self.replayed(actual, assumed, choice)
             scores = scores_of(results, choice.label, "invariant")
+            trace: RunTrace | None = None  # of a run that failed
+            if scores.good[self.typical - self.seed]:
+                trace, _ = self.replayed(actual, assumed, choice)
+                truth = trace.true_poses
             filters.append(
                 {
                     "word": entry["verdict"],
@@ -208,7 +211,6 @@ class _Exploration(NamedTuple):
                     **self._drawn(scores, trace),
                 }
             )
-            truth = trace.true_poses
         most = self._counts()[1]
         path = [] if truth is None else self.frame.codes(_thinned(truth[:, :2], most))
         return {"truth": path, "filters": filters}
@@ -219,17 +221,20 @@ class _Exploration(NamedTuple):
         sizes = 1, 2, 5, 5
         return [int(each * s / n) for s, n in zip(_SHARES, sizes, strict=True)]
 
-    def _drawn(self, scores: EstimatorScores, trace: RunTrace) -> dict[str, Any]:
+    def _drawn(self, scores: EstimatorScores, trace: RunTrace | None) -> dict[str, Any]:
         """Return the curve of the NEES, and path and ellipses of the typical run."""
         points, poses, ovals, marks = self._counts()
         average = scores.anees("invariant") if scores.good.any() else np.zeros(0)
         curve = np.log10(np.clip(_thinned(average, points), 1e-6, 1e9))
+        codes = np.round(100 * curve).astype(int).tolist()
+        if trace is None:
+            return {"curve": codes, "path": [], "poses": [], "map": []}
         rows = _evenly(len(trace.poses), ovals)
         frame, last = self.frame, trace.map_at(trace.last_step)
         kept = _evenly(len(last.ids), marks)
         position = trace.pose_covariances[rows][:, :2, :2]
         return {
-            "curve": np.round(100 * curve).astype(int).tolist(),
+            "curve": codes,
             "path": frame.codes(_thinned(trace.poses[:, :2], poses)),
             "poses": frame.ellipses(trace.poses[rows][:, :2], position),
             "map": frame.ellipses(last.means[kept], last.covariances[kept]),

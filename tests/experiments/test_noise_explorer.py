@@ -76,6 +76,36 @@ def test_ellipses_and_paths_are_those_of_the_typical_run(monkeypatch):
     assert (wider[:, 2] > marks[:, 2]).all()
 
 
+FRAGILE = """
+from slamgym.estimator import EkfSlam
+
+class Fragile(EkfSlam):
+    def __init__(self, motion_std, measurement_std, **options):
+        super().__init__(motion_std, measurement_std, **options)
+        self.most = 9 if measurement_std[1] > 0.15 else 99
+
+    def predict(self, odometry, dt=1.0):
+        if self.steps > self.most:
+            raise ValueError("the noise is too large")
+        super().predict(odometry, dt)
+"""
+
+
+def test_a_filter_that_fails_with_some_noise_is_drawn_with_the_other(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "fragile.py").write_text(FRAGILE)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(noise_explorer, "FACTORS", (1.0, 2.0))
+    facts = explore_noise(WORLD, "ekf,fragile:Fragile", 2, 5)
+    drawn = [len(one["path"]) > 0 for cell in facts["cells"] for one in cell["filters"]]
+    assert drawn == [True, True] * 2 + [True, False] * 2
+    failed = facts["cells"][-1]["filters"][1]
+    assert failed["curve"] == failed["poses"] == failed["map"] == []
+    assert failed["nees"] is None
+    assert facts["cells"][-1]["truth"]
+
+
 def test_angles_of_ellipses_are_those_of_their_longer_axis():
     frame = noise_explorer._MapCodes(np.zeros(2), 100.0, np.zeros((0, 2)))
     turned = np.array([[5.0, 4.0], [4.0, 5.0]])  # σ 3 along 45°, 1 across
