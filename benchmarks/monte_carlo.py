@@ -202,7 +202,7 @@ def peak_of(package: str, runs: int) -> float:
 
 
 def study_of(package: str, runs: int) -> Callable[[], object]:
-    """Return a study of two filters in memory."""
+    """Return a function that runs a study of two filters in memory."""
     study = import_module(f"{package}.experiments.monte_carlo_study")
     return lambda: study.monte_carlo("six_landmarks", list(FILTERS), runs)
 
@@ -210,7 +210,7 @@ def study_of(package: str, runs: int) -> Callable[[], object]:
 def files_of(
     package: str, episodes: int, *, form: str, what: str, folder: Path
 ) -> Callable[[], object]:
-    """Return the writing or the reading of some episodes of 1,005 steps."""
+    """Return a function that writes or reads some episodes of 1,005 steps."""
     module = import_module(f"{package}.experiments.trajectories.driven_episodes")
     formats = import_module(f"{package}.experiments.trajectories.formats")
     world = import_module(f"{package}.sim_configs").load_scenario("loop")

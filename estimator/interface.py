@@ -132,7 +132,7 @@ def resume(estimator: Any, before: Any) -> None:
 def returned_on_error(estimator: Any) -> Iterator[None]:
     """Return an estimator to its present state if the block raises, even an interrupt.
 
-    It serves whatever has a :func:`snapshot`, such as a map.
+    It works for any object with a :func:`snapshot`, for example a map.
     """
     before = snapshot(estimator)
     try:

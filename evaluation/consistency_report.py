@@ -241,7 +241,7 @@ def evaluate_in_parts(
     frame: ErrorFrame,
     rng: np.random.Generator,
 ) -> ConsistencyReport:
-    """Do the same with some runs at a time, to limit the memory.
+    """Do the same as `evaluate_consistency` for some runs at a time, to limit memory.
 
     Parameters
     ----------

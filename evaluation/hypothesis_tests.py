@@ -19,7 +19,7 @@ from scipy.special import chdtr, chdtrc, gammaincinv, stdtr, stdtrit
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.guards import argument_checks
 
-#: NIS and degrees of freedom of some runs at a time; a function, to begin again.
+#: Yields NIS and degrees of freedom of some runs at a time; each call begins again.
 Scans = Callable[[], Iterable[tuple[Array, IntArray]]]
 
 
@@ -103,7 +103,7 @@ def nis_test(
 
 
 def nis_test_in_parts(parts: Scans, *, error_rate: float = 0.05) -> HypothesisTest:
-    """Do the same with some runs at a time."""
+    """Apply `nis_test` to some runs at a time."""
     total, freedom = 0.0, 0
     for nis, degrees_of_freedom in parts():
         used = degrees_of_freedom > 0
@@ -179,7 +179,7 @@ def whiteness_test(
 def whiteness_test_in_parts(
     parts: Scans, *, lags: int = 10, error_rate: float = 0.05
 ) -> HypothesisTest:
-    """Do the same with some runs at a time."""
+    """Apply `whiteness_test` to some runs at a time."""
     test = _ljung_box(*autocorrelation_of_nis(parts, lags=lags))
     limit = float(chi_square_quantile(1 - error_rate, lags))
     return HypothesisTest(test.statistic, Band(0.0, limit), test.p_value, error_rate)

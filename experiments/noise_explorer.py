@@ -1,4 +1,4 @@
-"""A page on which the noise is dragged: the NEES, the ellipses and the verdict follow.
+"""A page with sliders for the noise: it shows the NEES, the ellipses and the verdict.
 
 `explore_noise` runs filters over a grid of factors on the noise of motion and of
 measurements; `write_explorer` writes what it found as one page without network.
@@ -32,7 +32,7 @@ from .run_and_replay.log_replay import Progress, replay
 from .run_and_replay.trace import RunTrace
 from .viewers.run_page import PARTS, hash_of, inline_json
 
-#: Of the noise of motion, and of measurements.
+#: Factors on the noise of motion, and on that of measurements.
 FACTORS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 #: Whose noise changes: that of the filters, of the world, or of both.
 CHANGED = ("filter", "world", "both")
@@ -41,7 +41,7 @@ _UNCHANGED = FACTORS.index(1.0)
 #: How many numbers the whole page may hold, so that it has at most 100 kB; the shares
 #: of the curve, the path, and the ellipses of poses and of landmarks.
 _NUMBERS, _SHARES = 30_000, (0.2, 0.3, 0.15, 0.35)
-_CODES, _FARTHEST = 2000, 20_000  # of a length: the world's width, and the largest
+_CODES, _FARTHEST = 2000, 20_000  # codes: of the world's width, and the largest
 _OWN_PARTS = Path(__file__).parent / "noise_explorer_parts"
 _SCRIPTS = (PARTS / "shapes.js", PARTS / "chart.js", _OWN_PARTS / "explorer.js")
 
@@ -109,7 +109,7 @@ class _MapCodes(NamedTuple):
     """How lengths become small integers."""
 
     low: Array
-    #: Of the sides of the square [m].
+    #: Length of the sides of the square [m].
     size: float
     landmarks: Array
 
@@ -263,7 +263,7 @@ def _scaled(scenario: Scenario, motion: float, sensor: float) -> Scenario:
 
 
 def _evenly(count: int, most: int) -> Array:
-    """Return at most so many places among count, the first and the last among them."""
+    """Return at most ``most`` indices below ``count``, with the first and the last."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 

@@ -45,7 +45,7 @@ def progress_bar(
             yield tick
         return
     if console is None:
-        # Not what rich takes for one, by variables such as FORCE_COLOR.
+        # rich trusts variables such as FORCE_COLOR, even for a file.
         console = Console(stderr=True, force_terminal=_is_terminal(sys.stderr))
     columns = (
         bars.TextColumn("{task.description:<10}"),

@@ -10,10 +10,10 @@ Each mutant runs the tests that TESTS names for its file, in a process of its ow
 loads the changed text in place of the file; no file is written. The kernels of PLAIN
 run as plain Python, and others that a mutant changes are compiled anew. A test that
 fails must pass without the mutant. Verdicts are kept in ``results/mutants.jsonl``, and
-a stopped run goes on where it was. The mutants that survive are listed; those in
-``mutants_explained.txt`` change nothing that counts, for the reason that stands beside
-them. mutmut and cosmic-ray write each mutant to disk and start Python and numba anew,
-most of the time here.
+a stopped run continues where it was. The mutants that survive are listed; those in
+``mutants_explained.txt`` have no effect that matters, for the reason given there.
+mutmut and cosmic-ray write each mutant to disk and start Python and numba anew, which
+would take most of the time here.
 """
 
 import argparse

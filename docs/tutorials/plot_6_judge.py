@@ -9,8 +9,8 @@ compares these with the truth.
 # %%
 # The drives
 # ----------
-# ``slamgym generate six_landmarks --episodes 100 --controller open_loop --out drives`` does the same. Here, a filter of slamgym
-# plays the part of the program.
+# The command ``slamgym generate six_landmarks --episodes 100 --controller open_loop --out results/drives`` writes such drives. Here,
+# a filter of slamgym takes the place of the program.
 
 import math
 from pathlib import Path
@@ -55,4 +55,4 @@ for name, found in summarise_monte_carlo(results)["estimators"].items():
 errors = nees_figure(results)
 
 # %%
-# :doc:`/judge` lists the formats and the mistakes that are named. An EKF-SLAM in C in the examples does it without Python.
+# :doc:`/judge` lists the formats and the mistakes that are named. ``examples/16_judge_a_program_in_c.c`` is an EKF-SLAM in C.

@@ -27,7 +27,7 @@ save_figure(column, "results/nees.pdf")
 # %%
 # A whole page
 # ------------
-# Figures are those of matplotlib, so you can change each part of them. ``save_figure`` embeds the fonts. Include the file
+# The figures are matplotlib figures, so you can change every part of them. ``save_figure`` embeds the fonts. Include the file
 # without scaling, so that the size of its text remains.
 
 page = runs_figure(results, width_mm=170)

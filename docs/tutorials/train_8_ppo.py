@@ -45,9 +45,9 @@ model = PPO(
 model.learn(500_000)
 
 # %%
-# On maps that it has not seen
-# ----------------------------
-# A policy is a function of the observation and the environment. Both policies play the same maps.
+# New maps
+# --------
+# A policy is a function of the observation and the environment. Both policies run on the same maps.
 
 env = ActiveSlamEnv("active_medium")
 
@@ -71,5 +71,6 @@ played = {
 print(active_slam_scores.score_table(played))
 
 # %%
-# The returns are 12.6 ± 2.1 for the trained policy and 13.2 ± 1.8 for coverage: after half a million steps, both are alike on 20
-# maps. :doc:`/active_slam_scores` compares five seeds on 100 maps, and :doc:`/reinforcement_learning` lists other libraries.
+# The returns are 12.6 ± 2.1 for the trained policy and 13.2 ± 1.8 for coverage: after half a million steps, 20 maps do not show
+# a difference. :doc:`/active_slam_scores` compares five seeds on 100 maps, and :doc:`/reinforcement_learning` lists other
+# libraries.

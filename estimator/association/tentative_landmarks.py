@@ -124,7 +124,7 @@ class TentativeLandmarks(NamedTuple):
         return self._replace(odds=self.odds + np.where(missed, np.log(chance), 0.0))
 
     def proven(self, needed: int) -> BoolArray:
-        """Return which are in enough scans and unlikely to be clutter, shape (t,)."""
+        """Return which occur in enough scans and are unlikely clutter, shape (t,)."""
         return (self.sightings >= needed) & (self.odds > ENTRY_ODDS)
 
     def with_sightings(

@@ -311,7 +311,7 @@ class EkfSlam(MapFilter):
     #: The kernels of both steps.
     _update_map: ClassVar[UpdateKernel] = staticmethod(update_map)
     _move_pose: ClassVar[Callable[..., None]] = staticmethod(move_pose)
-    #: Messages about further statuses of the update.
+    #: Error messages of further statuses of the update.
     _refusals: ClassVar[Mapping[int, str]] = {}
 
     def __init__(

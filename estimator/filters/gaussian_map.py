@@ -91,7 +91,7 @@ class GaussianMap:
     parts: Parts
     _slots: dict[int, int]
     _last: Callable[[], Any]  # the last report: a `ScanReport`, or one like it
-    _anew: ClassVar[Mapping[str, Any]] = {}  # attributes that a new memory brings
+    _anew: ClassVar[Mapping[str, Any]] = {}  # attributes to reset with a new block
 
     def __init__(self, values: Sequence[float]) -> None:
         capacity = self.capacity_for(FIRST_LANDMARKS)

@@ -531,7 +531,7 @@ def _halves(
 
 
 def among(these: IntArray, size: int) -> BoolArray:
-    """Return which of the first numbers, shape (size,), are among these."""
+    """Return which of the numbers 0 … size - 1 occur in ``these``, shape (size,)."""
     found = np.zeros(size, dtype=bool)
     found[these] = True
     return found

@@ -161,7 +161,7 @@ def marginal_covariance(
 
 
 def inverse(nodes: Sequence[Node], size: int, more: int = 0) -> tuple[Array, IntArray]:
-    """Return H⁻¹, where nodes eliminate all unknowns, from the last node to the first.
+    """Return H⁻¹ from nodes that eliminate all unknowns, the last node first.
 
     With T = L⁻ᵀ X, the rows of a node follow from those of its rest, for all unknowns o
     of the nodes after it::
@@ -178,7 +178,8 @@ def inverse(nodes: Sequence[Node], size: int, more: int = 0) -> tuple[Array, Int
     Returns
     -------
     covariance : ndarray, shape (N + more, N + more)
-        Σ, of the unknowns in another order; further entries are not set.
+        Σ, with the unknowns in another order. The last ``more`` rows and columns are
+        not set.
     places : ndarray, shape (N,)
         The row of each unknown.
     """
@@ -199,8 +200,9 @@ def append(covariance: Array, done: int, at: IntArray, T: Array, noise: Array) -
     Parameters
     ----------
     covariance : ndarray
-        Its first ``done`` rows and columns are set, and then those of y after them.
+        Its first ``done`` rows and columns are set. Those of y are written after them.
     done : int
+        Number of variables so far.
     at : ndarray, shape (r,)
         Rows of x.
     T : ndarray, shape (p, r)
@@ -214,7 +216,7 @@ def append(covariance: Array, done: int, at: IntArray, T: Array, noise: Array) -
 
 
 def permuted(covariance: Array, order: IntArray) -> Array:
-    """Return rows and columns of a matrix in an order, in one pass over the memory."""
+    """Return a matrix with rows and columns in this order, in one pass over memory."""
     found = np.empty((len(order),) * 2)
     _permute(covariance, order, found)
     return found

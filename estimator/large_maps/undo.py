@@ -1,4 +1,4 @@
-"""Take back what a refused call has changed, where a snapshot is too large."""
+"""Undo the changes of a refused call, where a snapshot would be too large."""
 
 from collections.abc import Callable
 

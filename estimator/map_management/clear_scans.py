@@ -1,10 +1,11 @@
-"""Take in clear scans by compiled calls: none of their readings decides anything.
+"""Process clear scans, whose readings decide nothing, by compiled calls.
 
 A scan is clear if every other association that a hypothesis would follow leaves nearly
-the same belief and the same tentative landmarks as the best one, which confirms none.
-`associate_clear` associates it, and `count_clear` counts what it has shown and missed,
-as `associate` and the pruner do with any scan.  Every other scan is left to these: one
-that splits a hypothesis or confirms a landmark, or of a robot that may be lost.
+the same belief and the same tentative landmarks as the best one, and if the best one
+confirms no landmark.  `associate_clear` associates it, and `count_clear` counts what it
+has shown and missed, as `associate` and the pruner do for any scan.  These process all
+other scans: those that split a hypothesis or confirm a landmark, and those of a robot
+that may be lost.
 
 `ClearScans` keeps what the kernels count in a block of memory.  The records that all
 other steps use, `Candidates` and `LandmarkRecords`, are renewed from it when needed.
@@ -111,7 +112,7 @@ class ClearScans:
         self.ahead = 0
         #: Number of the present scan, and whether the filter has used all its readings.
         self.number, self.is_used = 0, True
-        #: The landmark of each of its readings, and the label of its tentative one.
+        #: The landmark of each of its readings, and the label of a tentative landmark.
         self.row_ids: tuple[int | None, ...] = ()
         self.labels: tuple[int, ...] = ()
         #: Its rows of tentative landmarks, and those that are ambiguous.
@@ -122,7 +123,7 @@ class ClearScans:
 
     @staticmethod
     def serve(slam: SlamEstimator, policy: LandmarkPolicy) -> bool:
-        """Return whether this filter and policy do with a scan what the kernel does."""
+        """Return whether the kernel does the same as this filter and policy."""
         inside: Any = filter_inside(slam)
         return (
             isinstance(inside, EkfSlam)
@@ -139,7 +140,7 @@ class ClearScans:
         )
 
     def load(self, candidates: Candidates, records: LandmarkRecords) -> bool:
-        """Hold the records, as renewed last; return whether scans may be clear."""
+        """Load the records as last renewed; return whether scans may be clear."""
         if self._tally is None:
             parts = self._filter.map.parts
             mapped = parts.ids[: parts.numbers[LANDMARKS]].tolist()
@@ -205,7 +206,7 @@ class ClearScans:
         return True
 
     def associate_given(self, ids: IntArray) -> bool:
-        """Take landmarks as given; return whether the map holds all."""
+        """Assign the given landmarks; return whether the map holds all of them."""
         self._scan, self._ids, self.row_ids = None, ids, tuple(ids.tolist())
         self.labels, self.rows = (NO_LABEL,) * len(ids), ((), ())
         self.following = self.tentative.after_scan(self._policy.confirm[1])
@@ -219,7 +220,7 @@ class ClearScans:
         return int((scan.costs <= ceiling).sum()) > 1
 
     def tried(self, readings: Array, ceiling: float) -> list[tuple[float, MapView]]:
-        """Return the costs of the associations up to one, and the beliefs after them.
+        """Return the costs of associations up to a ceiling, and the beliefs after them.
 
         The best one comes first.  Those that the filter refuses are left out.
         """
@@ -296,7 +297,7 @@ class ClearScans:
 
 
 def filter_inside(slam: Any) -> Any:
-    """Return the filter that a recorder follows; any other one itself."""
+    """Return the filter inside a recorder, or any other filter itself."""
     return getattr(slam, "inside", slam)
 
 

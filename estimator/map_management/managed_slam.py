@@ -869,7 +869,7 @@ def distinct(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
 
 
 def differing(beliefs: Sequence[tuple[MapView, bytes]], most: int) -> list[int]:
-    """Return which beliefs differ from those before: maps, and tentative landmarks.
+    """Return which beliefs differ from all before in the map or the labels.
 
     The effect of readings that were left out fades with time.  Of hypotheses with
     overlapping poses, which are variants of one decision, the most probable are

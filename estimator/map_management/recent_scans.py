@@ -141,7 +141,7 @@ class RecentScans(Restorable):
                 self.decisions[place] = made._replace(row_ids=ids)
 
     def note_clear(self, scan: RecentScan, unused: Collection[int]) -> None:
-        """Remember a clear scan, but the landmarks whose readings were not used."""
+        """Remember a clear scan without the landmarks whose readings were not used."""
         if self._window:
             self.scans, self.motions = [*self.scans[-self._window :], scan], ()
         self.decisions.append(ScanDecisions(_without(unused, scan.row_ids)))

@@ -114,7 +114,7 @@ def _check_angles(sensor: Sensor, x: Array, y: Array) -> None:
 
 
 def _jumps_by_a_turn(sensor: Sensor, column: int) -> bool:
-    """Return whether a number jumps by 2π, not at a pole, on an arc of 3 m in view."""
+    """Return whether a number jumps by 2π, except at a pole, in view at 3 m."""
 
     def read(turn: Array) -> Array:
         return sensor.read(3 * np.cos(turn), 3 * np.sin(turn))[:, column]

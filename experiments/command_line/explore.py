@@ -1,4 +1,4 @@
-"""``slamgym explore``: a page on which the noise is dragged."""
+"""``slamgym explore``: a page with sliders for the noise."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +22,7 @@ class ExploreOptions(options.Options):
     change
         Whose noise changes: that of the filters, of the world, or of both.
     out
-        The page. One that explore wrote is replaced.
+        The page. A page that explore wrote is replaced.
     """
 
     estimators: str = options.declared("ekf,invariant", "--estimators -e NAMES")
@@ -34,11 +34,11 @@ class ExploreOptions(options.Options):
 @command
 @options.takes("estimators runs seed steps set_ change out as_json")
 def explore(scenario: options.ScenarioName, *, given: ExploreOptions) -> None:
-    """Write a page on which you drag the noise.
+    """Write a page with sliders for the noise.
 
-    Run filters with σ of motion and of measurement times 0.1 to 10, and write one web
-    page with a slider for each. It shows the NEES, the verdict and the ellipses of a
-    typical run, without network.
+    Run filters with σ of motion and of measurement multiplied by 0.1 to 10, and write a
+    web page with a slider for each. The page shows the NEES, the verdict and the
+    ellipses of a typical run. It works offline.
 
     Examples
     --------

@@ -579,7 +579,7 @@ class Reading(NamedTuple):
     true_id: int | None = None
 
 
-#: What all readings of a scan have, or none.
+#: Fields that all readings of a scan have, or none of them.
 _OPTIONAL = "ids", "sizes", "true ids"
 
 

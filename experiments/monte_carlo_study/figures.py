@@ -134,12 +134,12 @@ def nees_figure(
     width_mm : float, default 85
         Width of the figure [mm]: 85 for a column of a paper, 170 for a page.
     ax : Axes, optional
-        Draw here, in a figure of your own, whose size and layout stay.
+        Axes to draw in; the size and layout of their figure do not change.
 
     Returns
     -------
     Figure
-        For `save_figure`; that of `ax` if given.
+        A figure for `save_figure`: a new one, or that of `ax`.
 
     Raises
     ------

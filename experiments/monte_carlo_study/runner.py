@@ -350,8 +350,8 @@ def _repeated(
     Returns
     -------
     dict
-        `SMALL_NOISE`, shape (estimators, runs); empty if nothing is repeated. The
-        repeated runs are in the folder ``out`` meanwhile, if it is given.
+        `SMALL_NOISE`, shape (estimators, runs); empty if nothing is repeated. If
+        ``out`` is given, this folder stores the repeated runs meanwhile.
     dict
         `SMALL_NOISE_SHARE`, the share of the time that this took; ``seconds`` is the
         time of the other runs.

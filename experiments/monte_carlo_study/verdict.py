@@ -823,7 +823,7 @@ def parts_of(
 ) -> Iterator[tuple[slice, list[AnyArray]]]:
     """Yield variables (run, step) of one estimator from a step on, some runs at a time.
 
-    Results in a file stay there.
+    If the results are in a file, only these runs are loaded.
     """
     size = max(1, _AT_ONCE // results.sizes["step"])
     for first in range(0, results.sizes["run"], size):
@@ -835,7 +835,7 @@ def parts_of(
 class EstimatorScores(NamedTuple):
     """One estimator's results: M successful runs, K steps after the start.
 
-    What has a number per step is read for some runs at a time.
+    Variables with a number per step are read for some runs at a time.
     """
 
     label: str

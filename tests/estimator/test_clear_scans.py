@@ -15,7 +15,7 @@ from slamgym.sim_configs import action_sequence, load_scenario
 
 @pytest.fixture
 def count(monkeypatch):
-    """Return a list that holds, for each scan of the first twin, if it is clear."""
+    """Return a list with a flag per scan of the first twin: whether it is clear."""
     clear, take = [], ManagedSlam._take_clear
 
     def counted(slam, *args):

@@ -84,7 +84,7 @@ def assert_follows(world, here, there):
 
 
 # The joint tests decide the readings of a scan from one side to the other, each given
-# those before it: where a gate is close, a mirrored scan may end otherwise.
+# those before it: close to a gate, a mirrored scan may have another result.
 DECISIONS = [
     *((MOVED, each) for each in ("nearest", "joint", "compatibility", "hypotheses")),
     *((MIRRORED, "nearest"), (IN_FEET, "nearest"), (IN_FEET, "compatibility")),

@@ -92,7 +92,7 @@ def test_below_10_runs_the_time_averages_have_no_say():
     assert few.accepted
     many = report(*(np.concatenate([a, a[:1]]) for a in (nees, nis, freedom)))
     assert not many.accepted
-    nees = np.vstack([nees, np.full((1, 5), np.nan)])  # a failed run is no tenth
+    nees = np.vstack([nees, np.full((1, 5), np.nan)])  # a failed run
     failed = report(nees, *(np.concatenate([a, a[:1]]) for a in (nis, freedom)))
     assert failed.average_p_value == 1.0
 

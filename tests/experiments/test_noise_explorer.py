@@ -1,4 +1,4 @@
-"""The page on which the noise is dragged: its numbers, its size, and in Chromium."""
+"""The page with sliders for the noise: its numbers, its size, and in Chromium."""
 
 import json
 

@@ -19,7 +19,7 @@ class Terminal(io.StringIO):
 
 
 def terminal(monkeypatch, between=0.0):
-    """Have standard error be a terminal, whose bars move every so many seconds."""
+    """Make standard error a terminal whose bars move at this interval [s]."""
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
     monkeypatch.setenv("TERM", "xterm")

@@ -33,7 +33,7 @@ from .store import Submap
 
 # Decrement at which to stop: the step is then below 1e-4 standard deviations.
 CONVERGED = 1e-9
-# A part of the map of as many entries per unknown is taken from the covariance of all.
+# A part of the map with more entries per unknown uses the covariance of all unknowns.
 MANY = 0.75
 # Number of submaps whose factors are kept from one iteration to the next: 20 MB.
 MOST_KEPT = 500
@@ -137,16 +137,16 @@ class JoinedMap:
     def _small_covariance(
         self, size: int, rows: IntArray, columns: IntArray, owned: Sequence[Owned]
     ) -> Array:
-        """Return the covariance of a part of the map, by the factor.
+        """Return the covariance of a small part of the map, from the factors.
 
         Parameters
         ----------
         size : int
             Length of its state.
         rows, columns : ndarray, shape (v,)
-            The entries of the state that are unknowns, and which ones.
+            Entries of the state that are unknowns, and the indices of these unknowns.
         owned : sequence of Owned
-            The others.
+            The other entries, by submap.
         """
         own = np.zeros((size, size))
         entries = [(columns, rows, np.ones(len(rows)))]
@@ -162,7 +162,7 @@ class JoinedMap:
     def _large_covariance(
         self, size: int, rows: IntArray, columns: IntArray, owned: Sequence[Owned]
     ) -> Array:
-        """Return the same, by the covariance of all unknowns."""
+        """Return the covariance of a large part, from that of all unknowns."""
         P, places = self._factors.inverse(size - len(rows))
         done, order = len(places), np.empty(size, dtype=np.int64)
         order[rows] = places[columns]
