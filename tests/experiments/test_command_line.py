@@ -224,7 +224,7 @@ def test_a_replay_prints_every_landmark_with_both_distances(log, without_picture
     rows = [line.split() for line in lines if line.strip().startswith(("7 ", "9 "))]
     path = log.parent / "results/little-invariant/summary.json"
     seven = json.loads(path.read_text())["landmarks"][0]
-    forms = {"x": ".4f", "y": ".4f", "euclidean": ".7f", "mahalanobis": ".5f"}
+    forms = {"x": ".4f", "y": ".4f", "euclidean": ".4g", "mahalanobis": ".4g"}
     assert rows[0] == ["7", *(format(seven[key], form) for key, form in forms.items())]
     assert rows[1][3:] == ["-", "-"]
     assert "Wrote results/little-invariant/" in lines
