@@ -222,8 +222,9 @@ def page_environment(
 ) -> Environment:
     """Return an environment that escapes every value and refuses unknown ones.
 
-    Its templates may include ``web_style.css``, the colours and fonts in light and
-    dark.
+    Its templates may include ``web_head.html``, the head of a page, which allows the
+    script of ``script_hash`` alone, if any, and ``web_style.css``, the colours and
+    fonts in light and dark.
 
     Parameters
     ----------
