@@ -16,16 +16,12 @@ class BenchmarkOptions(options.Options):
 
     Attributes
     ----------
-    estimators
-        Filters separated by commas, such as "ekf,invariant[iterations=3]", or your own
-        "module:Class"; options in brackets.
     verify
         Repeat two of the worlds of a file, and compare all bits of their results.
     out
         A new file for the scores, the versions and the digests.
     """
 
-    estimators: str = options.declared("ekf,invariant", "--estimators -e NAMES")
     verify: Path | None = options.declared(None, "FILE.json", "score")
     out: Path | None = options.declared(None, "FILE.json", "print them")
 

@@ -14,9 +14,6 @@ class ExploreOptions(options.Options):
 
     Attributes
     ----------
-    estimators
-        Filters separated by commas, such as "ekf,invariant[iterations=3]", or your own
-        "module:Class"; options in brackets.
     runs
         Runs for each of 49 pairs of noises.
     change
@@ -25,7 +22,6 @@ class ExploreOptions(options.Options):
         The page. A page that explore wrote is replaced.
     """
 
-    estimators: str = options.declared("ekf,invariant", "--estimators -e NAMES")
     runs: int = options.declared(100, "", min=2)
     change: str = options.declared("filter", "filter|world|both")
     out: Path | None = options.declared(None, "FILE.html", "explore-<scenario>.html")

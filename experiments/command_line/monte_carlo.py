@@ -35,9 +35,6 @@ class MonteCarloOptions(options.Options):
 
     Attributes
     ----------
-    estimators
-        Filters separated by commas, such as "ekf,invariant[iterations=3]", or your own
-        "module:Class"; options in brackets.
     runs
         Number of runs. Run i is the world of seed SEED + i, so studies with overlapping
         seed ranges share worlds.
@@ -63,7 +60,6 @@ class MonteCarloOptions(options.Options):
         to existing ones.
     """
 
-    estimators: str = options.declared("ekf,invariant", "--estimators -e NAMES")
     runs: int = options.declared(200, "")
     until: str | None = options.declared(None, "decided")
     assume: list[str] | None = options.declared(None, "KEY=VALUE")

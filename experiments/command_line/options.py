@@ -90,6 +90,9 @@ class Options:
     estimator
         A filter (see: slamgym estimators), or your own "module:Class", with or without
         options, as in "invariant[iterations=3]".
+    estimators
+        Filters separated by commas, such as "ekf,invariant[iterations=3]", or your own
+        "module:Class"; options in brackets.
     labels
         Filters separated by commas, such as "ekf,invariant[iterations=3]", or your own
         "module:Class". run.html and comparison.png show all of them; the other files
@@ -152,6 +155,7 @@ class Options:
     """
 
     estimator: str = declared("invariant", "--estimator -e NAME")
+    estimators: str = declared("ekf,invariant", "--estimators -e NAMES")
     labels: str = declared("invariant", "--estimator -e NAMES")
     option_texts: list[str] | None = declared(None, "--option KEY=VALUE")
     motion_std: str | None = declared(None, "A,B,C", "from the log")
