@@ -25,7 +25,9 @@ from ..sim_configs import Scenario
 from ..sim_configs.scenario_files import replace_when_written
 from .figures.style import page_environment
 from .logs.recording import record_episode
+from .logs.slamlog import SlamLog
 from .monte_carlo_study import monte_carlo, summarise_monte_carlo
+from .monte_carlo_study.runner import with_noise_times
 from .monte_carlo_study.verdict import POSE_FREEDOM, EstimatorScores, scores_of
 from .run_and_replay.filter_settings import EstimatorChoice, estimator_choices
 from .run_and_replay.log_replay import Progress, replay
@@ -77,16 +79,14 @@ def explore_noise(
         first filter with the unchanged noise.
     """
     choices = estimator_choices(estimators)
+    study = _Exploration(scenario, estimators, choices, runs, seed, change).begun()
     pairs = [(motion, sensor) for sensor in FACTORS for motion in FACTORS]
-    study = _Exploration(scenario, estimators, choices, runs, seed, change)
-    pairs.insert(0, (1.0, 1.0))  # selects the typical run and the size of the map
+    studies = 1 + len(pairs)  # the first one has chosen the typical run
+    progress(runs, studies * runs)
     cells: list[dict[str, Any]] = []
-    for done, pair in enumerate(pairs, 1):
-        if done == 1:
-            study = study.begun()
-        else:
-            cells.append(study.cell(*pair))
-        progress(done * runs, len(pairs) * runs)
+    for done, pair in enumerate(pairs, 2):
+        cells.append(study.cell(*pair))
+        progress(done * runs, studies * runs)
     low, high = np.array(average_band(runs, POSE_FREEDOM)) / POSE_FREEDOM
     return {
         "world": scenario.name,
@@ -178,12 +178,13 @@ class _Exploration(NamedTuple):
         good = np.flatnonzero(scores.good)
         run = int(good[order[len(order) // 2]]) if len(good) else 0
         study = self._replace(typical=self.seed + run)
-        trace, landmarks = study.replayed(self.scenario, self.scenario, self.choices[0])
-        return study._replace(frame=_MapCodes.around(trace, landmarks))
+        log = study.log_of(self.scenario)
+        trace = replayed(log, self.choices[0], self.scenario)
+        return study._replace(frame=_MapCodes.around(trace, log.landmarks))
 
     def cell(self, motion: float, sensor: float) -> dict[str, Any]:
         """Return what the page shows for a pair of factors."""
-        scaled = _scaled(self.scenario, motion, sensor)
+        scaled = with_noise_times(self.scenario, motion, sensor)
         actual = self.scenario if self.change == "filter" else scaled
         assumed = self.scenario if self.change == "world" else scaled
         results = monte_carlo(
@@ -195,13 +196,13 @@ class _Exploration(NamedTuple):
             progress=False,
         )
         summary = summarise_monte_carlo(results)
-        filters, truth = [], None
+        log, filters, truth = self.log_of(actual), [], None
         for choice in self.choices:
             entry = summary["estimators"][choice.label]
             scores = scores_of(results, choice.label, "invariant")
             trace: RunTrace | None = None  # of a run that failed
             if scores.good[self.typical - self.seed]:
-                trace, _ = self.replayed(actual, assumed, choice)
+                trace = replayed(log, choice, assumed)
                 truth = trace.true_poses
             filters.append(
                 {
@@ -240,26 +241,16 @@ class _Exploration(NamedTuple):
             "map": frame.ellipses(last.means[kept], last.covariances[kept]),
         }
 
-    def replayed(
-        self, actual: Scenario, assumed: Scenario, choice: EstimatorChoice
-    ) -> tuple[RunTrace, Array]:
-        """Filter the typical run; return its trace and the true landmarks."""
+    def log_of(self, actual: Scenario) -> SlamLog:
+        """Drive the typical run in a world."""
         driver = make_controller("open_loop", actual, np.random.default_rng(0))
-        log = record_episode(actual, driver, self.typical)
-        slam = choice.settings(assumed).make(log.start)
-        return replay(log, slam, name=choice.label).trace, log.landmarks
+        return record_episode(actual, driver, self.typical)
 
 
-def _scaled(scenario: Scenario, motion: float, sensor: float) -> Scenario:
-    """Multiply the noise of the motion, and that of the measurements."""
-    given = scenario.sensor
-    return scenario.with_changes(
-        motion={"std": [motion * std for std in scenario.motion.std]},
-        sensor={
-            "std": [sensor * std for std in given.std],
-            "range_std_per_metre": sensor * given.range_std_per_metre,
-        },
-    )
+def replayed(log: SlamLog, choice: EstimatorChoice, assumed: Scenario) -> RunTrace:
+    """Filter a log with the noise of a scenario."""
+    slam = choice.settings(assumed).make(log.start)
+    return replay(log, slam, name=choice.label).trace
 
 
 def _evenly(count: int, most: int) -> Array:

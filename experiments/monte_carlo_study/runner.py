@@ -400,16 +400,19 @@ def with_less_noise(scenario: Scenario, factor: float) -> Scenario:
     >>> with_less_noise(load_scenario("six_landmarks"), 0.5).motion.std
     (0.125, 0.05, 0.05)
     """
+    start = {"std": [factor * std for std in scenario.start.std]}
+    return with_noise_times(scenario, factor, factor).with_changes(start=start)
 
-    def scaled(deviations: Sequence[float]) -> list[float]:
-        return [factor * std for std in deviations]
 
-    sensor = scenario.sensor
-    per_metre = factor * sensor.range_std_per_metre
+def with_noise_times(scenario: Scenario, motion: float, sensor: float) -> Scenario:
+    """Multiply the noise of the motion, and that of the measurements."""
+    given = scenario.sensor
     return scenario.with_changes(
-        start={"std": scaled(scenario.start.std)},
-        motion={"std": scaled(scenario.motion.std)},
-        sensor={"std": scaled(sensor.std), "range_std_per_metre": per_metre},
+        motion={"std": [motion * std for std in scenario.motion.std]},
+        sensor={
+            "std": [sensor * std for std in given.std],
+            "range_std_per_metre": sensor * given.range_std_per_metre,
+        },
     )
 
 
