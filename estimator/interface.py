@@ -10,7 +10,7 @@ import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from numpy.typing import ArrayLike
 
@@ -221,16 +221,27 @@ def _takes_landmark_ids(belief: Callable[..., Belief]) -> bool:
     return "landmark_ids" in inspect.signature(belief).parameters
 
 
+class _OfInside:
+    """A member of a wrapper: that of the filter inside, where this has one."""
+
+    def __set_name__(self, wrapper: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, wrapper: Any, kind: type | None = None) -> Any:
+        if wrapper is None:
+            return self
+        if wrapper.passes_on:
+            return getattr(wrapper._inside, self._name)
+        raise AttributeError(f"{kind} object has no attribute {self._name!r}")
+
+
 class FilterWrapper(Interruptible):
-    """A filter around another one: its map is that of the filter inside.
+    """A filter around another one: its map is that of the filter inside."""
 
-    It passes on the members of `passed_on` that the filter inside has.
-    """
-
-    #: Optional members that need no more than the filter inside.
-    passed_on: tuple[str, ...] = (
-        "observe_truth",
-        *("local_view", "join", "smoothed", "belief_limit"),
+    #: Whether to pass on the optional members that need no more than the filter inside.
+    passes_on = True
+    observe_truth, local_view, join, smoothed, belief_limit = (
+        _OfInside() for _ in range(5)
     )
 
     @property
@@ -251,12 +262,3 @@ class FilterWrapper(Interruptible):
     def landmark_ids(self) -> tuple[int, ...]:
         """The mapped landmarks, in the order of the belief."""
         return mapped_ids(self._inside)
-
-    if not TYPE_CHECKING:  # else every name would be a member
-
-        def __getattr__(self, name: str) -> Any:
-            """Return a member of the filter inside."""
-            if name in self.passed_on:
-                return getattr(self._inside, name)
-            kind = type(self).__name__
-            raise AttributeError(f"{kind!r} object has no attribute {name!r}")

@@ -208,9 +208,11 @@ class ClearScans:
     def associate_given(self, ids: IntArray) -> bool:
         """Assign the given landmarks; return whether the map holds all of them."""
         self._scan, self._ids, self.row_ids = None, ids, tuple(ids.tolist())
+        if not all(map(self._filter.map.slots.__contains__, self.row_ids)):
+            return False
         self.labels, self.rows = (NO_LABEL,) * len(ids), ((), ())
         self.following = self.tentative.after_scan(self._policy.confirm[1])
-        return all(map(self._filter.map.slots.__contains__, self.row_ids))
+        return True
 
     def has_rivals(self, ceiling: float) -> bool:
         """Return whether another association costs no more than this."""

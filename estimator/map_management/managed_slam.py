@@ -151,7 +151,7 @@ class ManagedSlam(FilterWrapper):
         #: Number of steps taken.
         self.steps = 0
         if policy.association == "hypotheses":
-            self.passed_on = ()
+            self.passes_on = False
 
     # The results, which are those of the most probable hypothesis.
 
@@ -356,18 +356,17 @@ class ManagedSlam(FilterWrapper):
         self, readings: Array, landmark_ids: LandmarkIds | None
     ) -> UpdateReport | None:
         """Take in a scan if it is clear in every hypothesis: see `ClearScans`."""
-        ceiling, found = np.inf, []
+        ceiling, ranked = np.inf, []
         for h in self._hypotheses:
             cost = h.associate_clear(readings, landmark_ids, ceiling - h.cost)
             if cost is None:
                 return None
-            found.append((h.cost + cost, h))
+            ranked.append((h.cost + cost, h))
             ceiling = min(ceiling, h.cost + cost + SPREAD)
-        ranked = found
-        if len(found) > 1:
-            ranked = sorted([f for f in found if f[0] <= ceiling], key=itemgetter(0))
+        if len(ranked) > 1:
+            ranked = sorted([r for r in ranked if r[0] <= ceiling], key=itemgetter(0))
         every = [h for _, h in ranked]
-        if self._is_split(every, readings, ceiling):
+        if landmark_ids is None and self._is_split(every, readings, ceiling):
             return None
         taken = self._taken(ranked, readings)
         if not taken:
