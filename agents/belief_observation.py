@@ -16,12 +16,12 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
+from .. import argument_checks
 from ..arrays import AnyArray, Array, BoolArray
 from ..envs import LandmarkWorldEnv
 from ..envs.vector.landmark_world_vector import final_infos
 from ..estimator.filters.batch import BatchBeliefs, BatchSlam, BatchStorage, can_batch
 from ..estimator.filters.ekf import EkfSlam
-from ..estimator.guards import argument_checks
 from ..estimator.interface import resume, snapshot
 from ..estimator.registry import accepted_models, find_estimator, make_batch, read_label
 from ..restorable import Restorable, State

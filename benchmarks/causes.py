@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 import xarray as xr
 
+from slamgym.argument_checks import LandmarkIds
 from slamgym.estimator import Belief, InvariantEkfSlam
-from slamgym.estimator.guards.argument_checks import LandmarkIds
 from slamgym.experiments.monte_carlo_study import monte_carlo, summarise_monte_carlo
 from slamgym.sim_configs import Scenario, load_scenario
 

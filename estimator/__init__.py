@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from .check_estimator import EstimatorContractError as EstimatorContractError
     from .check_estimator import check_estimator as check_estimator
     from .filters import *
-    from .guards import argument_checks as argument_checks
     from .interface import Belief as Belief
     from .interface import ScanDecisions as ScanDecisions
     from .interface import SlamEstimator as SlamEstimator

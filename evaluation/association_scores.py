@@ -25,8 +25,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..argument_checks import as_floats
 from ..arrays import AnyArray, Array
-from ..estimator.guards.argument_checks import as_floats
 from ..estimator.interface import ScanDecisions
 from ..estimator.models.rigid_motion import rotation
 from ..estimator.models.sensors import Sensor, find_sensor

@@ -14,8 +14,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .. import argument_checks
 from ..arrays import Array, BoolArray, IntArray
-from ..estimator.guards import argument_checks
 from ..estimator.models.rigid_motion import ErrorFrame
 from ..suggestions import counted
 from . import hypothesis_tests as tests

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import bdtrc, chdtri, stdtr, stdtrit
 
+from .. import argument_checks
 from ..arrays import Array, BoolArray
-from ..estimator.guards import argument_checks
 from ..suggestions import counted
 from . import noise_findings
 from .hypothesis_tests import time_average_test

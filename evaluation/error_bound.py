@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
+from .. import argument_checks
 from ..arrays import SMALLEST, Array, BoolArray, IntArray
 from ..estimator.filters.batch import BatchSlam
 from ..estimator.filters.ekf import EkfSlam
-from ..estimator.guards import argument_checks
 from ..estimator.models.rigid_motion import invariant_covariance, seen_from
 from ..estimator.models.sensors import BEARING_RANGE, POSITION, Sensor, find_sensor
 

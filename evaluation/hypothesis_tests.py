@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtr, chdtrc, gammaincinv, stdtr, stdtrit
 
+from .. import argument_checks
 from ..arrays import Array, BoolArray, IntArray
-from ..estimator.guards import argument_checks
 
 #: Yields NIS and degrees of freedom of some runs at a time; each call begins again.
 Scans = Callable[[], Iterable[tuple[Array, IntArray]]]

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtr, chdtrc, chndtr
 
+from ..argument_checks import shaped
 from ..arrays import Array, BoolArray, IntArray
-from ..estimator.guards.argument_checks import shaped
 from .hypothesis_tests import EQUIVALENCE_MARGIN, EquivalenceTest, equivalence_test
 from .sequential_tests import EProcess, MeanEProcess, average_of
 

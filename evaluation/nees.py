@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..argument_checks import one_of
 from ..arrays import Array
-from ..estimator.guards.argument_checks import one_of
 from ..estimator.models.rigid_motion import (
     ERROR_FRAMES,
     ErrorFrame,

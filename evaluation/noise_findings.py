@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtr, chdtrc, ndtr, stdtr
 
+from .. import argument_checks
 from ..arrays import Array, BoolArray, IntArray
-from ..estimator.guards import argument_checks
 from ..estimator.models.bearing_range import wrap_angle
 from ..estimator.models.sensors import Sensor, only_bearing_range
 

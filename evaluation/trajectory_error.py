@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..argument_checks import as_floats, shaped
 from ..arrays import Array, IntArray
-from ..estimator.guards.argument_checks import as_floats, shaped
 from ..estimator.models.bearing_range import wrap_angle
 from ..estimator.models.rigid_motion import rotation, rotations
 

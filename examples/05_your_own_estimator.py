@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slamgym import Belief, UpdateReport, check_estimator
-from slamgym.estimator import EstimatorContractError, argument_checks, wrap_angle
+from slamgym import Belief, UpdateReport, argument_checks, check_estimator
+from slamgym.estimator import EstimatorContractError, wrap_angle
 
 ORIGIN = (0.0, 0.0, 0.0)
 

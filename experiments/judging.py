@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from .. import argument_checks
 from ..arrays import AnyArray, Array
 from ..estimator.filters.batch import BatchTrace
-from ..estimator.guards import argument_checks
 from ..estimator.models.rigid_motion import pose_rotation
 from ..evaluation.consistency_report import evaluate_consistency
 from ..evaluation.error_bound import PosteriorBound

@@ -26,8 +26,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..argument_checks import one_of
 from ..arrays import Array
-from ..estimator.guards.argument_checks import one_of
 from ..evaluation.consistency_report import evaluate_consistency
 from ..evaluation.nees import normalised_squared_error
 from .estimate_conventions import unit_of

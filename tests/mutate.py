@@ -95,7 +95,7 @@ TESTS = {
     "estimator/association": f"{SCANS} joint_assignment",
     "estimator/association/constellations": "constellations loop_closing",
     "estimator/association/missed_landmarks": "missed_detections map_management",
-    "estimator/guards": "errors_change_nothing saved_states filter_memory magnitudes",
+    "estimator/guards": "errors_change_nothing saved_states magnitudes",
     "estimator/interface": "representations ekf_slam pose_readings check_estimator",
     "estimator/map_management": f"{SCANS} missed_detections map_editor",
     "estimator/map_management/clear_scans": "clear_scans map_management",
@@ -165,6 +165,7 @@ TESTS = {
     "experiments/viewers/run_page": "run_page",
     "sim_configs": "scenario layouts controls city randomisation extreme_scenarios",
     "src/slamgym": "public_names kernel_cache leaves scenario",
+    "src/slamgym/argument_checks": "errors_change_nothing magnitudes filter_memory",
     "src/slamgym/restorable": "state_and_restore",
     "src/slamgym/suggestions": "scenario command_line",
 }

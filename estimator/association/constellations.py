@@ -27,8 +27,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
+from ... import argument_checks
 from ...arrays import Array, BoolArray, ComplexArray, IntArray
-from ..guards import argument_checks
 from ..kernels.assignment_search import compare_pairs, search_clique
 from ..models.relative_geometry import lever_of, offset_covariance, squared_offsets
 from ..models.rigid_motion import left_jacobian, rotation

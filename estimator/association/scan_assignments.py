@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
+from ... import argument_checks
 from ...arrays import Array, IntArray
 from ...jit import jit, jit_in_place, njit_allocating
-from ..guards import argument_checks
 from ..interface import MapView
 from ..kernels.assignment_search import (
     UNPAIRED,

@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ... import argument_checks
+from ...argument_checks import aligned_zeros, shaped, usable_cores
 from ...arrays import LARGEST, AnyArray, Array, BoolArray, IntArray
 from ...restorable import Restorable, State
 from ..beliefs import Belief, columns_of
-from ..guards import argument_checks, saved_states
-from ..guards.argument_checks import aligned_zeros, shaped, usable_cores
+from ..guards import saved_states
 from ..kernels.batch import (
     NEVER,
     RunArrays,

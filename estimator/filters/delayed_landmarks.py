@@ -43,10 +43,10 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from ...argument_checks import LOWEST_ID, RESERVED_IDS, refuse_reserved
 from ...arrays import LARGEST, Array, BoolArray, IntArray
 from ..beliefs import Belief, MapView, UpdateReport
 from ..guards import saved_states
-from ..guards.argument_checks import LOWEST_ID, RESERVED_IDS, refuse_reserved
 from ..guards.saved_states import NUMBERS, WHOLE, Table, with_prefix, without_prefix
 from ..interface import returned_on_error
 from ..kernels.scan_update import (

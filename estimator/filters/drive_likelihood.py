@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ... import argument_checks
+from ...argument_checks import aligned_zeros, usable_cores
 from ...arrays import LARGEST, Array, IntArray
 from ...jit import jit, njit_internal
-from ..guards import argument_checks
-from ..guards.argument_checks import aligned_zeros, usable_cores
 from ..kernels import scan_update as scan
 from ..kernels.batch import share_out
 from ..kernels.scan_update import (

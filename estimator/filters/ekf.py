@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ... import argument_checks
+from ...argument_checks import LandmarkIds, landmark_pairs, with_copies
 from ...arrays import Array, IntArray
 from ..beliefs import Belief, MapView, UpdateReport, describe_filter
-from ..guards import argument_checks
-from ..guards.argument_checks import LandmarkIds, landmark_pairs, with_copies
 from ..kernels import scan_update as scan
 from ..kernels.scan_update import DONE, FRAMES, NOT_USABLE, BeliefArrays, Rules
 from ..models.motions import UNICYCLE, Motion, MotionNoise

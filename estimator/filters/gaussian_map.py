@@ -15,16 +15,16 @@ from weakref import ref
 
 import numpy as np
 
-from ...arrays import Array, IntArray
-from ...jit import jit_in_place, njit_inlined, njit_internal
-from ..beliefs import Belief, MapView, UpdateReport, columns_of
-from ..guards.argument_checks import (
+from ...argument_checks import (
     aligned_copy,
     aligned_zeros,
     covariance_bytes,
     too_large,
     with_copies,
 )
+from ...arrays import Array, IntArray
+from ...jit import jit_in_place, njit_inlined, njit_internal
+from ..beliefs import Belief, MapView, UpdateReport, columns_of
 from ..kernels import scan_update as scan
 from ..kernels.scan_update import DONE, BeliefArrays, Rules, update_lower_half
 from ..models.rigid_motion import ErrorFrame, predict

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ... import argument_checks
+from ...argument_checks import LandmarkIds
 from ...arrays import Array
 from ..beliefs import UpdateReport
-from ..guards import argument_checks, saved_states
-from ..guards.argument_checks import LandmarkIds
+from ..guards import saved_states
 from ..interface import returned_on_error
 from ..kernels.scan_update import AT_ESTIMATE, AT_TRUTH, BeliefArrays
 from ..models.rigid_motion import composed, pose_rotation

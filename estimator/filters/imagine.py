@@ -7,8 +7,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ... import argument_checks
 from ...arrays import Array, IntArray
-from ..guards import argument_checks
 from ..kernels.imagine import Imagined, as_view, imagine_plans
 from ..kernels.scan_update import AFTER_STDS, FIRST_STD, workspace_for
 from ..models.motions import only_unicycle

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ... import argument_checks
 from ...arrays import Array, IntArray
 from ..beliefs import Belief, UpdateReport
-from ..guards import argument_checks
 from ..kernels.scan_update import Rules
 from ..models.bearing_range import wrap_angle
 from ..models.relative_geometry import lever_of

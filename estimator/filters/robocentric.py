@@ -8,11 +8,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ... import argument_checks
+from ...argument_checks import LandmarkIds
 from ...arrays import Array, IntArray
 from ...jit import jit_in_place, njit_internal
 from ..beliefs import Belief, MapView, part_of
-from ..guards import argument_checks, saved_states
-from ..guards.argument_checks import LandmarkIds
+from ..guards import saved_states
 from ..kernels.scan_update import DONE
 from ..models.rigid_motion import as_covariance
 from ..models.sensors import only_placing

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...argument_checks import as_floats, identities
 from ...arrays import LARGEST_IN_STATE, Array, IntArray
-from .argument_checks import as_floats, identities
 
 #: Tolerance of a negative eigenvalue, relative to the trace, or to 1 if it is less.
 ROUNDING = 1e-9

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...argument_checks import aligned_zeros
 from ...arrays import LARGEST, Array, IntArray
 from ...jit import fma, njit_apart, njit_inlined, njit_internal
-from ..guards.argument_checks import aligned_zeros
 from ..models.bearing_range import (
     difference_jit,
     expected_reading_jit,

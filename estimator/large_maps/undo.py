@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from ..guards.argument_checks import with_copies
+from ...argument_checks import with_copies
 
 #: What takes back later changes; it may be called more than once.
 Undo = Callable[[], object]

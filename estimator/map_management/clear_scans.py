@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...argument_checks import aligned_copy
 from ...arrays import Array, IntArray
 from ...jit import jit, njit_allocating, njit_inlined, njit_internal
 from ..association.missed_landmarks import (
@@ -59,7 +60,6 @@ from ..filters.gaussian_map import (
     parts_of,
     update_map,
 )
-from ..guards.argument_checks import aligned_copy
 from ..interface import MapView, SlamEstimator, hides_its_belief
 from ..kernels.scan_update import DONE, OUTCOME, SLOT, USED, usable
 from ..models.bearing_range import wrap_angle

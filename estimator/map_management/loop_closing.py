@@ -32,6 +32,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ... import argument_checks
 from ...arrays import LARGEST, Array, BoolArray, IntArray
 from ...jit import jit
 from ..association.constellations import (
@@ -45,7 +46,6 @@ from ..association.constellations import (
     turn_between,
 )
 from ..association.scan_assignments import Noise, with_readings
-from ..guards import argument_checks
 from ..interface import MapView
 from ..models.bearing_range import wrap_angle
 from ..models.relative_geometry import (

@@ -20,6 +20,8 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ... import argument_checks
+from ...argument_checks import LandmarkIds
 from ...arrays import Array, IntArray
 from ..association.missed_landmarks import LOST_SCORE
 from ..association.scan_assignments import AssociationSensor
@@ -31,8 +33,7 @@ from ..association.scan_association import (
 )
 from ..association.tentative_landmarks import TentativeLandmarks
 from ..filters.pose_readings import PoseReading, observe_relative_pose
-from ..guards import argument_checks, saved_states
-from ..guards.argument_checks import LandmarkIds
+from ..guards import saved_states
 from ..guards.interrupts import changing
 from ..guards.saved_states import with_prefix, without_prefix
 from ..interface import (

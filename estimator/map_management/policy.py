@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from ... import argument_checks
 from ...arrays import Array, BoolArray
 from ...suggestions import closest
 from ..association.constellations import Constellations
 from ..association.scan_assignments import AssociationPolicy
-from ..guards import argument_checks
 from ..models.bearing_range import wrap_angle
 
 

@@ -29,8 +29,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ... import argument_checks
 from ...arrays import LARGEST, Array
-from ..guards import argument_checks
 from .rigid_motion import composed
 
 Real = Any  # a number, or an array of any shape

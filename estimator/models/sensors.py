@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ... import argument_checks
 from ...arrays import LARGEST_RANGE_GROWTH, Array
-from ..guards import argument_checks
 from .bearing_range import LandmarkLocation, MeasurementPrediction, wrap_angle
 from .rigid_motion import rotation
 

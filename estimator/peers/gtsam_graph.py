@@ -21,8 +21,9 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ... import argument_checks
 from ...arrays import Array
-from ..guards import argument_checks, saved_states
+from ..guards import saved_states
 from ..models.bearing_range import locate_landmark
 from ..models.rigid_motion import pose_rotation
 from . import peer_slam

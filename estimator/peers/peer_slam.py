@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ... import argument_checks
+from ...argument_checks import LandmarkIds
 from ...arrays import Array, IntArray
-from ..guards import argument_checks
-from ..guards.argument_checks import LandmarkIds
 from ..interface import Belief, UpdateReport
 from ..models.bearing_range import predict_measurement, wrap_angle
 from ..models.motions import UNICYCLE, Motion, MotionNoise, predict_pose

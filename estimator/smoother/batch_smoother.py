@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import cho_solve, solve_triangular
 
+from ... import argument_checks
+from ...argument_checks import LandmarkIds
 from ...arrays import Array, IntArray
-from ..guards import argument_checks
-from ..guards.argument_checks import LandmarkIds
 from ..interface import Belief, SlamEstimator
 from ..map_management.managed_slam import filter_in
 from ..models.bearing_range import locate_landmark, wrap_angle

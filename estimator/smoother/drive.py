@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ... import argument_checks
 from ...arrays import Array, IntArray
 from ..filters.ekf import checked_rules
 from ..filters.pose_readings import PoseReading
-from ..guards import argument_checks
 from ..kernels.scan_update import AT_ESTIMATE
 from ..models.bearing_range import wrap_angle
 from ..models.motions import UNICYCLE, Motion, MotionNoise

@@ -8,9 +8,10 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ... import argument_checks
 from .. import interface
 from ..filters.pose_readings import PoseReading
-from ..guards import argument_checks, saved_states
+from ..guards import saved_states
 from ..guards.interrupts import changing
 from ..map_management.map_editor import MapEditor
 from ..models.motions import UNICYCLE, Motion

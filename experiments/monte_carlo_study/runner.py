@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ...argument_checks import one_of, usable_cores
 from ...arrays import Array
 from ...envs.spaces import count_rows
 from ...estimator import registry
-from ...estimator.guards.argument_checks import one_of, usable_cores
 from ...evaluation.diagnosis import SMALLEST_NOISE
 from ...sim_configs import Scenario, load_scenario
 from ..job_folders import (

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ...argument_checks import one_of
 from ...arrays import AnyArray, Array, BoolArray, IntArray
-from ...estimator.guards.argument_checks import one_of
 from ...estimator.models.rigid_motion import ERROR_FRAMES, ErrorFrame
 from ...estimator.models.sensors import DELAYED
 from ...evaluation.consistency_report import (

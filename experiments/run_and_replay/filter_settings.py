@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
+from ... import argument_checks
 from ...estimator import interface, registry
-from ...estimator.guards import argument_checks
 from ...estimator.models.sensors import Sensor, sensor_in
 from ...public_names import is_here
 from ...sim_configs import Scenario

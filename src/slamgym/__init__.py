@@ -16,6 +16,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from . import agents as agents
+    from . import argument_checks as argument_checks
     from . import envs as envs
     from . import estimator as estimator
     from . import evaluation as evaluation

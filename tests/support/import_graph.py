@@ -10,8 +10,8 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("sim_configs", "envs", "estimator", "evaluation", "agents", "experiments")
 # Beside the rooms; every room may import them.
 GROUND = {
-    *("arrays", "jit", "kernel_variants", "leaves", "public_names", "restorable"),
-    "suggestions",
+    *("argument_checks", "arrays", "jit", "kernel_variants", "leaves"),
+    *("public_names", "restorable", "suggestions"),
 }
 
 

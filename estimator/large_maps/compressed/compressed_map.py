@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ....argument_checks import LOWEST_ID, covariance_bytes
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam, InvariantEkfSlam
 from ...guards import saved_states
-from ...guards.argument_checks import LOWEST_ID, covariance_bytes
 from ...guards.saved_states import MAP_STATE, with_prefix, without_prefix
 from ...interface import Belief
 from ..multifrontal import pairs, symmetric

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .... import argument_checks
+from ....argument_checks import LandmarkIds
 from ...beliefs import Belief, MapView, UpdateReport, describe_filter
 from ...filters.ekf import (
     EkfSlam,
@@ -17,8 +19,7 @@ from ...filters.ekf import (
     IteratedEkfSlam,
     ObservabilityConstrainedEkfSlam,
 )
-from ...guards import argument_checks, saved_states
-from ...guards.argument_checks import LandmarkIds
+from ...guards import saved_states
 from ...guards.interrupts import Interruptible, changing
 from ...models.sensors import only_placing
 from ..undo import Undo, attributes, undo_all

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ....argument_checks import covariance_bytes, too_large
 from ....arrays import Array, IntArray
 from ....jit import jit
 from ...guards import saved_states
-from ...guards.argument_checks import covariance_bytes, too_large
 from ..multifrontal import symmetric
 from ..undo import Undo, contents
 

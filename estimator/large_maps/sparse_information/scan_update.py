@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import lapack, solve_triangular
 
+from .... import argument_checks
 from ....arrays import Array, BoolArray, IntArray
 from ...filters import ekf
-from ...guards import argument_checks
 from ...interface import UpdateReport
 from ...models.bearing_range import locate_landmark, predict_measurement, wrap_angle
 from ...models.motions import UNICYCLE, MotionNoise

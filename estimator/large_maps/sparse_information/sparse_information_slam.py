@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .... import argument_checks
+from ....argument_checks import LandmarkIds
 from ....arrays import Array, IntArray
 from ...beliefs import Belief, MapView, UpdateReport, describe_filter
 from ...filters.ekf import EkfSlam
-from ...guards import argument_checks, saved_states
-from ...guards.argument_checks import LandmarkIds
+from ...guards import saved_states
 from ...guards.interrupts import Interruptible, changing
 from ...guards.saved_states import with_prefix, without_prefix
 from ...models.bearing_range import wrap_angle

@@ -14,12 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .... import argument_checks
+from ....argument_checks import LandmarkIds
 from ....arrays import Array, IntArray
 from ...filters.ekf import InvariantEkfSlam
 from ...filters.gaussian_map import without_landmarks
 from ...filters.pose_readings import coincide
-from ...guards import argument_checks, saved_states
-from ...guards.argument_checks import LandmarkIds
+from ...guards import saved_states
 from ...interface import Belief, MapView, UpdateReport
 from ...models.rigid_motion import ErrorFrame
 from ..undo import Undo, attributes

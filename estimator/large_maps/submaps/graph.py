@@ -14,9 +14,9 @@ import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 from scipy.linalg.blas import dsyrk
 
+from .... import argument_checks
 from ....arrays import Array, IntArray
 from ...filters.ekf import EkfSlam
-from ...guards import argument_checks
 from ...interface import Belief
 from ...models.bearing_range import wrap_angle
 from ...models.rigid_motion import (

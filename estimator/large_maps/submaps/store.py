@@ -14,8 +14,8 @@ from uuid import uuid4
 
 import numpy as np
 
+from ....argument_checks import LOWEST_ID
 from ....arrays import Array, IntArray
-from ...guards.argument_checks import LOWEST_ID
 from ..undo import Undo
 
 CACHE_SIZE = 8  # number of submaps of a folder that are kept in memory

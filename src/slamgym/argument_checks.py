@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...arrays import LARGEST, SMALLEST, AnyArray, Array, IntArray
+from .arrays import LARGEST, SMALLEST, AnyArray, Array, IntArray
 
 LandmarkIds = Sequence[int] | NDArray[np.integer[Any]]
 
