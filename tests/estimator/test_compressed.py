@@ -272,6 +272,40 @@ def test_a_scale_is_a_root_of_the_covariance_as_far_as_there_is_one():
     np.testing.assert_allclose(scale_of(indefinite), np.diag([2.0, 1.0]))
 
 
+def test_a_local_map_lies_ahead_by_half_the_way_of_the_phase_before(monkeypatch):
+    slam = map_all(CompressedEkfSlam(*NOISE, local_size=12), 100)
+    ahead, places = [], []
+
+    def note(centre, *_):
+        ahead.append(centre)
+        places.append(map_of(slam).filter.map.mean[:2].copy())
+
+    spied(monkeypatch, active_set, "choose_local", note)
+    run(slam, wander(100, 30))
+    steps = np.diff(places, axis=0)
+    assert np.hypot(*steps.T).max() > 1.0
+    np.testing.assert_allclose(ahead[1:], places[1:] + steps / 2, atol=1e-9)
+
+
+def test_a_local_map_grows_by_half_before_it_changes():
+    slam, sizes = CompressedEkfSlam(*NOISE, local_size=4), []
+    for k in range(12):  # 6 landmarks are not too many, and one more joins them
+        slam.update([(0.1 * k, 3.0)], [k])
+        sizes.append(len(slam.local_ids))
+    assert sizes == [1, 2, 3, 4, 5, 6, 7, 5, 6, 7, 5, 6]
+
+
+def test_a_removed_landmark_leaves_nothing_in_a_saved_state():
+    slam = run(CompressedEkfSlam(*NOISE, local_size=12), wander(100, 40))
+    places = dict(zip(slam.landmark_ids, slam.state_dict()["slots"], strict=True))
+    gone = [i for i in slam.landmark_ids if i not in slam.local_ids][:3]
+    slam.remove(gone)
+    state = slam.state_dict()
+    for k in [places[i] for i in gone]:
+        for key in ("points", "references", "strip"):
+            assert not state[key][..., 2 * k : 2 * k + 2].any(), key
+
+
 def test_a_landmark_counts_as_near_up_to_five_deviations():
     slam = run(CompressedEkfSlam(*NOISE, local_size=12), wander(100, 40))
     pose, whole = slam.belief([]), slam.belief()

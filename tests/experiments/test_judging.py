@@ -37,6 +37,7 @@ RUNS, SEED = 24, 300
 JOB = {"episodes": RUNS, "seed": SEED, "controller": "open_loop"}
 JOB["episodes_per_shard"] = 10
 DEGREES = np.diag([1.0, 1.0, 180 / np.pi])
+FLIP = np.array([1.0, 1.0, -1.0])
 ORDER = np.eye(3)[[2, 0, 1]]  # (θ, x, y)
 ROWS = [*range(5), 6, 5, *range(7, 30)]  # two of the 30 poses are swapped
 EXACT = {"rtol": 1e-12, "atol": 0}
@@ -135,8 +136,9 @@ SAME = (
     *("pose_nees_invariant", "pose_nees_additive", "position_nees_invariant"),
     *("heading_nees", "position_error", "heading_std", "ate_aligned", "pose_area"),
     *("landmark_rmse", "landmark_rmse_aligned", "landmark_nees_additive"),
-    *("landmark_error", "map_error_centred", "map_bound", "noise_sums"),
+    *("landmark_error", "map_error_centred", "noise_sums"),
 )
+BOUNDS = "position_bound", "position_bound_raw", "heading_bound", "map_bound"
 
 
 @pytest.mark.parametrize("way", ["data set", "npz", "csv", "tum"])
@@ -166,8 +168,9 @@ def test_a_filter_is_judged_through_files_as_in_a_monte_carlo(
             np.savetxt(folder / f"seed_{seed}.tum", lines, fmt="%.17g")
         results = judge(folder, drives)
     has_map = way in ("data set", "csv")
-    for name in SAME:
-        of_map = name.startswith(("landmark", "map"))
+    assert not results["readings"].any()  # it is not known which corrected anything
+    for name in SAME + BOUNDS:
+        of_map = name.startswith(("landmark", "map")) or name in BOUNDS
         if has_map or not of_map:
             tolerance = {"rtol": 1e-9, "atol": 1e-12} if way == "tum" else EXACT
             np.testing.assert_allclose(results[name], study[name], **tolerance)
@@ -213,6 +216,18 @@ def relative(poses):
     cos, sin = np.cos(1.0), np.sin(1.0)
     x, y = poses[..., 0] - 5, poses[..., 1] + 3
     return np.stack([cos * x + sin * y, cos * y - sin * x, poses[..., 2] - 1], axis=-1)
+
+
+def inverse_of(poses):
+    """Pose of the world in the robot's frame."""
+    x, y, turn = np.moveaxis(poses, -1, 0)
+    cos, sin = np.cos(turn), np.sin(turn)
+    return np.stack([-cos * x - sin * y, sin * x - cos * y, -turn], axis=-1)
+
+
+def inverse_jacobian(poses, step=1e-6):
+    moved = [inverse_of(poses + d) - inverse_of(poses - d) for d in step * np.eye(3)]
+    return np.stack(moved, axis=-1) / (2 * step)
 
 
 def transposed(poses, covariances):
@@ -269,8 +284,7 @@ WRONG = {
     ),
     "clockwise": (lambda x, P: (x * [1, 1, -1], P), "headings that grow clockwise: "),
     "millimetres": (lambda x, P: (x * [1e3, 1e3, 1], P), "positions in millimetres: "),
-    "centimetres": (lambda x, P: (x * [100, 100, 1], P), "positions in centimetres: "),
-    "feet": (lambda x, P: (x / [0.3048, 0.3048, 1], P), "positions in feet: "),
+    "another truth": (lambda x, P: (x / [100, 100, 1], P), "a truth in centimetres: "),
     "another scale": (
         lambda x, P: (x * [0.4, 0.4, 1], P),
         "positions in a unit of 2.5 m: ",
@@ -284,9 +298,21 @@ WRONG = {
         lambda x, P: (x + np.array([0, 0, np.pi]), P),
         "headings that are 180° off: ",
     ),
-    "sideways": (
+    "to the left": (
         lambda x, P: (x + np.array([0, 0, np.pi / 2]), P),
         "headings that are 90° too large: ",
+    ),
+    "to the right": (
+        lambda x, P: (x - np.array([0, 0, np.pi / 2]), P),
+        "headings that are 90° too small: ",
+    ),
+    "compass": (
+        lambda x, P: (np.array([0, 0, np.pi / 2]) + x * FLIP, np.outer(FLIP, FLIP) * P),
+        "headings clockwise from the y axis: ",
+    ),
+    "inverse": (
+        lambda x, P: (inverse_of(x), inverse_jacobian(x) @ P @ inverse_jacobian(x).mT),
+        "poses of the world as the robot sees it (inverse): ",
     ),
     "covariance in centimetres": (
         lambda x, P: (x, P * np.outer([100, 100, 1], [100, 100, 1])),
@@ -504,6 +530,8 @@ def test_a_drive_without_usable_estimates_is_a_failed_run(
     found = entry_of(results)
     assert [failure["run"] for failure in found["failed_runs"]] == [3]
     assert found["failed_runs"][0]["message"] == message
+    steps = {"unknown landmark": 29, "not symmetric": 0, "negative": 0, "none": 0}
+    assert found["failed_runs"][0]["step"] == steps.get(what, -1)
     assert found["verdict"] == "not shown"
     assert found["reason"].startswith(f"1 of {RUNS} runs failed; of the others, ")
 
@@ -692,14 +720,16 @@ def test_comments_above_a_true_path_are_ignored(elsewhere):
 def test_poses_in_a_gap_of_the_truth_are_left_out_and_counted(elsewhere):
     mine, truth = elsewhere
     before = judge(mine, truth=truth).pose_nees_invariant
-    for path in truth.iterdir():
+    _, *paths = sorted(truth.iterdir())
+    for path in paths:
         lines = path.read_text().splitlines()
         path.write_text("\n".join(lines[:9] + lines[21:]))
     results = judge(mine, truth=truth)
     there = [*range(9), *range(21, 30)]
-    np.testing.assert_allclose(results.pose_nees_invariant, before[:, :, there])
+    np.testing.assert_allclose(results.pose_nees_invariant[:, 1:], before[:, 1:, there])
     (note,) = (n for n in summarise_monte_carlo(results)["notes"] if "truth" in n)
-    assert note.startswith(f"{12 * RUNS} of {30 * RUNS} poses have no truth near their")
+    assert note.startswith(f"{12 * (RUNS - 1)} of {30 * RUNS} poses have no truth near")
+    assert note.endswith(f"the first file is {mine / paths[0].name}, with 12.")
 
 
 @pytest.mark.parametrize("start", [0, 1_600_000_000])
@@ -984,8 +1014,11 @@ def test_worlds_with_ranges_and_hidden_identities_are_judged(tmp_path):
         world = load_scenario(preset).with_changes(**more)
         job = {"episodes": 5, "estimator": "invariant"}
         generate_trajectories(world, tmp_path / name, **job)
-        found = entry_of(judge(tmp_path / name))
+        results = judge(tmp_path / name)
+        found = entry_of(results)
         assert found["good_runs"] == 5
+        count, _, squares = results.noise_sums.values[0, ..., :3].sum(axis=1).T
+        assert (abs(squares - count) < 5 * np.sqrt(2 * count)).all()  # of each run
         assert 0.2 < found["pose_nees"]["invariant"]["mean"] < 3
         assert (found["landmark_rmse"]["raw"] is None) == (name == "hidden")
 

@@ -10,7 +10,7 @@ from commands import slamgym
 from recordings import recorded
 
 from slamgym.estimator.models.bearing_range import wrap_angle
-from slamgym.experiments.log_conventions import mistake_in
+from slamgym.experiments.log_conventions import _Comparison, mistake_in, part_of
 from slamgym.experiments.logs import (
     OdometryRow,
     Scan,
@@ -250,6 +250,21 @@ def test_a_log_without_a_scan_in_its_first_part_has_nothing_to_name():
     for k in reversed(range(late, late + 19)):
         events.insert(k, Scan(float(k), readings, ids))
     assert mistake_of(SlamLog("drive", events=events)) is None
+
+
+def test_the_nis_of_a_fit_is_near_1_and_falls_with_the_square_of_the_noise(corridor):
+    """The start is certain, so that a factor of all noise changes no estimate."""
+    given = part_of(corridor)
+    comparison = _Comparison(corridor, settings_for(corridor), given)
+    fit = comparison.fit(given, np.array([[1.0, 1.0], [2.0, 2.0]]))
+    assert 0.7 < fit.nis[0] < 1.3
+    assert fit.nis[1] == pytest.approx(fit.nis[0] / 4, rel=1e-3)
+    assert not fit.rejected.any()
+    unusable = given.measurements.copy()
+    unusable[::100, 1] = 0.0
+    lost = comparison.fit(given._replace(measurements=unusable), np.ones((1, 2)))
+    assert lost.rejected[0] > 0
+    assert fit.likelihoods[0] - lost.likelihoods[0] > 9 * lost.rejected[0]
 
 
 def test_a_mirrored_log_is_consistent(corridor):
