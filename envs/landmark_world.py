@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from operator import attrgetter, getitem
 from pathlib import Path
 from reprlib import repr as short_repr
@@ -20,7 +19,7 @@ from ..arrays import AnyArray, Array, ComplexArray, ImageArray, WordArray
 from ..restorable import Restorable, State, refuse_other_state
 from ..sim_configs import Scenario, load_scenario
 from ..sim_configs.landmarks_and_controls import possible_positions
-from ..sim_configs.scenario import plain, refuse_unknown_keywords
+from ..sim_configs.scenario import refuse_unknown_keywords
 from ..suggestions import closest
 from .bearing_range import BearingRangeSensor, hide_identities
 from .drives import drive_of
@@ -28,6 +27,7 @@ from .noise_streams import NoiseRows, PoseSensors, WorldNoise, row_of
 from .random_numbers import EpisodeStarts, drawn_scenarios, episode_keys
 from .robot import OdometrySensor, UnicycleBody
 from .spaces import action_space, clipped_action, observation_space
+from .specs import plain_spec
 
 if TYPE_CHECKING:
     from .rendering.episode_renderer import EpisodeRenderer
@@ -376,18 +376,6 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
             clutter = None if ids is None else ids[mask] < 0
             self._renderer.add(body.pose, measurements[mask], collision, clutter)
         return {"landmarks": measurements, "mask": mask, "odometry": odometry}, info
-
-
-def plain_spec(spec: EnvSpec, steps: int) -> EnvSpec:
-    """Return a specification that JSON can hold, with the length of the episodes.
-
-    A scenario becomes its fields, a path its text, an array a list.
-    """
-    length = spec.max_episode_steps or steps
-    kwargs = plain(spec.kwargs)
-    if isinstance(path := kwargs.get("scenario"), Path):
-        kwargs["scenario"] = str(path)
-    return replace(spec, kwargs=kwargs, max_episode_steps=length)
 
 
 def _numbers(name: str, value: object, shape: tuple[int, ...]) -> list[Any]:

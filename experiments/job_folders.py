@@ -172,12 +172,18 @@ def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
         )
 
     def workers(calls: Iterable[Call]) -> Iterator[Any]:
-        # Else a file of the user named like a module of Python, such as random.py,
-        # would replace it in the workers.
-        with environment("PYTHONSAFEPATH", "1"):
+        with without_scripts_of_the_user():
             yield from compute(calls)
 
     return workers
+
+
+def without_scripts_of_the_user() -> contextlib.AbstractContextManager[None]:
+    """Let processes begun in the block import modules of Python, such as random.
+
+    Else a file random.py in the working folder would replace it.
+    """
+    return environment("PYTHONSAFEPATH", "1")
 
 
 @contextlib.contextmanager

@@ -23,15 +23,11 @@ from ...arrays import AnyArray, Array, BoolArray, ImageArray
 from ...restorable import Restorable, State, copied, put_back, refuse_other_state
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.scenario import refuse_unknown_keywords
-from ..landmark_world import (
-    OF_A_WORLD,
-    LandmarkWorldEnv,
-    plain_spec,
-    refuse_other_world,
-)
+from ..landmark_world import OF_A_WORLD, LandmarkWorldEnv, refuse_other_world
 from ..rendering.episode_renderer import EpisodeRenderer
 from ..rendering.render_state import BeliefLike
 from ..spaces import action_space, observation_space
+from ..specs import plain_spec
 from .world_batch import WorldBatch
 
 Observations = dict[str, Any]
@@ -492,6 +488,6 @@ def episode_steps(scenario: Scenario, most: int | None) -> int:
     """
     if most is None or most == -1:  # Gymnasium's value for no limit
         return scenario.steps
-    if isinstance(most, bool) or not isinstance(most, int) or most < 1:
+    if isinstance(most, bool) or not isinstance(most, int | np.integer) or most < 1:
         raise ValueError(f"max_episode_steps must be a whole number >= 1, got {most!r}")
-    return min(most, scenario.steps)
+    return int(min(most, scenario.steps))

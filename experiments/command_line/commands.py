@@ -33,6 +33,7 @@ from typer.core import TyperGroup
 
 from ... import __version__
 from ...sim_configs.scenario_files import unfinished
+from ...suggestions import FOLDERS
 from ..progress_bar import Tick, progress_bar
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -73,7 +74,8 @@ class OneLineErrors(TyperGroup):
             if "SLAMGYM_TRACEBACK" in os.environ:
                 raise
             line.acquire()  # waits for the end where another thread has taken it
-            sys.stderr.write(f"slamgym: {message_of(error)}\n")
+            with contextlib.suppress(OSError):  # of a full disk
+                sys.stderr.write(f"slamgym: {message_of(error)}\n")
             sys.exit(exit_code_of(error))
         sys.exit(result if isinstance(result, int) else 0)
 
@@ -394,8 +396,7 @@ def _slamgym(
     slamgym replay data.txt           filter a log, draw
     slamgym COMMAND --help            explain a command
     """
-    if (here := str(Path.cwd())) not in sys.path:
-        sys.path.append(here)  # for the user's own estimators, "module:Class"
+    FOLDERS[:] = [str(Path.cwd())]  # for the user's own estimators, "module:Class"
     if version:
         typer.echo(f"slamgym {__version__}")
     elif context.invoked_subcommand is None:

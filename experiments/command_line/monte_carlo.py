@@ -16,6 +16,7 @@ from rich.text import Text
 
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.field_types import unknown_choice
+from ..job_folders import without_scripts_of_the_user
 from . import options
 from .commands import (
     FAILURE,
@@ -227,7 +228,11 @@ def _compile(estimators: str, *, identities: bool) -> None:
 # The cluster that can compute the runs of a command.
 
 #: What starts here listens to this machine only.
-_HERE = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+_HERE = {
+    "host": "127.0.0.1",
+    "dashboard_address": "127.0.0.1:0",
+    "threads_per_worker": 1,
+}
 _INTERVAL = 1.0  # between looks at the workers of a local cluster [s]
 
 
@@ -265,7 +270,7 @@ def _dask_client(scheduler: str | None, jobs: int | None) -> Any:
     client: Any = distributed.Client
     if scheduler is not None:
         return _naming_loss(client(scheduler), scheduler)
-    return _with_new_workers(client(n_workers=jobs, threads_per_worker=1, **_HERE))
+    return _with_new_workers(partial(client, n_workers=jobs, **_HERE))
 
 
 @contextlib.contextmanager
@@ -298,20 +303,21 @@ def _naming_loss(client: Any, address: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _with_new_workers(client: Any) -> Iterator[None]:
-    """Replace workers of a local cluster that are gone.
+def _with_new_workers(start: Callable[[], Any]) -> Iterator[None]:
+    """Start a local cluster, and replace workers that are gone.
 
     Dask restarts a worker that was killed, but not one that was killed as it started.
     """
-    cluster = client.cluster
-    wanted = len(cluster.worker_spec)
 
     def replace() -> None:
         if len(cluster.workers) < wanted:
             cluster.scale(wanted)
 
-    with client, _repeated(replace):
-        yield
+    with without_scripts_of_the_user(), start() as client:
+        cluster = client.cluster
+        wanted = len(cluster.worker_spec)
+        with _repeated(replace):
+            yield
 
 
 @contextlib.contextmanager

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import gymnasium
 
+from .envs.specs import WorldSpec
 from .public_names import attach, is_here
 
 __version__ = "0.1.0"
@@ -48,14 +49,15 @@ if TYPE_CHECKING:
 else:
     __getattr__, __dir__, __all__ = attach(__name__)
 
-gymnasium.register(
-    id="slamgym/LandmarkWorld-v0",
-    entry_point="slamgym.envs.landmark_world:LandmarkWorldEnv",
-    vector_entry_point="slamgym.envs.vector.landmark_world_vector:LandmarkWorldVectorEnv",
-)
-if is_here("agents.active_slam"):
-    gymnasium.register(
-        id="slamgym/ActiveSlam-v0",
-        entry_point="slamgym.agents.active_slam:ActiveSlamEnv",
-        vector_entry_point="slamgym.agents.active_slam:ActiveSlamVectorEnv",
-    )
+_TASKS = {
+    "LandmarkWorld": ("envs.landmark_world", "envs.vector.landmark_world_vector"),
+    "ActiveSlam": ("agents.active_slam", "agents.active_slam"),
+}
+for _task, (_single, _many) in _TASKS.items():
+    if is_here(_single):
+        _spec = WorldSpec(
+            id=f"slamgym/{_task}-v0",
+            entry_point=f"slamgym.{_single}:{_task}Env",
+            vector_entry_point=f"slamgym.{_many}:{_task}VectorEnv",
+        )
+        gymnasium.registry[_spec.id] = _spec

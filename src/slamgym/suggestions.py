@@ -1,5 +1,6 @@
 """Words of the user and for the user: import a path, suggest a name, count things."""
 
+import sys
 from collections.abc import Iterable
 from difflib import SequenceMatcher
 from importlib import import_module
@@ -8,6 +9,9 @@ from operator import attrgetter
 from typing import Any
 
 _SIMILAR = 0.6  # of at most 1
+
+#: Folders in which `imported` looks for modules, after those of Python.
+FOLDERS: list[str] = []
 
 
 def closest(word: str, words: Iterable[str], *, else_all: bool = False) -> str:
@@ -66,6 +70,8 @@ def imported(path: str, refusal: str, *, kind: bool = False) -> Any:
     True
     """
     module, _, name = path.partition(":")
+    if not module.startswith(__package__):
+        sys.path.extend(folder for folder in FOLDERS if folder not in sys.path)
     try:
         return attrgetter(name)(import_module(module))
     except Exception as error:

@@ -1,6 +1,8 @@
 """Gymnasium's own checker and the traps that it does not see."""
 
 import functools
+import json
+import math
 
 import gymnasium as gym
 import numpy as np
@@ -12,6 +14,7 @@ from presets import PRESETS
 
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.envs import LandmarkWorldEnv
+from slamgym.estimator import EkfSlam
 from slamgym.sim_configs import action_sequence, load_scenario, save_scenario
 
 ID = "slamgym/LandmarkWorld-v0"
@@ -58,6 +61,10 @@ def test_an_id_with_the_package_in_front_makes_the_same_world():
     same(env.reset(seed=0)[0], other.reset(seed=0)[0])
 
 
+def no_json(constant):
+    raise AssertionError(constant)  # NaN and Infinity, which Python alone reads
+
+
 @pytest.mark.parametrize(
     "make", [gym.make, functools.partial(gym.make_vec, num_envs=2)]
 )
@@ -66,11 +73,45 @@ def test_a_world_is_made_again_from_its_spec_in_json(task, make, tmp_path):
     path = tmp_path / "mine.toml"
     save_scenario(load_scenario("active_easy"), path)
     changes = {"steps": np.int64(9), "start": {"std": np.ones(3)}}
-    for scenario in (load_scenario("active_easy"), path):
+    endless = load_scenario("active_easy").with_changes(sensor={"max_range": math.inf})
+    for scenario in (endless, path):
         world = make(task, scenario=scenario, **changes)
-        again = make(EnvSpec.from_json(world.spec.to_json()))
+        written = world.spec.to_json()
+        json.loads(written, parse_constant=no_json)
+        assert EnvSpec.from_json(written) == world.spec
+        again = make(EnvSpec.from_json(written))
         assert again.unwrapped.scenario == world.unwrapped.scenario
         assert again.spec.max_episode_steps == 9
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_scenario_can_be_part_of_a_spec_in_json(name):
+    spec = gym.make(ID, scenario=load_scenario(name)).spec
+    assert EnvSpec.from_json(spec.to_json()) == spec
+    (scenario,) = json.loads(spec.to_json(), parse_constant=no_json)["kwargs"].values()
+    assert load_scenario(scenario) == load_scenario(name)
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_worlds_in_gymnasiums_own_vectors_have_a_spec_in_json(mode):
+    same_step = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}
+    scenario = load_scenario("active_easy")
+    make = functools.partial(gym.make_vec, vectorization_mode=mode)
+    worlds = make(ID, 2, scenario=scenario, vector_kwargs=same_step)
+    spec = EnvSpec.from_json(worlds.spec.to_json())
+    again = gym.make_vec(spec)
+    same(again.reset(seed=3), worlds.reset(seed=3))
+    assert again.metadata["autoreset_mode"] == same_step["autoreset_mode"]
+    for each in (again, worlds):
+        each.close()
+
+
+@pytest.mark.parametrize(
+    "settings", [{"dtype": np.dtype("float32")}, {"estimator": EkfSlam}], ids=str
+)
+def test_types_among_the_keywords_can_be_part_of_a_spec_in_json(settings):
+    spec = gym.make("slamgym/ActiveSlam-v0", **settings).spec
+    assert gym.make(EnvSpec.from_json(spec.to_json())).spec == spec
 
 
 def test_gymnasiums_time_limit_comes_on_top_of_the_worlds_own():

@@ -16,6 +16,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         experiments
     """,
     "envs": """
+        specs
         drives
         robot random_numbers
         noise_streams controllers

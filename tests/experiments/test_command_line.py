@@ -31,6 +31,7 @@ from slamgym.experiments.run_and_replay.log_replay import replay
 from slamgym.jit import jit
 from slamgym.sim_configs import list_presets, load_scenario
 from slamgym.sim_configs.scenario import Gps, Randomise, SensorTable
+from slamgym.suggestions import imported
 
 pytestmark = pytest.mark.usefixtures("here")
 COMMANDS = "run replay smooth fit-noise generate judge monte-carlo noise-study render"
@@ -384,6 +385,13 @@ def of_a_user(here, monkeypatch):
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     yield "of_a_user:Plain"
     sys.modules.pop("of_a_user", None)
+
+
+def test_modules_of_the_user_are_looked_for_only_if_named(of_a_user, monkeypatch):
+    monkeypatch.setattr(sys, "path", [each for each in sys.path if each != os.getcwd()])
+    assert slamgym("estimators").exit_code == 0
+    assert os.getcwd() not in sys.path  # a script gtsam.py is not taken for the library
+    assert imported(of_a_user, "").__name__ == "Plain"
 
 
 @pytest.mark.parametrize(
@@ -1059,6 +1067,7 @@ def test_landmarks_that_were_never_placed_are_named(here, without_pictures):
         ("scenarios >&-", 1, "slamgym: standard output is closed: there is no place"),
         ("scenarios --json >&-", 1, "slamgym: standard output is closed"),
         ("run nonsense 2>&-", 2, ""),
+        ("run nonsense 2>/dev/full", 2, ""),
         ("scenarios <&-", 0, ""),
     ],
 )

@@ -685,6 +685,15 @@ def test_a_dask_cluster_listens_to_this_machine_only():
 
 
 @pytest.mark.slow
+def test_a_dask_worker_imports_no_script_of_the_user(tmp_path, monkeypatch):
+    distributed = pytest.importorskip("distributed", reason="needs dask.distributed")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "random.py").write_text("raise ImportError('a script of the user')")
+    with connected("dask", None, 1):
+        assert distributed.default_client().submit(abs, -3).result(timeout=60) == 3
+
+
+@pytest.mark.slow
 def test_a_dask_worker_that_dask_does_not_restart_is_replaced():
     distributed = pytest.importorskip("distributed", reason="needs dask.distributed")
     import dask
