@@ -10,6 +10,7 @@ import pytest
 from import_graph import FILES, ROOT, code_lines, graph
 
 import slamgym
+from slamgym import jit
 from slamgym.leaves import LEAVES
 
 ALL = [place for places in LEAVES.values() for place in places]
@@ -44,6 +45,9 @@ for part in (package, package.estimator, package.experiments, package.agents):
     for name in part.__all__:
         getattr(part, name)
 """
+
+#: No kernel of the core reads a leaf: those of the whole package are these, too.
+KERNELS = f"from slamgym import jit; jit._DIGEST = {jit._DIGEST!r}"
 
 #: Rendering takes most of the time of these commands, and loads no module.
 WITHOUT_PICTURES = """
@@ -120,10 +124,13 @@ def test_the_commands_of_the_core_work_without_a_leaf(name, tmp_path):
 @pytest.mark.slow
 def test_the_core_works_without_any_leaf(tmp_path):
     copy_without(tmp_path, LEAVES)
-    without_leaves(tmp_path, "-c", COMMANDS + MANY_RUNS)
+    (tmp_path / "with_kernels.py").write_text(KERNELS)
+    code = KERNELS + WITHOUT_PICTURES + COMMANDS + MANY_RUNS
+    without_leaves(tmp_path, "-c", code)
     for name in ("tests", "pyproject.toml"):
         source, target = ROOT / name, tmp_path / name
         (shutil.copytree if source.is_dir() else shutil.copy)(source, target)
     tests = [f"tests/{name}" for name in CORE_TESTS]
     options = ["-q", "-p", "no:cacheprovider", "-n", "0", "-m", "not slow"]
+    options += ["-p", "with_kernels"]
     without_leaves(tmp_path, "-m", "pytest", *options, *tests)
