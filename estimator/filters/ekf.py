@@ -211,7 +211,7 @@ class MapFilter:
             together; the belief is then as before.
         """
         checked = self.map.checked(state, estimator=type(self).__name__)
-        MapFilter.restore(self, checked)  # subclasses read what is theirs
+        MapFilter.restore(self, checked)  # not self.restore: subclasses override it
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a state that this process has saved, without checks."""
@@ -331,7 +331,7 @@ class EkfSlam(MapFilter):
         self._motion_noise = MotionNoise.checked(motion_std, noise_at_rest, motion)
         given = find_sensor(sensor)
         self.sensor = given.delayed() if landmark_init == DELAYED else given
-        self._is_default = self.sensor == BEARING_RANGE
+        self._reads_bearing_range = self.sensor == BEARING_RANGE
         self.rules = checked_rules(
             measurement_std,
             sensor=self.sensor,
@@ -405,7 +405,9 @@ class EkfSlam(MapFilter):
         """
         readings = argument_checks.scan(measurements, self.sensor.columns)
         ids = argument_checks.identity_array(landmark_ids, len(readings), self)
-        kernel = self._update_map if self._is_default else self._kernel_of_sensor()
+        kernel = (
+            self._update_map if self._reads_bearing_range else self._kernel_of_sensor()
+        )
         status = self.map.take_in(kernel, readings, ids)
         if status != DONE:
             self._refuse(status, readings, ids)
@@ -433,6 +435,7 @@ class EkfSlam(MapFilter):
         return np.array(self.rules)
 
     def _adopt(self, rules: Rules) -> None:
+        """Go on with other rules."""
         self.rules = rules
         self.map.adopt((*rules, *self._motion_noise.variance))
 

@@ -1,9 +1,9 @@
 """Update of one belief by one scan, compiled: screen, correct, map new landmarks.
 
 `update_belief` is the whole update.  Below it are its parts, down to the Kalman gain:
-`absorb` computes gain and covariance for many readings at once, and `compose` the
-state.  At the end are the `Rules` that distinguish one filter from another, and the
-arrays that a kernel works in.
+`absorb` conditions the covariance on many readings at once, and `compose` moves the
+state.  The gain K = Aᵀ L⁻¹ itself is never formed.  At the end are the `Rules` that
+distinguish one filter from another, and the arrays that a kernel works in.
 
 ``system`` holds two rows for each reading, from the row FIRST of the workspace on.
 `Workspace` and the constants above it describe them.  The covariance has room for whole
@@ -32,7 +32,7 @@ from ..models.bearing_range import (
 from ..models.relative_geometry import variance_from_robot
 from ..models.rigid_motion import ErrorFrame, turn_coefficients_jit
 
-# Status of an update, where it is not the reading that failed.
+# Status of an update; from 0 on it is the number of the reading that failed.
 DONE, NOT_USABLE = -1, -2
 
 
@@ -166,7 +166,7 @@ def as_rules(values: Array) -> Rules:
 
 @njit_internal
 def usable(value: float) -> bool:
-    """Whether a number is finite, and its square too, with room to spare."""
+    """Return whether a number is at most LARGEST, so that its square is finite."""
     return abs(value) <= LARGEST
 
 
@@ -261,7 +261,7 @@ def squared_ratio(n0: float, n1: float, s00: float, s10: float, s11: float) -> f
 
 @njit_internal
 def is_near(mean: Array, covariance: Array, column: int) -> bool:
-    """Whether the robot is within 10 σ of a landmark, where linearisation fails.
+    """Return whether the robot is within 10 σ of a landmark: linearisation then fails.
 
     σ is the largest standard deviation of the landmark's place relative to the robot.
     """
@@ -302,13 +302,13 @@ def correct(
     system, prior, columns = rows[FIRST:], rows[MEAN_BEFORE], ledger[COLUMN]
     for j in range(size):
         prior[j] = mean[j]
-    again = rules.iterations > 1 and not rules.adaptive
+    repeats = rules.iterations > 1 and not rules.adaptive
     for k in range(used):
         linearise(
             mean, belief.reference, rules.linearisation, system, 2 * k, columns[k]
         )
-        again |= rules.adaptive and is_far_off(mean, system, 2 * k, columns[k])
-    if again:
+        repeats |= rules.adaptive and is_far_off(mean, system, 2 * k, columns[k])
+    if repeats:
         failed = relinearise(belief, size, ledger, rules, rows, used)
     else:
         block = BLOCK if size <= LARGE else used  # few while P fits the caches
@@ -359,14 +359,14 @@ def relinearise(
     P is then as before.
     """
     mean, columns = belief.mean, ledger[COLUMN]
-    now, again, at = rows[FIRST:], second_system(rows), rows[ITERATE]
+    now, second, at = rows[FIRST:], second_system(rows), rows[ITERATE]
     for k in range(used):
-        copy_reading(now, 2 * k, again, 2 * k)
+        copy_reading(now, 2 * k, second, 2 * k)
     for iteration in range(rules.iterations):
         for j in range(size):
             at[j] = mean[j]
         if iteration > 0:
-            now = again
+            now = second
             for k in range(used):
                 linearise_again(at, belief, rules, rows, 2 * k, columns[k])
         begin_correction(size, rows, now, 2 * used)
@@ -376,7 +376,7 @@ def relinearise(
         compose(mean, rows[MEAN_BEFORE], rows, size, rules.frame)
         if rules.adaptive:
             if abs(rows[CORRECTION, 2]) > TURNED:
-                now = again
+                now = second
                 failed = take_one_by_one(belief, size, ledger, rules, rows, used)
                 if failed >= 0:
                     return failed
@@ -640,21 +640,21 @@ def add_landmark(
     mean[c], mean[c + 1] = lx, ly
     if linearisation in (AT_REFERENCE, PROJECTED):
         reference[c], reference[c + 1] = lx, ly
-    if linearisation != AT_ESTIMATE:
+    if linearisation != AT_ESTIMATE:  # F_p at the point where H is
         turned_x = reference[1] - reference[c + 1]
         turned_y = reference[c] - reference[0]
-    x, y = P[c], P[c + 1]
+    row_x, row_y = P[c], P[c + 1]
     for j in range(size):
-        x[j] = P[0, j] + turned_x * P[2, j]
-        y[j] = P[1, j] + turned_y * P[2, j]
-    x[c] = x[0] + turned_x * x[2] + xx + more_xx
-    y[c] = y[0] + turned_x * y[2] + xy
-    y[c + 1] = y[1] + turned_y * y[2] + yy + more_yy
-    x[c + 1] = y[c]
+        row_x[j] = P[0, j] + turned_x * P[2, j]
+        row_y[j] = P[1, j] + turned_y * P[2, j]
+    row_x[c] = row_x[0] + turned_x * row_x[2] + xx + more_xx
+    row_y[c] = row_y[0] + turned_x * row_y[2] + xy
+    row_y[c + 1] = row_y[1] + turned_y * row_y[2] + yy + more_yy
+    row_x[c + 1] = row_y[c]
     for j in range(size):
         if not rules.correlated:
-            x[j] = y[j] = 0.0
-        P[j, c], P[j, c + 1] = x[j], y[j]
+            row_x[j] = row_y[j] = 0.0
+        P[j, c], P[j, c + 1] = row_x[j], row_y[j]
 
 
 # --------------------------------------------------------------------------------------

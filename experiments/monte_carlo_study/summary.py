@@ -295,7 +295,8 @@ def _unused_readings(scores: EstimatorScores) -> float | None:
 
 
 # --------------------------------------------------------------------------------------
-# The measures of an estimator: each is declared once, for the summary and all tables.
+# The measures of an estimator: each is declared once, for the summary and the tables of
+# the command and the report.
 
 Entry = dict[str, Any]
 Computation = Callable[[EstimatorScores], float | None]
