@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import fields
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -11,18 +11,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 
-class WorldSpec(EnvSpec):
-    """A specification whose keywords are written as JSON, whatever their types.
-
-    Gymnasium hands out copies of the registered one.
-    """
-
-    def to_json(self) -> str:
-        """Write the specification as JSON."""
-        return EnvSpec.to_json(replace(self, kwargs=json_value(self.kwargs)))
-
-
-def plain_spec(spec: EnvSpec, steps: int) -> EnvSpec:
+def plain_spec(spec: EnvSpec, steps: int | None = None) -> EnvSpec:
     """Return a specification that JSON can hold, with the length of the episodes."""
     values = {each.name: getattr(spec, each.name) for each in fields(spec) if each.init}
     values["max_episode_steps"] = spec.max_episode_steps or steps

@@ -61,7 +61,8 @@ print(*sys.modules)
     estimators, workers = map(str.split, run_python(code).splitlines())
     heavy = {"scipy.stats", "matplotlib", "xarray", "netCDF4", "slamgym.agents"}
     assert "numba" in estimators
-    assert not (heavy | {"scipy.special", "pymunk"}) & set(estimators)
+    others = {"scipy.special", "pymunk", "slamgym.envs", "slamgym.experiments"}
+    assert not (heavy | others) & set(estimators)
     assert not heavy & set(workers)
 
 
