@@ -67,7 +67,7 @@ def test_a_singular_covariance_has_no_entropy():
 
 def test_landmarks_not_yet_mapped_count_with_the_prior(slam):
     rows = belief_storage(slam.belief(), 4, by_id=True).beliefs()
-    joint = map_covariances(rows, (3.0, 2.0))[0]
+    _, joint = (map_covariances(rows, (3.0, 2.0))[0] for _ in range(2))  # no sum
     covariance = slam.belief().covariance
     order = [5, 6, 3, 4]  # the map holds landmark 2, then landmark 0
     seen = [0, 1, 4, 5]
@@ -77,6 +77,11 @@ def test_landmarks_not_yet_mapped_count_with_the_prior(slam):
     np.testing.assert_array_equal(np.diag(joint)[[2, 3, 6, 7]], [9.0, 4.0, 9.0, 4.0])
     unseen = joint[np.ix_([2, 3, 6, 7], seen)]
     assert not unseen.any()
+
+
+def test_the_prior_of_a_landmark_is_as_long_and_as_wide_as_the_world():
+    world = load_scenario("loop").with_changes(walls=[[0, 0, 12, 0], [0, 6, 12, 6]])
+    assert landmark_prior_std(world) == pytest.approx((12**0.5, 3**0.5))
 
 
 def test_a_first_sight_is_worth_what_a_measurement_of_the_prior_is():

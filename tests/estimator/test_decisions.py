@@ -67,6 +67,16 @@ def test_a_rejected_reading_is_given_to_no_landmark():
     assert slam.decisions[-1].row_ids == (None,)
 
 
+def test_a_reading_too_near_to_use_is_given_to_no_landmark():
+    slam = managed()
+    slam.update(AHEAD, [7])
+    report = slam.update([(0.0, 1e-4), (0.5, 5.0)], [7, 8])
+    assert (report.skipped_ids, report.row_ids) == ((7,), (7, 8))
+    assert slam.decisions[-1].row_ids == (None, 8)
+    assert slam.update([(0.0, 1e-4)], [7]).skipped_ids == (7,)  # nothing is new
+    assert slam.decisions[-1].row_ids == (None,)
+
+
 def test_a_new_run_and_a_loaded_state_begin_without_decisions():
     slam = managed()
     slam.update(AHEAD)
@@ -85,12 +95,13 @@ def test_a_filter_told_the_decisions_has_the_same_belief(method, backdate, slipp
     policy = {"association": method, "backdate": backdate}
     slam = make_estimator("invariant", **noise, management=policy)
     told = make_estimator("invariant", **noise)
-    for odometry, readings in scans:
-        slam.predict(odometry)
+    durations = [1.0 + k % 2 for k in range(len(scans))]
+    for dt, (odometry, readings) in zip(durations, scans, strict=True):
+        slam.predict(odometry, dt)
         slam.update(readings)
-    assert len(slam.decisions) == len(scans)
-    for (odometry, readings), made in zip(scans, slam.decisions, strict=True):
-        told.predict(odometry)
+    made_of = zip(durations, scans, slam.decisions, strict=True)
+    for dt, (odometry, readings), made in made_of:
+        told.predict(odometry, dt)
         rows = [row for row, i in enumerate(made.row_ids) if i is not None]
         told.update(readings[rows], [made.row_ids[row] for row in rows])
     expected = told.belief(slam.landmark_ids)

@@ -17,6 +17,7 @@ from slamgym.estimator.models.rigid_motion import invariant_covariance, invarian
 from slamgym.estimator.smoother import smooth
 from slamgym.evaluation.nees import normalised_squared_error
 from slamgym.experiments import (
+    estimate_conventions,
     generate_trajectories,
     judging,
     nees_figure,
@@ -25,6 +26,7 @@ from slamgym.experiments import (
     summarise_monte_carlo,
 )
 from slamgym.experiments.estimate_conventions import (
+    PosesAsRead,
     additive_covariances,
     mistake_in,
     stray_poses,
@@ -168,6 +170,7 @@ def test_a_filter_is_judged_through_files_as_in_a_monte_carlo(
             np.savetxt(folder / f"seed_{seed}.tum", lines, fmt="%.17g")
         results = judge(folder, drives)
     has_map = way in ("data set", "csv")
+    np.testing.assert_array_equal(results["run"], study["run"])
     assert not results["readings"].any()  # it is not known which corrected anything
     for name in SAME + BOUNDS:
         of_map = name.startswith(("landmark", "map")) or name in BOUNDS
@@ -389,6 +392,18 @@ def test_deviations_alone_are_not_read_in_another_frame(correlation):
     said = mistake_in(truth, poses, np.broadcast_to(P, (20, 50, 3, 3)), truth[:, 0])
     frame = "covariances of the right-invariant error (the world's frame): read so"
     assert said.startswith(frame) if correlation else not said
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+def test_a_reading_is_honest_if_its_squares_are_near_1(factor):
+    """Runs differ by half of the mean, but there are many."""
+    rng = np.random.default_rng(2)
+    truth = rng.normal(size=(100, 10, 3))
+    poses = truth + 0.1 * rng.normal(size=truth.shape)
+    claims = np.broadcast_to(0.01 / factor * np.eye(3), (100, 10, 3, 3))
+    fit = estimate_conventions._fit(truth, PosesAsRead("", poses, claims, True))
+    assert fit.nees == pytest.approx(factor, rel=0.1)
+    assert fit.is_honest == (factor == 1)
 
 
 def test_the_errors_of_a_filter_are_no_stray_poses():
@@ -754,6 +769,19 @@ def test_nanoseconds_beside_seconds_are_converted_with_a_word(start, elsewhere):
         assert (f"the time stamps {what} nanoseconds" in "".join(notes)) == bool(what)
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e9])
+def test_converted_times_beyond_the_truth_stay_beyond_it(unit):
+    """But for what rounding adds to the last one."""
+    t = np.arange(10.0)
+    path = np.column_stack([1e9 / unit * t, t, t, 0 * t])[:8]
+    found, what = judging._in_seconds(unit * t, np.column_stack([t, t, 0 * t]), path)
+    np.testing.assert_allclose(found, 1e9 / unit * t)
+    assert what == ("of the truth are nanoseconds" if unit == 1 else "are nanoseconds")
+    rounded = unit * np.append(t[:7], 7 + 2e-7)
+    found, _ = judging._in_seconds(rounded, path[:, 1:], path)
+    assert found[-1] == path[-1, 0]
+
+
 def test_names_are_paired_by_what_differs(elsewhere):
     mine, truth = elsewhere
     before = judge(mine, truth=truth)
@@ -779,6 +807,15 @@ def test_a_robot_at_rest_is_not_turned_by_a_fit(elsewhere):
         theirs[:, 1:3] += rng.normal(0, 0.1, (30, 2))
         np.savetxt(mine / path.name, theirs, fmt="%.17g")
     assert abs(judge(mine, truth=truth, align="fit").heading_error).max() < 1e-9
+
+
+@pytest.mark.parametrize(("noise", "turn"), [(0.3, -0.5), (0.8, 0.0)])
+def test_a_fit_turns_what_it_explains_most_of(noise, turn):
+    rng = np.random.default_rng(1)
+    truth = rng.normal(size=(200, 2))
+    turned = truth @ np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
+    motion = judging._fitted(turned + noise * rng.normal(size=(200, 2)), truth)
+    assert motion.angle == pytest.approx(turn, abs=0.1)
 
 
 def test_an_indefinite_covariance_is_a_failed_run(elsewhere):

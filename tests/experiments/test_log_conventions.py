@@ -9,8 +9,14 @@ import pytest
 from commands import slamgym
 from recordings import recorded
 
+from slamgym.estimator.filters.drive_likelihood import drive_likelihood
 from slamgym.estimator.models.bearing_range import wrap_angle
-from slamgym.experiments.log_conventions import _Comparison, mistake_in, part_of
+from slamgym.experiments.log_conventions import (
+    _Comparison,
+    events_of,
+    mistake_in,
+    part_of,
+)
 from slamgym.experiments.logs import (
     OdometryRow,
     Scan,
@@ -260,6 +266,12 @@ def test_the_nis_of_a_fit_is_near_1_and_falls_with_the_square_of_the_noise(corri
     assert 0.7 < fit.nis[0] < 1.3
     assert fit.nis[1] == pytest.approx(fit.nis[0] / 4, rel=1e-3)
     assert not fit.rejected.any()
+    quarter = np.full((1, 2), 0.25)
+    few, events = comparison.fit(given, quarter), events_of(given)
+    record = drive_likelihood(comparison.filter, events, comparison.noises(quarter))
+    again = len(events.readings) - len(set(events.landmarks.tolist()))
+    assert 0.1 < few.rejected[0] == pytest.approx(record.rejected.sum() / again)
+    assert few.likelihoods[0] == pytest.approx(record.log_likelihoods.sum() / again)
     unusable = given.measurements.copy()
     unusable[::100, 1] = 0.0
     lost = comparison.fit(given._replace(measurements=unusable), np.ones((1, 2)))
