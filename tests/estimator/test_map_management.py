@@ -16,6 +16,7 @@ from slamgym.estimator import check_estimator, list_estimators, make_estimator
 from slamgym.estimator.map_management import policy as policies
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
 from slamgym.estimator.map_management.policy import FieldOfView, LandmarkPolicy
+from slamgym.estimator.map_management.pruning import LandmarkRecords
 from slamgym.estimator.models.motions import UNICYCLE, differential
 from slamgym.estimator.models.relative_geometry import largest_std, separation
 from slamgym.evaluation.nees import normalised_squared_error
@@ -587,6 +588,21 @@ def test_a_merged_landmark_answers_to_both_names():
     assert slam.update(place[:1], [8]).added_ids == (8,)  # another run, other names
 
 
+def test_records_of_merged_landmarks_are_those_of_one_with_all_their_names():
+    records = LandmarkRecords()
+    records.follow([4, 7, 9, 11])
+    records.misses[:] = 2, 3, 1, 0
+    records.information[:] = np.arange(12.0).reshape(4, 3)
+    records.apart = {(9, 11)}
+    records.join(7, 9)
+    records.join(4, 7)
+    assert records.misses[0] == 1  # it was seen as 9
+    assert records.information[0].tolist() == [9, 12, 15]
+    assert records.aliases == {7: 4, 9: 4}
+    records.follow([4, 11])
+    assert records.apart == {(4, 11)}
+
+
 # --- capacity ---
 
 
@@ -601,6 +617,13 @@ def test_beyond_its_capacity_a_map_gives_up_what_it_knows_least_of():
     report = slam.update(polar([(-3, -2), (-3, 2)]), [4, 3])
     assert report.removed_ids == (0,)  # as often read as 1, but from farther
     assert slam.belief().landmark_ids == (1, 3, 4)
+
+
+def test_of_landmarks_known_alike_the_newest_is_given_up():
+    records = LandmarkRecords()
+    records.follow([7, 9, 3, 5])
+    records.information[:] = np.outer([1, 1, 1, 2], [1.0, 0.5, 1.0])
+    assert records.by_information([7, 9, 3, 5]) == [3, 9, 7, 5]
 
 
 def test_a_reading_from_afar_informs_less_where_noise_grows_with_the_range():
