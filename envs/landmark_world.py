@@ -295,11 +295,13 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
 
     def _asked(self, options: Mapping[str, Any]) -> tuple[Scenario, dict[str, Any]]:
         """Return the world that options of `reset` ask for, and how they change it."""
+        if not isinstance(options, Mapping):
+            raise ValueError(f"options must be a dict, got {short_repr(options)}")
         for name in options:
             if name not in _OPTIONS:
                 known = ", ".join(_OPTIONS)
-                hint = closest(name, _OPTIONS)
-                raise ValueError(f"options may hold {known}, got '{name}'{hint}")
+                hint = closest(str(name), _OPTIONS)
+                raise ValueError(f"options may hold {known}, got {name!r}{hint}")
         changes: dict[str, Any] = {}
         if "pose" in options:
             changes["start"] = {"pose": _numbers("pose", options["pose"], (3,))}
@@ -381,15 +383,16 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
 def _numbers(name: str, value: object, shape: tuple[int, ...]) -> list[Any]:
     """Return an option of `reset` as lists of finite numbers."""
     try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+        array = np.asarray(value)
+    except ValueError:  # lists of several lengths
         array = np.array(np.nan)
-    if array.shape != shape or not np.isfinite(array).all():
+    is_real = array.dtype.kind in "iuf"
+    if array.shape != shape or not (is_real and np.isfinite(array).all()):
         raise ValueError(
             f"options['{name}'] must be finite numbers of shape {shape}, "
             f"got {short_repr(value)}"
         )
-    numbers: list[Any] = array.tolist()
+    numbers: list[Any] = array.astype(np.float64).tolist()
     return numbers
 
 

@@ -465,7 +465,11 @@ def test_wrong_settings_are_refused_by_name(changes, message):
     [
         ({"pse": 1}, r"options may hold pose, .*, got 'pse'; did you mean 'pose'"),
         ({"pose": (0, 1)}, r"\['pose'\] must be finite numbers of shape \(3,\), got"),
+        ({1: 2}, "options may hold pose, landmarks, scenario, got 1"),
+        ("pose", "options must be a dict, got 'pose'"),
         ({"pose": "here"}, r"\['pose'\] must be finite numbers .*, got 'here'"),
+        ({"pose": ("0", "1", "2")}, r"\['pose'\] must be finite numbers"),
+        ({"pose": (True, False, True)}, r"\['pose'\] must be finite numbers"),
         ({"pose": (np.nan, 0, 0)}, r"\['pose'\] must be finite"),
         ({"pose": (9e4, 0, 0)}, "keep 'landmarks' in the observation space, up to"),
         ({"landmarks": [[1, 2]]}, r"\['landmarks'\] must be .* of shape \(30, 2\)"),
