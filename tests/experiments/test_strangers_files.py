@@ -100,6 +100,26 @@ def test_other_spellings_of_the_tables_are_the_same_log(folder, odometry, measur
             assert (ours.t, ours.d, ours.alpha, ours.dt) == pytest.approx(expected)
 
 
+@pytest.mark.parametrize(
+    ("names", "units"),
+    [
+        ("omega_deg_s;time;v", (math.pi / 180, 1)),
+        ("yaw_rate (deg/sec);stamp;speed_mm_s", (math.pi / 180, 1e-3)),
+        ("w_dps;t;v [cm per second]", (math.pi / 180, 1e-2)),
+        ("twist.angular.z [mrad/s];t;v_kmh", (1e-3, 1 / 3.6)),
+    ],
+)
+def test_units_of_velocities_are_understood_in_any_spelling(folder, names, units):
+    rows = [(0.4, 0, 1.0), (0.2, 1, 2.0), (0, 2, 0)]
+    turn, drive = units
+    lines = [f"{w / turn!r};{t};{v / drive!r}" for w, t, v in rows]
+    log = own(folder, odometry="\n".join([names, *lines]) + "\n")
+    ours = own(folder, odometry="t,v,omega\n0,1,.4\n1,2,.2\n2,0,0\n")
+    for event, same in zip(log.events, ours.events, strict=True):
+        if not isinstance(event, Scan):
+            assert (event.d, event.alpha) == pytest.approx((same.d, same.alpha))
+
+
 def test_two_tables_of_one_kind_are_refused(folder):
     with pytest.raises(LogError, match=r"one file with odometry, got odom.csv and odo"):
         own(folder, odom=ODOMETRY)
@@ -489,6 +509,12 @@ def test_a_folder_without_a_true_path_is_no_truth(folder):
 def test_a_single_file_of_utias_asks_for_its_folder(file, name):
     with pytest.raises(LogError, match=f"{name}: expected a log, .*: give its folder"):
         read_log(file("1248272262.1 0.1 0\n1248272262.2 0.1 0\n", name))
+
+
+def test_a_table_without_the_columns_of_odometry_is_shown_with_them(folder):
+    wheels = "t,v,gyro\n0,1,2\n"
+    with pytest.raises(LogError, match=r"got measurements.csv .*; wheels.csv with"):
+        read_log(folder(measurements=MEASUREMENTS, wheels=wheels))
 
 
 def test_a_folder_of_unknown_tables_names_them(folder):

@@ -59,17 +59,19 @@ _NAMES = {column: names.split() for column, names in SYNONYMS.items()}
 _IGNORED = {"field", "pose", "twist", "robot", "odom", "odometry", "measured"}
 #: Words for each unit by its size in SI units.
 _WORDS = {
-    1.0: "m metre metres meter meters m/s rad radian radians rad/s s sec secs second "
-    "seconds 1 -",
-    math.pi / 180: "deg degree degrees ° deg/s °/s",
-    1e-2: "cm",
-    1e-3: "mm ms msec millisecond milliseconds",
+    1.0: "m metre metres meter meters m/s mps rad radian radians rad/s radps s sec "
+    "secs second seconds 1 -",
+    math.pi / 180: "deg degree degrees ° deg/s °/s dps degps",
+    1e-2: "cm cm/s",
+    1e-3: "mm mm/s mrad mrad/s ms msec millisecond milliseconds",
+    1 / 3.6: "km/h kmh kph",
     1e-6: "us µs μs usec microsecond microseconds",
     1e-9: "ns nsec nanosec nanosecond nanoseconds",
     1e3: "km",
 }
 UNITS = {word: size for size, words in _WORDS.items() for word in words.split()}
 UNITS[""] = 1.0
+_IN_TIME = {"sec": "s", "second": "s", "hr": "h", "hour": "h"}
 #: Names of t that state its unit.
 _TIMED = ("sec", "secs", "seconds", "step", "k")
 #: The columns of each kind, in the forms that it may have.
@@ -109,6 +111,7 @@ _FEWEST_INSIDE = 0.1  # least share of readings within the time of the odometry
 #: A first stamp beyond this is an epoch time, which is subtracted [s].
 _EPOCH = 1e8
 TIME_DIGITS = 6
+_MOST_SHOWN = 3  # tables of an unknown kind in an error
 _EMPTY = ("", "nan", "none", "null")
 
 
@@ -259,7 +262,7 @@ def _check_units(header: log_lines.LogLine, names: Sequence[str]) -> None:
     known = {name for spellings in _NAMES.values() for name in spellings}
     for name in names:
         match = _UNIT.fullmatch(name.lower())
-        if match and match[2].strip() not in UNITS and _plain(match[1]) in known:
+        if match and _unit(match[2]) not in UNITS and _plain(match[1]) in known:
             wanted = "one of the units m, cm, mm, km, rad, deg, s, ms, us and ns"
             raise header.error(wanted, f"{log_lines.shown(name)}: convert the column")
 
@@ -303,14 +306,29 @@ def _readings_of(name: str) -> Iterator[tuple[str, str]]:
     --------
     >>> list(_readings_of("Bearing [deg]")), list(_readings_of("range_mm"))
     ([('bearing', 'deg')], [('rangemm', ''), ('range', 'mm')])
+    >>> ("omega", "deg/s") in _readings_of("omega_deg_s")
+    True
     """
     match = _UNIT.fullmatch(name.lower())
     text, unit = match.groups() if match else (name.lower(), "")
     parts = _parts(text)
-    if unit.strip() in UNITS:
-        yield "".join(parts), unit.strip()
-    if not unit and len(parts) > 1 and parts[-1] in UNITS:
-        yield "".join(parts[:-1]), parts[-1]
+    if (unit := _unit(unit)) in UNITS:
+        yield "".join(parts), unit
+    for k in range(1, len(parts)):
+        if not match and (unit := _unit("/".join(parts[k:]))) in UNITS:
+            yield "".join(parts[:k]), unit
+
+
+def _unit(text: str) -> str:
+    """Return a unit in its usual form, such as deg/s for ``deg per sec``.
+
+    Examples
+    --------
+    >>> _unit("deg per sec"), _unit(" m / s "), _unit("rad/per/s"), _unit("sec")
+    ('deg/s', 'm/s', 'rad/s', 'sec')
+    """
+    words = [word for word in re.split(r"[/\s]+|\bper\b", text) if word]
+    return "/".join([*words[:1], *(_IN_TIME.get(word, word) for word in words[1:])])
 
 
 def tables_in(folder: Path) -> list[Table]:
@@ -450,10 +468,13 @@ def lacking(kind: str, tables: Sequence[Table], source: Path) -> slamlog.LogErro
     form = _EXAMPLES["groundtruth" if kind == "truth" else kind]
     if kind == "measurements":
         form += ", one row per reading"
-    got = "; ".join(
-        f"{table.file.name} with {log_lines.shown(table.header.text)}"
-        for table in tables
-    )
+    heads = {table.file: table.header.text for table in tables}
+    if source.is_dir():
+        files = (file for file in source.iterdir() if file.suffix.lower() in ENDINGS)
+        for file in sorted(set(files) - set(heads))[:_MOST_SHOWN]:
+            heads[file] = log_lines.read_lines(file)[0].text
+    shown = (f"{file.name} with {log_lines.shown(heads[file])}" for file in heads)
+    got = "; ".join(shown)
     other = "" if source.is_dir() else ", or give the folder of several such files"
     if kind == "odometry" and any(table.has_path for table in tables):
         other += "; poses give odometry by their differences: t, dx, dy, dtheta"
