@@ -31,6 +31,7 @@ from filelock import FileLock, Timeout
 
 from ..sim_configs.field_types import unknown_choice
 from ..sim_configs.scenario_files import WRITER, replace_when_written
+from .environment_variables import without_scripts_of_the_user
 from .run_and_replay.filter_settings import integer, one_blas_thread
 
 Result = TypeVar("Result")
@@ -176,28 +177,6 @@ def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
             yield from compute(calls)
 
     return workers
-
-
-def without_scripts_of_the_user() -> contextlib.AbstractContextManager[None]:
-    """Let processes begun in the block import modules of Python, such as random.
-
-    Else a file random.py in the working folder would replace it.
-    """
-    return environment("PYTHONSAFEPATH", "1")
-
-
-@contextlib.contextmanager
-def environment(name: str, value: str) -> Iterator[None]:
-    """Set a variable of the environment during the block, for processes begun in it."""
-    before = os.environ.get(name)
-    os.environ[name] = value
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[name]
-        else:
-            os.environ[name] = before
 
 
 def blocks_at_once(jobs: int | None, backend: str | None) -> int:

@@ -8,6 +8,7 @@ import ast
 import atexit
 import contextlib
 import gc
+import importlib
 import inspect
 import io
 import json
@@ -34,6 +35,7 @@ from typer.core import TyperGroup
 from ... import __version__
 from ...sim_configs.scenario_files import unfinished
 from ...suggestions import FOLDERS
+from ..environment_variables import environment
 from ..progress_bar import Tick, progress_bar
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -68,7 +70,7 @@ class OneLineErrors(TyperGroup):
         _open_closed_streams()
         _replace_unknown_characters()
         try:
-            with rarely_collecting(), ending_in_time(line), terminable():
+            with rarely_collecting(), ending_in_time(line), terminable(), _same_look():
                 result = super().main(*args, **kwargs)
         except Exception as error:
             if "SLAMGYM_TRACEBACK" in os.environ:
@@ -192,6 +194,18 @@ def _open_closed_streams() -> None:
         sys.stdout = _ClosedOutput()
     if sys.stderr is None:
         sys.stderr = io.StringIO()
+
+
+@contextlib.contextmanager
+def _same_look() -> Iterator[None]:
+    """Draw as everywhere: without the user's settings of matplotlib.
+
+    Some need LaTeX or make figures unreadable, such as a dark background.
+    """
+    with environment("MATPLOTLIBRC", os.devnull):
+        if Path("matplotlibrc").exists():  # which matplotlib reads first
+            importlib.import_module("matplotlib").rcdefaults()
+        yield
 
 
 def _replace_unknown_characters() -> None:

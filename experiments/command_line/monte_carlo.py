@@ -16,7 +16,7 @@ from rich.text import Text
 
 from ...sim_configs import Scenario, load_scenario
 from ...sim_configs.field_types import unknown_choice
-from ..job_folders import without_scripts_of_the_user
+from ..environment_variables import without_scripts_of_the_user
 from . import options
 from .commands import (
     FAILURE,

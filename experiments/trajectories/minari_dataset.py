@@ -24,7 +24,7 @@ from minari.data_collector import EpisodeBuffer
 from ...envs.spaces import action_space, observation_space
 from ...sim_configs import Scenario
 from ...sim_configs.scenario_files import scenario_text
-from ..job_folders import environment
+from ..environment_variables import environment
 from .trajectory import (
     Trajectory,
     array_of,

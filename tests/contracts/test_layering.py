@@ -54,7 +54,7 @@ FLOORS = {  # from the ground up; rooms of one line do not import each other
         consistency_report
     """,
     "experiments": """
-        logs progress_bar
+        logs progress_bar environment_variables
         run_and_replay
         figures job_folders
         viewers

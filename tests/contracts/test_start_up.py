@@ -35,6 +35,12 @@ def test_importing_slamgym_loads_nothing_heavy():
     assert not heavy & loaded
 
 
+def test_the_program_begins_without_the_libraries_of_its_commands():
+    code = "import sys, slamgym.experiments.command_line.app; print(*sys.modules)"
+    heavy = {"numba", "scipy", "matplotlib", "pymunk", "xarray", "joblib"}
+    assert not heavy & set(run_python(code).split())
+
+
 @pytest.mark.slow
 def test_importing_slamgym_takes_hardly_longer_than_importing_gymnasium():
     code = """

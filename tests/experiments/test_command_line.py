@@ -1083,6 +1083,29 @@ def test_closed_streams_neither_lose_results_nor_change_the_exit_code(
     assert bool(done.stdout) == (code == 0)
 
 
+@pytest.mark.parametrize("place", [".", "rc"])
+def test_settings_of_matplotlib_do_not_change_the_pictures_of_a_command(
+    place, tmp_path, monkeypatch
+):
+    (tmp_path / place).mkdir(exist_ok=True)
+    (tmp_path / place / "matplotlibrc").write_text("axes.facecolor: black\n")
+    monkeypatch.setenv("MATPLOTLIBRC", str(tmp_path / place))
+    program = (
+        "from slamgym.experiments.command_line import commands, options\n"
+        "@commands.command\n"
+        "def look() -> None:\n"
+        "    'Look.'\n"
+        "    import matplotlib\n"
+        "    print(matplotlib.rcParams['axes.facecolor'])\n"
+        "commands.main(['look'])"
+    )
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(
+        command, cwd=tmp_path, check=True, capture_output=True, text=True
+    )
+    assert done.stdout == "white\n"
+
+
 def test_a_tilde_after_an_equals_sign_is_the_home_of_the_user(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     assert slamgym("generate", "loop", "--episodes=1", "--out=~/drives").exit_code == 0
