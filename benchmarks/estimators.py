@@ -240,6 +240,7 @@ def compare_hidden(seen: int, mapped: int) -> None:
         packages = {", earlier": sys.modules[f"{EARLIER}.estimator"].make_estimator}
         packages[""] = make_estimator
     cases: dict[str, Callable[[], object]] = {}
+    slams: dict[str, Any] = {}
     for key, make in packages.items():
         for name, given, options in (
             ("identities given", ids, {}),
@@ -249,6 +250,7 @@ def compare_hidden(seen: int, mapped: int) -> None:
             slam = make("invariant", **NOISE, **options)
             slam.update(readings, list(range(mapped)))
             cases[name + key] = drive_step(slam, scans, given)
+            slams[name + key] = slam
     times = time_interleaved(cases)
     CONSOLE.print(f"one step, {seen} seen of {mapped} landmarks")
     for name in times:
@@ -257,6 +259,8 @@ def compare_hidden(seen: int, mapped: int) -> None:
         said = ""
         if name in goal:
             said = f" (<= {goal[name]}: {verdict(found, goal[name], at_least=False)})"
+        if "hidden" in name:
+            said += f", hypotheses: {len(slams[name].hypotheses)}"
         CONSOLE.print(
             f"  {name}: {microseconds(times, name):.1f} µs, {found:.1f} ×{said}"
         )

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...argument_checks import aligned_copy
-from ...arrays import Array, IntArray
+from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_allocating, njit_inlined, njit_internal
 from ..association.missed_landmarks import (
     PROVEN,
@@ -65,9 +65,10 @@ from ..kernels.scan_update import DONE, OUTCOME, SLOT, USED, usable
 from ..models.bearing_range import wrap_angle
 from ..models.relative_geometry import variance_from_robot
 from ..models.sensors import BEARING_RANGE
-from .loop_closing import ACCURATE, FEWEST_READINGS
+from .loop_closing import ACCURATE, FEWEST_READINGS, LOCAL_STD, NEAR_STDS
 from .policy import LandmarkPolicy
 from .pruning import LandmarkRecords, add_sightings, noise_of_sightings
+from .recent_scans import RecentScan, RecentScans
 
 #: Difference of −2 ln of probabilities: hypotheses e²⁰ = 5e8 times less probable than
 #: the best one are discarded.
@@ -77,16 +78,27 @@ SPREAD = 40.0
 class ClearScan(NamedTuple):
     """A scan as one hypothesis associates it."""
 
-    #: −2 ln of the likelihood of the associations to consider, the best first, (M,).
-    costs: Array
-    #: Slot of the map of each reading, `NEW` or `AMBIGUOUS`, shape (M, m).
-    slots: IntArray
+    #: Rows (β, r) [rad, m], shape (m, 2).
+    readings: Array
+    #: Number of the scan.
+    number: int
+    #: −2 ln of the likelihood of the associations to consider, the best first.
+    costs: Sequence[float]
+    #: Slot of the map of each reading, `NEW` or `AMBIGUOUS`, shape (M, m); None where
+    #: the landmarks were given.
+    slots: IntArray | None
     #: Place of the tentative landmark of each reading, or below 0, shape (m,).
     again: IntArray
-    #: Probability to miss each tentative landmark, shape (t,).
-    chance: Array
-    #: Density of readings of no known landmark at each reading, (m,) [1 / (rad m)].
-    density: Array
+    #: The readings that the filter uses, and their landmarks.
+    fed: tuple[Array, IntArray]
+    #: The landmark of each reading, and the label of its tentative landmark.
+    row_ids: tuple[int | None, ...]
+    labels: tuple[int, ...]
+    #: Rows of tentative landmarks, and those that are ambiguous.
+    tentative_rows: tuple[int, ...]
+    ambiguous_rows: tuple[int, ...]
+    #: The tentative landmarks after the scan.
+    following: TentativeLandmarks
 
 
 class ClearScans:
@@ -98,28 +110,22 @@ class ClearScans:
         The filter of the hypothesis, for which :meth:`serve` is true.
     policy : LandmarkPolicy
     sensor : AssociationSensor
+    recent : RecentScans
+        Of the hypothesis: it notes the scans.
     """
 
     def __init__(
-        self, slam: Any, policy: LandmarkPolicy, sensor: AssociationSensor
+        self,
+        slam: Any,
+        policy: LandmarkPolicy,
+        sensor: AssociationSensor,
+        recent: RecentScans,
     ) -> None:
-        self._slam, self._settings = slam, settings_of(policy, sensor)
+        self._slam, self._recent = slam, recent
         self._filter = filter_inside(slam)
         self._policy, self._noise = policy, sensor.noise
-        self._tally: Any = None  # an array, where it holds the records
-        self._path: list[list[float]] = []
-        #: Number of scans taken in since the records were renewed.
-        self.ahead = 0
-        #: Number of the present scan, and whether the filter has used all its readings.
-        self.number, self.is_used = 0, True
-        #: The landmark of each of its readings, and the label of a tentative landmark.
-        self.row_ids: tuple[int | None, ...] = ()
-        self.labels: tuple[int, ...] = ()
-        #: Its rows of tentative landmarks, and those that are ambiguous.
-        self.rows: tuple[tuple[int, ...], tuple[int, ...]] = (), ()
-        self._scan: ClearScan | None = None
-        #: The tentative landmarks, and those after the present scan.
-        self.tentative = self.following = TentativeLandmarks()
+        self._settings = settings_of(policy, sensor)
+        self.forget()
 
     @staticmethod
     def serve(slam: SlamEstimator, policy: LandmarkPolicy) -> bool:
@@ -139,150 +145,152 @@ class ClearScans:
             and policy.merge_within is None
         )
 
-    def load(self, candidates: Candidates, records: LandmarkRecords) -> bool:
-        """Load the records as last renewed; return whether scans may be clear."""
+    def forget(self) -> None:
+        """Forget all scans, since other records begin."""
+        self._tally: Any = None  # an array, where it holds the records
+        self._path: list[list[float]] = []
+        #: Number of scans taken in since the records were renewed.
+        self._ahead = 0
+
+    def associate(
+        self,
+        readings: Array,
+        ids: IntArray | None,
+        ceiling: float,
+        candidates: Candidates,
+        records: LandmarkRecords,
+    ) -> ClearScan | None:
+        """Associate a scan (m, 2); return None if it is not clear.
+
+        Parameters
+        ----------
+        readings : ndarray, shape (m, 2)
+            Rows (β, r) [rad, m].
+        ids : ndarray of int64, shape (m,), or None
+            The landmarks, if they are given.
+        ceiling : float
+            Cost beyond which only the best association is of interest.
+        candidates, records
+            As last renewed, but for the tentative landmarks.
+        """
+        inside, count, known = self._filter.map, len(readings), candidates.tentative
         if self._tally is None:
-            parts = self._filter.map.parts
-            mapped = parts.ids[: parts.numbers[LANDMARKS]].tolist()
+            mapped = [*inside.slots]
             is_full = len(mapped) > (self._policy.capacity or math.inf)
             if is_full or not may_be_clear(candidates, records, mapped):
-                return False
+                return None
             self._tally = new_tally(candidates, records, self._settings)
-            self.tentative, self._first = candidates.tentative, candidates.scan
-        self.number = self._first + self.ahead
-        return True
-
-    def associate(self, readings: Array, ceiling: float) -> float | None:
-        """Associate a scan (m, 2); return its cost, or None if it is not clear.
-
-        Above a cost of ``ceiling``, only the best association is of interest.
-        """
-        parts, known = self._filter.map.parts, self.tentative[:3]
-        block, tally = self._filter.map.block, self._tally
-        scan = ClearScan(*associate_clear(block, tally, known, readings, ceiling))
-        if not len(scan.costs):
+        number, none = candidates.scan + self._ahead, (NO_LABEL,) * count
+        if ids is not None:
+            row_ids = tuple(ids.tolist())
+            if not all(map(inside.slots.__contains__, row_ids)):
+                return None
+            kept, given = known.after_scan(self._policy.confirm[1]), (readings, ids)
+            again = np.zeros(count, np.int64)
+            decided = given, row_ids, none, (), (), kept
+            return ClearScan(readings, number, (0.0,), None, again, *decided)
+        tentative = known.mean, known.covariance, known.seen
+        found = associate_clear(inside.block, self._tally, tentative, readings, ceiling)
+        costs, slots, again, chance, density = found
+        if not len(costs):
             return None
-        self._scan, best = scan, scan.slots[0]
-        marks, self._ids = best.tolist(), parts.ids[best]
-        ids = self._ids.tolist()
-        self.row_ids = tuple(ids)
-        self.labels, self.following = (NO_LABEL,) * len(ids), self.tentative
-        self.rows = (), ()
+        marks, fed = slots[0].tolist(), (readings, inside.parts.ids[slots[0]])
+        row_ids, new, unclear = tuple(fed[1].tolist()), list[int](), list[int]()
         if min(marks, default=0) < 0:
-            every = np.flatnonzero(best == NEW), np.flatnonzero(best == AMBIGUOUS)
-            self.rows = tuple(every[0].tolist()), tuple(every[1].tolist())
-            pairs = zip(ids, marks, strict=True)
-            self.row_ids = tuple([i if slot >= 0 else None for i, slot in pairs])
-        is_tried = len(scan.chance) or self.rows[0]
-        if is_tried and not self._follow_tentative(readings):
-            return None
-        return float(scan.costs[0])
+            rows = slots[0] >= 0
+            fed = readings[rows], fed[1][rows]
+            new = [k for k, slot in enumerate(marks) if slot == NEW]
+            unclear = [k for k, slot in enumerate(marks) if slot == AMBIGUOUS]
+            pairs = zip(row_ids, marks, strict=True)
+            row_ids = tuple([i if slot >= 0 else None for i, slot in pairs])
+        rest = again, fed, row_ids, none, tuple(new), tuple(unclear), known
+        scan = ClearScan(readings, number, costs.tolist(), slots, *rest)
+        if not len(chance) and not new:
+            return scan
+        return self._with_tentative(scan, chance, density)
 
-    def _follow_tentative(self, readings: Array) -> bool:
-        """Find the tentative landmarks after the scan; return whether none is proven.
+    def _with_tentative(
+        self, scan: ClearScan, chance: Array, density: Array
+    ) -> ClearScan | None:
+        """Find the tentative landmarks after a scan; return None if one is proven.
 
-        See `ScanAssociation`.
+        See `ScanAssociation`.  ``chance`` is the probability to miss each of them, and
+        ``density`` that of readings of no known landmark [1 / (rad m)].
         """
-        needed, scans = self._policy.confirm
-        known, scan = self.tentative, self._scan
-        assert scan is not None
-        again = scan.again
+        (needed, scans), again = self._policy.confirm, scan.again
+        numbers, known = tally_of(self._tally).numbers, scan.following
         rows = np.flatnonzero(again >= 0)
         if len(rows):
-            shown, density = readings[rows], scan.density[rows]
-            known = known.with_sightings(again[rows], shown, self._noise, density)
-        known = known.with_misses(scan.chance)
-        fresh = [row for row in self.rows[0] if again[row] < 0]
+            shown = again[rows], scan.readings[rows], self._noise, density[rows]
+            known = known.with_sightings(*shown)
+        known = known.with_misses(chance)
+        fresh = [row for row in scan.tentative_rows if again[row] < 0]
         if (len(rows) and known.proven(needed).any()) or (fresh and needed == 1):
-            return False
+            return None
         labels = np.append(known.labels, NO_LABEL)[np.maximum(again, -1)]
-        labels[fresh] = [(self.number << LABEL_BITS) + row for row in fresh]
-        self.labels = tuple(labels.tolist())
+        labels[fresh] = [(scan.number << LABEL_BITS) + row for row in fresh]
         if fresh:
-            added = readings[fresh], self._noise, labels[fresh]
-            landmarks, unknown = tally_of(self._tally).numbers[[SHARE, SUMS]].tolist()
-            known = known.with_new(*added, min(landmarks / unknown, 1.0))
-        self.following = known.after_scan(scans)
-        return True
+            share = min(float(numbers[SHARE] / numbers[SUMS]), 1.0)
+            added = scan.readings[fresh], self._noise, labels[fresh], share
+            known = known.with_new(*added)
+        following = known.after_scan(scans)
+        return scan._replace(labels=tuple(labels.tolist()), following=following)
 
-    def associate_given(self, ids: IntArray) -> bool:
-        """Assign the given landmarks; return whether the map holds all of them."""
-        self._scan, self._ids, self.row_ids = None, ids, tuple(ids.tolist())
-        if not all(map(self._filter.map.slots.__contains__, self.row_ids)):
-            return False
-        self.labels, self.rows = (NO_LABEL,) * len(ids), ((), ())
-        self.following = self.tentative.after_scan(self._policy.confirm[1])
-        return True
-
-    def has_rivals(self, ceiling: float) -> bool:
-        """Return whether another association costs no more than this."""
-        scan = self._scan
-        if scan is None or len(scan.costs) == 1:
-            return False
-        return int((scan.costs <= ceiling).sum()) > 1
-
-    def tried(self, readings: Array, ceiling: float) -> list[tuple[float, MapView]]:
+    def tried(self, scan: ClearScan, ceiling: float) -> list[tuple[float, MapView]]:
         """Return the costs of associations up to a ceiling, and the beliefs after them.
 
         The best one comes first.  Those that the filter refuses are left out.
         """
-        gaussian, scan, found = self._filter.map, self._scan, []
-        assert scan is not None
+        gaussian, found = self._filter.map, []
+        every = () if scan.slots is None else scan.slots
         ids, names = gaussian.parts.ids, [*gaussian.slots]
-        for cost, slots in zip(scan.costs.tolist(), scan.slots, strict=True):
+        for cost, slots in zip(scan.costs, every, strict=True):
             rows, copy = slots >= 0, aligned_copy(gaussian.block)
             if cost <= ceiling and (
-                update_map(copy, readings[rows], ids[slots[rows]]) == DONE
+                update_map(copy, scan.readings[rows], ids[slots[rows]]) == DONE
             ):
                 after = parts_of(copy)
                 found.append((cost, MapView(after.mean, after.covariance, names)))
         return found
 
-    def take(self, readings: Array) -> bool:
-        """Take in the scan as associated; return False if the filter refuses it."""
-        gaussian, scan, ids, used = self._filter.map, self._scan, self._ids, readings
-        slots = again = np.zeros(len(ids), np.int64)
-        if scan is not None:
-            slots, again = scan.slots[0], scan.again
-            if None in self.row_ids:
-                used, ids = readings[slots >= 0], ids[slots >= 0]
+    def take(self, scan: ClearScan) -> bool:
+        """Take in a scan as associated; return False if the filter refuses it."""
+        gaussian, is_given = self._filter.map, scan.slots is None
+        slots = scan.again if scan.slots is None else scan.slots[0]
+        before = self._recent.state_before(scan.number, scan.labels)
         if self._filter is self._slam:
-            if gaussian.take_in(update_map, used, ids) != DONE:
+            if gaussian.take_in(update_map, *scan.fed) != DONE:
                 return False
         else:
             try:
-                self._slam.update(used, ids)
+                self._slam.update(*scan.fed)
             except (ValueError, np.linalg.LinAlgError):
                 return False
-        block, tally, given = gaussian.block, self._tally, scan is None
-        done = count_clear(block, tally, readings, slots, again, given)
-        is_afar, self.is_used = done
-        self.tentative, self.ahead = self.following, self.ahead + 1
+        parts, read = gaussian.parts, (scan.readings, slots, scan.again)
+        is_afar, is_used = count_clear(gaussian.block, self._tally, *read, is_given)
+        self._ahead += 1
         if is_afar:
-            mean, P = gaussian.parts.mean[:3], gaussian.parts.covariance[:3, :3]
-            self._path.append([self.number, *mean.tolist(), *P.ravel().tolist()])
+            mean, P = parts.mean[:3], parts.covariance[:3, :3]
+            self._path.append([scan.number, *mean.tolist(), *P.ravel().tolist()])
+        unused: set[int] = set()
+        if not is_used:
+            report = self._slam.report()
+            unused.update(report.rejected_ids, report.skipped_ids)
+        # The caller may reuse the array of readings.
+        kept = self._recent.motions, scan.readings.copy(), scan.row_ids, scan.labels
+        self._recent.note_clear(RecentScan(scan.number, *kept, before), unused)
         return True
-
-    @property
-    def is_loaded(self) -> bool:
-        """Whether the memory holds the records."""
-        return self._tally is not None
-
-    def forget(self) -> None:
-        """Forget all scans, since other records begin."""
-        self._tally, self._path, self.ahead = None, [], 0
 
     def renew(self, before: Candidates, records: LandmarkRecords) -> Candidates:
         """Return the candidates after the scans taken in; renew the records."""
         if self._tally is None:
             return before
-        tally, self._tally = tally_of(self._tally), None
-        before = before._replace(tentative=self.tentative)
-        if not self.ahead:
+        tally, ahead, path = tally_of(self._tally), self._ahead, self._path
+        self.forget()
+        if not ahead:
             return before
         records.misses, records.information = tally.misses, tally.information
         known, numbers = before.detections, tally.numbers.tolist()
-        path = np.vstack([known.path, *self._path]) if self._path else known.path
         lost = LostEvidence(*numbers[EVIDENCE:SUMS])
         lost = lost._replace(first_new=int(tally.whole[FIRST_NEW]))
         detections = known._replace(
@@ -290,12 +298,12 @@ class ClearScans:
             missed=_renewed(known.missed, records.ids, tally.missed, 1.0),
             shown=_renewed(known.shown, records.ids, tally.shown, 0),
             lost=lost,
-            path=path,
+            path=np.vstack([known.path, *path]) if path else known.path,
         )
         sums = zip(UnexplainedDensity._fields, numbers[SUMS:PLACE], strict=False)
         density = before.density._replace(**dict(sums), cells=tally.cells)
-        scan, self.ahead, self._path = before.scan + self.ahead, 0, []
-        return before._replace(scan=scan, density=density, detections=detections)
+        number = before.scan + ahead
+        return before._replace(scan=number, density=density, detections=detections)
 
 
 def filter_inside(slam: Any) -> Any:
@@ -379,7 +387,7 @@ class ClearRules(NamedTuple):
     nodes: float
     accurate: float  # a robot that knows no landmark so well may be astray [m]
     lost: float  # a landmark that is known less well may be lost [m]
-    fewest: float  # landmarks of a map that may hold lost ones
+    least: float  # landmarks of a constellation that recognises lost ones
     keeps_path: float
 
 
@@ -387,7 +395,7 @@ def settings_of(policy: LandmarkPolicy, sensor: AssociationSensor) -> Array:
     """Return the settings as an array."""
     splits, rules = policy.association == "hypotheses", policy.constellations
     lost = math.inf if rules is None else rules.lost_std
-    least = 2 * rules.least if rules is not None and not rules.always else 0
+    least = 0 if rules is None or rules.always else rules.least
     return np.array(
         [
             *sensor.noise,
@@ -506,13 +514,14 @@ def associate_clear(
         Without any association, if the scan is not clear.
     """
     parts, tally, rows = parts_jit(block), tally_jit(tally_block), len(readings)
-    settings, (mean, P, seen) = settings_jit(tally), tentative
+    settings, seen = settings_jit(tally), tentative[2]
     density, again, chance = np.empty(rows), np.full(rows, NEW), np.ones(len(seen))
     none = np.empty(0), np.empty((0, rows), np.int64), again, chance, density
     is_known = tally.whole[COUNT] == parts.numbers[LANDMARKS]
     if not (is_known and _is_usable(readings, settings.min_range)):
         return none
-    if _may_be_lost(parts, settings):
+    is_astray, known = _known(parts, settings, readings)
+    if is_astray:
         return none
     _, per_scan, longest = _of_density(tally)
     density[:] = settings.density
@@ -522,15 +531,31 @@ def associate_clear(
     if len(seen) > 0:
         share = min(tally.numbers[SHARE] / tally.numbers[SUMS], 1.0)
         add_tentative(tentative, readings, settings.noise, gate, share, every)
-    belief = parts.mean, parts.covariance, parts.numbers[LANDMARKS]
+    belief = _part(parts, known)
     costs, slots, explained = _assign(
         belief, readings, every, settings, ceiling, int(settings.most)
     )
-    best = _count_best(parts, tally, readings, costs, slots, explained)
-    costs, slots = _with_rivals(costs, slots, best, ceiling)
-    if len(costs) == 0 or len(seen) == 0:
-        return costs, slots, again, chance, density
-    new = np.flatnonzero(slots[0] == NEW)
+    scan = slots, explained, readings
+    best = _count_best(belief, parts.ids[known], known, tally, costs, scan)
+    costs, slots = _with_rivals(costs, slots, best, ceiling, known)
+    if len(costs) > 0 and len(seen) > 0:
+        of_new = slots[0] == NEW, density, settings, longest
+        _associate_tentative(tentative, readings, of_new, tally, again, chance)
+    return costs, slots, again, chance, density
+
+
+@njit_allocating
+def _associate_tentative(
+    tentative: tuple[Array, Array, IntArray],
+    readings: Array,
+    of_new: tuple[BoolArray, Array, ClearRules, float],
+    tally: Tally,
+    again: IntArray,
+    chance: Array,
+) -> None:
+    """Fill the tentative landmark of each new reading, and the chance to miss each."""
+    (mean, P, seen), (is_new, density, settings, longest) = tentative, of_new
+    new = np.flatnonzero(is_new)
     if len(new) > 0:
         view = mean, P, len(seen)
         _, found, _ = _assign(view, readings[new], density[new], settings, np.inf, 1)
@@ -540,16 +565,16 @@ def associate_clear(
     nothing = new[:0], new[:0], readings[:0]
     is_telling = np.zeros(len(seen), np.bool_)
     count_scan((mean, P), nothing, is_telling, longest, counts, chance)
-    return costs, slots, again, chance, density
 
 
 @njit_allocating
 def _with_rivals(
-    costs: Array, slots: IntArray, best: int, ceiling: float
+    costs: Array, slots: IntArray, best: int, ceiling: float, known: IntArray
 ) -> tuple[Array, IntArray]:
     """Return the best association and those not far less probable; none to leave it.
 
-    An unpaired reading that is new begins another tentative landmark.
+    An unpaired reading that is new begins another tentative landmark.  The slots are
+    those of the known landmarks, which become those of the map.
     """
     kept, count = np.zeros(len(costs), np.int64), 1
     kept[0], most = best, min(costs[best] + SPREAD, ceiling)
@@ -558,39 +583,48 @@ def _with_rivals(
             if ((slots[k] == NEW) != (slots[best] == NEW)).any():
                 return costs[:0], slots[:0]
             kept[count], count = k, count + 1
-    return costs[kept[:count]], slots[kept[:count]]
+    costs, slots = costs[kept[:count]], slots[kept[:count]]
+    for k in range(count):
+        for i in range(slots.shape[1]):
+            slots[k, i] = known[slots[k, i]] if slots[k, i] >= 0 else slots[k, i]
+    return costs, slots
 
 
 @njit_allocating
 def _count_best(
-    parts: Parts,
+    belief: tuple[Array, Array, int],
+    ids: IntArray,
+    known: IntArray,
     tally: Tally,
-    readings: Array,
     costs: Array,
-    slots: IntArray,
-    explained: IntArray,
+    scan: tuple[IntArray, IntArray, Array],
 ) -> int:
     """Add what missed landmarks cost; return the best association, whose counts wait.
 
     See `Detections.after`.
     """
-    best, is_telling = 0, np.empty(len(tally.missed), np.bool_)
-    belief = parts.mean, parts.covariance
+    best, is_telling = 0, np.empty(len(known), np.bool_)
+    mean, P, _ = belief
+    slots, explained, readings = scan
     _, per_scan, longest = _of_density(tally)
     # The Poisson probability of no other reading.
     others = 2 * per_scan if np.isnan(settings_jit(tally).density) else 0.0
+    _copy(tally.missed, tally.next_missed)
     for k in range(len(slots)):
         for j in range(len(is_telling)):
-            is_older = parts.ids[j] < tally.whole[FIRST_NEW]
-            is_telling[j] = is_older and tally.shown[j] >= PROVEN
-        detected, missed = tally.detected.copy(), tally.missed.copy()
-        scan = slots[k], explained, readings
-        cost, fewer = count_scan(belief, scan, is_telling, longest, detected, missed)
+            is_older = ids[j] < tally.whole[FIRST_NEW]
+            is_telling[j] = is_older and tally.shown[known[j]] >= PROVEN
+        detected, missed = tally.detected.copy(), tally.missed[known]
+        shown = slots[k], explained, readings
+        cost, fewer = count_scan(
+            (mean, P), shown, is_telling, longest, detected, missed
+        )
         costs[k] += cost + others
         if k == 0 or costs[k] < costs[best]:
             best, tally.numbers[FEWER] = k, fewer
             _copy(detected.ravel(), tally.next_detected)
-            _copy(missed, tally.next_missed)
+            for j in range(len(known)):
+                tally.next_missed[known[j]] = missed[j]
     return best
 
 
@@ -605,18 +639,45 @@ def _is_usable(readings: Array, min_range: float) -> bool:
     return True
 
 
-@njit_internal
-def _may_be_lost(parts: Parts, settings: ClearRules) -> bool:
-    """Return whether the robot may be astray or a landmark lost: see `loop_closing`."""
+@njit_allocating
+def _known(
+    parts: Parts, settings: ClearRules, readings: Array
+) -> tuple[bool, IntArray]:
+    """Return whether the robot may be astray, and what its readings may belong to.
+
+    See `is_astray` and `without_lost`.
+    """
     mean, P, n = parts.mean, parts.covariance, parts.numbers[LANDMARKS]
-    is_astray, has_lost = n >= FEWEST_READINGS, False
-    for c in range(3, 3 + 2 * n, 2):
+    is_astray, is_lost = n >= FEWEST_READINGS, np.zeros(n, np.bool_)
+    local, reach = 0, NEAR_STDS * settings.lost
+    if len(readings) > 0:
+        reach += max(readings[:, 1].max(), 0.0)
+    for j in range(n):
+        c = 3 + 2 * j
         P[c, c + 1] = P[c + 1, c]  # of a large P, this part alone may be out of date
         dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
         std = np.sqrt(max(variance_from_robot(P, c, dx, dy), 0.0))
         is_astray &= std > settings.accurate
-        has_lost |= std > settings.lost
-    return is_astray or (has_lost and n >= settings.fewest)
+        is_lost[j] = std > settings.lost
+        local += std <= LOCAL_STD * settings.lost
+    lost, least = is_lost.sum(), settings.least
+    if lost == 0 or n < 2 * least or local < least or lost < 2 * least:
+        return is_astray, np.arange(n)
+    for j in range(n):
+        c = 3 + 2 * j
+        is_lost[j] |= np.hypot(mean[c] - mean[0], mean[c + 1] - mean[1]) > reach
+    return is_astray, np.flatnonzero(~is_lost)
+
+
+@njit_allocating
+def _part(parts: Parts, slots: IntArray) -> tuple[Array, Array, int]:
+    """Return mean and covariance of the pose and some landmarks, and their number."""
+    mean, P, n = parts.mean, parts.covariance, len(slots)
+    if n == parts.numbers[LANDMARKS]:
+        return mean, P, n
+    columns = np.arange(3 + 2 * n)
+    columns[3::2], columns[4::2] = 3 + 2 * slots, 4 + 2 * slots
+    return mean[columns], P[columns][:, columns].copy(), n
 
 
 @njit_allocating

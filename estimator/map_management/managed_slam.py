@@ -50,7 +50,7 @@ from ..interface import (
 from ..models.bearing_range import wrap_angle
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.rigid_motion import rotation
-from .clear_scans import SPREAD, ClearScans, is_near
+from .clear_scans import SPREAD, ClearScan, ClearScans, is_near
 from .loop_closing import AROUND, FEWEST_READINGS, is_astray, places_of_scan
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy
@@ -214,9 +214,8 @@ class ManagedSlam(FilterWrapper):
         reading = argument_checks.pair("odometry", odometry)
         if type(dt) is not float or dt != 1.0:
             argument_checks.duration(dt)
-        displacement = self._settings.motion_noise.motion.moved(reading)
         with changing(self, "predict"):
-            self._step(lambda h: h.predict(reading, dt, displacement))
+            self._step(lambda h: h.predict(reading, dt))
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -244,17 +243,21 @@ class ManagedSlam(FilterWrapper):
             If the arguments are malformed, or the filter's covariance is degenerate;
             all is then as before.
         """
-        readings = argument_checks.scan(measurements)
+        readings, ids = argument_checks.scan(measurements), None
+        if landmark_ids is not None:
+            count = len(readings)
+            ids = argument_checks.identity_array(landmark_ids, count, None)
         with changing(self, "update"):
-            report = self._take_clear(readings, landmark_ids)
+            report = self._take_clear(readings, ids)
             if report is not None:
                 return report
         with self._changing("update"):
-            if landmark_ids is None:
+            if ids is None:
                 return self._take(self._branches(readings))
-            ids = argument_checks.identities(landmark_ids, len(readings))
+            names: list[int] = ids.tolist()
+            argument_checks.refuse_repeated(names)
             given = [
-                Branch(h.cost, h, partial(h.as_given, readings, ids))
+                Branch(h.cost, h, partial(h.as_given, readings, names))
                 for h in self._hypotheses
             ]
             return self._take(given)
@@ -353,58 +356,51 @@ class ManagedSlam(FilterWrapper):
         several = f", best of {count} hypotheses" if count > 1 else ""
         return f"Managed {self.filter!r}{several}"
 
-    def _take_clear(
-        self, readings: Array, landmark_ids: LandmarkIds | None
-    ) -> UpdateReport | None:
+    def _take_clear(self, readings: Array, ids: IntArray | None) -> UpdateReport | None:
         """Take in a scan if it is clear in every hypothesis: see `ClearScans`."""
-        ceiling, ranked = np.inf, []
+        ceiling, ranked = np.inf, list[ClearBranch]()
         for h in self._hypotheses:
-            cost = h.associate_clear(readings, landmark_ids, ceiling - h.cost)
-            if cost is None:
+            scan = h.associate_clear(readings, ids, ceiling - h.cost)
+            if scan is None:
                 return None
-            ranked.append((h.cost + cost, h))
-            ceiling = min(ceiling, h.cost + cost + SPREAD)
+            ranked.append((h.cost + scan.costs[0], h, scan))
+            ceiling = min(ceiling, ranked[-1][0] + SPREAD)
         if len(ranked) > 1:
             ranked = sorted([r for r in ranked if r[0] <= ceiling], key=itemgetter(0))
-        every = [h for _, h in ranked]
-        if landmark_ids is None and self._is_split(every, readings, ceiling):
+        has_rivals = any(
+            cost <= ceiling - h.cost for _, h, scan in ranked for cost in scan.costs[1:]
+        )
+        if has_rivals and self._is_split(ranked, ceiling):
             return None
-        taken = self._taken(ranked, readings)
+        taken = self._taken(ranked)
         if not taken:
             return None
         if len(self._hypotheses) == 1:
-            return every[0].report
+            return taken[0][1].report
         chosen = distinct([h for _, h in taken], self.policy.hypotheses)
         return self._take_over([pair for pair in taken if pair[1] in chosen])
 
-    def _taken(
-        self, ranked: Sequence[tuple[float, Hypothesis]], readings: Array
-    ) -> list[tuple[float, Hypothesis]]:
+    def _taken(self, ranked: Sequence[ClearBranch]) -> list[tuple[float, Hypothesis]]:
         """Let hypotheses take in a clear scan; return those that do.
 
         The first one counts the step, so that an error in a later one leaves the mark.
         """
         taken: list[tuple[float, Hypothesis]] = []
-        for cost, h in ranked:
-            if h.take_clear(readings):
+        for cost, h, scan in ranked:
+            if h.take_clear(scan):
                 self.steps += not taken
                 taken.append((cost, h))
         return taken
 
-    def _is_split(
-        self, every: Sequence[Hypothesis], readings: Array, ceiling: float
-    ) -> bool:
+    def _is_split(self, ranked: Sequence[ClearBranch], ceiling: float) -> bool:
         """Return whether a scan that seemed clear splits one of these hypotheses."""
-        if not any(h.has_rivals(ceiling - h.cost) for h in every):
-            return False
         tried = [
-            (h.cost + cost, k, (view, h.labels_after))
-            for h in every
-            for k, (cost, view) in enumerate(h.tried(readings, ceiling - h.cost))
+            (h.cost + cost, k, (view, scan.following.labels.tobytes()))
+            for _, h, scan in ranked
+            for k, (cost, view) in enumerate(h.tried(scan, ceiling - h.cost))
         ]
         tried.sort(key=itemgetter(0))
-        beliefs = [belief for *_, belief in tried]
-        kept = differing(beliefs, self.policy.hypotheses)
+        kept = differing([belief for *_, belief in tried], self.policy.hypotheses)
         return any(tried[n][1] for n in kept)
 
     # One scan: all ways to associate it.  The most probable ones continue.
@@ -566,6 +562,10 @@ def _settled(
     return replace(policy, association="joint" if one else "hypotheses")
 
 
+#: A clear scan in one hypothesis, and the cost of both.
+ClearBranch = tuple[float, "Hypothesis", ClearScan]
+
+
 class Hypothesis:
     """One sequence of associations, and the filter that has followed it.
 
@@ -586,12 +586,11 @@ class Hypothesis:
         self.pruner = MapPruner(policy, self.editor, sensor.noise)
         self.recent = RecentScans(slam, self.editor, policy)
         serves = ClearScans.serve(slam, policy)
-        self._clear = ClearScans(slam, policy, sensor) if serves else None
+        clear = ClearScans(slam, policy, sensor, self.recent) if serves else None
+        self._clear = clear
         self._candidates = Candidates()
-        #: None after a clear scan: the filter can return it once more.
-        self._report: UpdateReport | None = UpdateReport()
-        self._row_ids: tuple[int | None, ...] = ()
-        self._rows: tuple[tuple[int, ...], tuple[int, ...]] = (), ()
+        #: After a clear scan this scan: the filter can return the report once more.
+        self._report: UpdateReport | ClearScan = UpdateReport()
 
     @property
     def candidates(self) -> Candidates:
@@ -609,7 +608,15 @@ class Hypothesis:
     @property
     def report(self) -> UpdateReport:
         """The report of the last update."""
-        return self._report_of_clear_scan() if self._report is None else self._report
+        scan = self._report
+        if isinstance(scan, UpdateReport):
+            return scan
+        report: UpdateReport = cast("Any", self.filter).report()
+        return report.completed(
+            row_ids=scan.row_ids,
+            tentative_rows=scan.tentative_rows,
+            ambiguous_rows=scan.ambiguous_rows,
+        )
 
     @report.setter
     def report(self, report: UpdateReport) -> None:
@@ -618,60 +625,36 @@ class Hypothesis:
     @property
     def tentative(self) -> TentativeLandmarks:
         """The landmarks without an identity that are not in the map yet."""
-        clear = self._clear
-        if clear is not None and clear.is_loaded:
-            return clear.tentative
         return self._candidates.tentative
 
+    @tentative.setter
+    def tentative(self, changed: TentativeLandmarks) -> None:
+        self._candidates = self._candidates._replace(tentative=changed)
+
     def associate_clear(
-        self, readings: Array, landmark_ids: LandmarkIds | None, ceiling: float
-    ) -> float | None:
-        """Associate a scan (m, 2); return its cost, or None unless it is clear."""
-        clear = self._clear
-        if clear is None or not clear.load(self._candidates, self.pruner.records):
+        self, readings: Array, ids: IntArray | None, ceiling: float
+    ) -> ClearScan | None:
+        """Associate a scan (m, 2), by its identities if given; None if not clear."""
+        if self._clear is None:
             return None
-        if landmark_ids is None:
-            return clear.associate(readings, ceiling)
-        ids = argument_checks.identity_array(landmark_ids, len(readings), None)
-        return 0.0 if clear.associate_given(ids) else None
+        known = self._candidates, self.pruner.records
+        return self._clear.associate(readings, ids, ceiling, *known)
 
-    def has_rivals(self, ceiling: float) -> bool:
-        """Return whether a clear scan has another association up to this cost."""
-        return self._clear is not None and self._clear.has_rivals(ceiling)
-
-    @property
-    def labels_after(self) -> bytes:
-        """Labels of the tentative landmarks after a clear scan."""
-        assert self._clear is not None
-        return self._clear.following.labels.tobytes()
-
-    def tried(self, readings: Array, ceiling: float) -> list[tuple[float, MapView]]:
+    def tried(self, scan: ClearScan, ceiling: float) -> list[tuple[float, MapView]]:
         """Return the costs and the beliefs after all associations of a clear scan."""
         assert self._clear is not None
-        return self._clear.tried(readings, ceiling)
+        return self._clear.tried(scan, ceiling)
 
-    def take_clear(self, readings: Array) -> bool:
+    def take_clear(self, scan: ClearScan) -> bool:
         """Take in a clear scan as associated; return False if the filter refuses it."""
-        clear = self._clear
-        assert clear is not None
-        decided = clear.row_ids, clear.labels
-        scan = self.recent.new_scan(clear.number, readings, *decided)
-        if not clear.take(readings):
+        assert self._clear is not None
+        if not self._clear.take(scan):
             return False
         self.editor.expire()
-        self._report, self._row_ids, self._rows = None, clear.row_ids, clear.rows
-        unused: set[int] = set()
-        if not clear.is_used:
-            unused.update(self.report.rejected_ids, self.report.skipped_ids)
-        self.recent.note_clear(scan, unused)
+        if scan.following is not self.tentative:
+            self.tentative = scan.following
+        self._report = scan
         return True
-
-    def _report_of_clear_scan(self) -> UpdateReport:
-        report: UpdateReport = cast("Any", self.filter).report()
-        tentative, ambiguous = self._rows
-        return report.completed(
-            row_ids=self._row_ids, tentative_rows=tentative, ambiguous_rows=ambiguous
-        )
 
     def _settle(self) -> None:
         """Complete what clear scans have left for later, before the map is edited."""
@@ -689,23 +672,15 @@ class Hypothesis:
         self.candidates, self.report = Candidates(), UpdateReport()
         self.recent.forget()
 
-    def predict(
-        self,
-        reading: tuple[float, float],
-        dt: float,
-        displacement: tuple[float, float, float],
-    ) -> None:
-        """Move by odometry (d, α), which is a displacement in the robot's frame."""
+    def predict(self, reading: tuple[float, float], dt: float) -> None:
+        """Move by odometry (d, α)."""
         self.filter.predict(reading, dt)
         self.editor.expire()
-        tentative, clear = self.tentative, self._clear
-        if len(tentative.seen):
-            variance = self.motion_noise.over(displacement, dt)
-            moved = tentative.moved(displacement, variance)
-            if clear is not None and clear.is_loaded:
-                clear.tentative = moved
-            else:
-                self._candidates = self._candidates._replace(tentative=moved)
+        if len(self._candidates.tentative.seen):
+            noise = self.motion_noise
+            displacement = noise.motion.moved(reading)
+            variance = noise.over(displacement, dt)
+            self.tentative = self.tentative.moved(displacement, variance)
         self.recent.note_motions((*reading, dt))
 
     def observe_pose(self, given: PoseReading) -> UpdateReport:
