@@ -6,6 +6,7 @@ the innovations. `write_noise` writes the noise into the header of the log's fil
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -68,8 +69,9 @@ class NoiseFit:
     before: Fitted
     #: With the most likely noise.
     fitted: Fitted
-    #: The same, the noise of the sensor inflated where innovations are not white; where
-    #: all are white, it is `fitted` itself.
+    #: The same, with the noise of the sensor inflated where innovations are not white,
+    #: and without motion noise at zero, see `above_zero`; where neither changes the
+    #: noise, it is `fitted` itself.
     suggested: Fitted
     #: The factor of the sensor's noise at which the pose NEES is 1 per degree of
     #: freedom; None if the truth is unknown.
@@ -155,7 +157,7 @@ def _fit_known(
         noise = found.noise
         before = _fitted(likelihood, settings, search.noise_of(settings))
         fitted = _fitted(likelihood, settings, noise)
-        inflated = noise.copy()
+        inflated = above_zero(noise, found.table)
         bearing, distance = fitted.whiteness
         inflated[[search.BEARING, search.IN_METRES]] *= bearing.inflation
         inflated[[search.RANGE, search.PER_METRE]] *= distance.inflation
@@ -174,6 +176,30 @@ def _fit_known(
         len(timed.events.readings),
         found.passes,
     )
+
+
+def above_zero(noise: Array, table: Sequence[search.FittedNoise]) -> Array:
+    """Replace motion noise that may be zero by the upper end of its interval.
+
+    A filter without a part of the motion noise soon becomes certain of this part, and
+    then rejects readings that contradict it.  The upper end is almost as likely.
+
+    Parameters
+    ----------
+    noise : ndarray, shape (7,)
+        The most likely noise.
+    table : sequence of FittedNoise
+        Its entries, the motion noise first.
+
+    Returns
+    -------
+    ndarray, shape (7,)
+    """
+    result = noise.copy()
+    for i, entry in enumerate(table[: search.BEARING]):
+        if entry.verdict == "zero":
+            result[i] = entry.high if np.isfinite(entry.high) else entry.before
+    return result
 
 
 def _filter(log: slamlog.SlamLog, settings: FilterSettings) -> EkfSlam:

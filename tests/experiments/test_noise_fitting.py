@@ -27,7 +27,12 @@ from slamgym.experiments.noise_fitting import (
     summarise_fit,
     write_noise,
 )
-from slamgym.experiments.noise_fitting.fit import _crossing, nees_bounds, positive_sum
+from slamgym.experiments.noise_fitting.fit import (
+    _crossing,
+    above_zero,
+    nees_bounds,
+    positive_sum,
+)
 from slamgym.experiments.noise_fitting.intervals import profile_crossing
 from slamgym.experiments.noise_fitting.scoring import (
     associated_log,
@@ -117,6 +122,28 @@ def test_a_noise_of_zero_has_one_bound_from_any_start():
     assert_same(fit, fitted(log, start=FAR))
 
 
+@pytest.mark.slow
+def test_motion_noise_that_may_be_zero_is_suggested_at_its_upper_end():
+    fit = fitted(a_log(6, steps=60, motion={"std": (0.05, 0.05, 0.0)}))
+    along, across, turn = fit.noise[:3]
+    assert (turn.value, turn.verdict) == (0, "zero")
+    expected = pytest.approx((along.value, across.value, turn.high), rel=1e-3)
+    assert fit.suggested.settings.motion_std == expected
+    summary = summarise_fit(fit)
+    without, suggested = (
+        summary["runs"][stage]["nees"]["per_degree"]
+        for stage in ("fitted", "suggested")
+    )
+    assert without > 1 > suggested > 0.5
+    assert "σα, because a filter without this noise" in shown(advice(summary))
+    endless = [turn._replace(high=np.inf, before=0.2)] * 3
+    assert above_zero(np.zeros(7), endless).tolist() == [0.2, 0.2, 0.2, 0, 0, 0, 0]
+
+
+def shown(table):
+    return "".join(str(cell) for column in table.columns for cell in column.cells)
+
+
 def test_white_innovations_suggest_no_inflation(example):
     assert example.suggested.settings == example.fitted.settings
     assert example.suggested is example.fitted
@@ -156,6 +183,7 @@ def test_a_factor_beyond_those_tried_is_open(ratios, factor):
 def test_the_advice_states_open_ends_and_what_remains(found, text):
     calibration = dict(zip(("factor", "low", "high"), found, strict=True))
     summary = {
+        "noise": [],
         "inflation": {"bearing": 1.0, "range": 1.0},
         "calibration": calibration | {"tried": [0.25, 16.0]},
         "readings": 269,
@@ -165,17 +193,17 @@ def test_the_advice_states_open_ends_and_what_remains(found, text):
         },
     }
 
-    def shown():
-        return "".join(str(cell) for c in advice(summary).columns for cell in c.cells)
+    def said():
+        return shown(advice(summary))
 
-    assert text in shown()
-    assert "stays overconfident" not in shown()
+    assert text in said()
+    assert "stays overconfident" not in said()
     summary["runs"]["suggested"]["nees"]["per_degree"] = 1.6
-    assert "the pose NEES is 1.6 per degree with the suggested noise" in shown()
-    assert "none needed" in shown()
+    assert "the pose NEES is 1.6 per degree with the suggested noise" in said()
+    assert "none needed" in said()
     summary["runs"]["fitted"]["rejected"] = 125
-    assert "none needed" not in shown()
-    assert "125 of 269 readings (46%), which fit no noise" in shown()
+    assert "none needed" not in said()
+    assert "125 of 269 readings (46%), which fit no noise" in said()
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.9, 0.98])
