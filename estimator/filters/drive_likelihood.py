@@ -291,6 +291,7 @@ def follow_drive(
             rule_values[scan.FIRST_STD + i] = noises[b, SENSOR + i]
         rules = as_rules(rule_values)
         size = len(start[0])  # a literal would compile all kernels anew
+        x, y = belief.mean[0], belief.mean[1]
         for s in range(len(drive.first_motions) - 1):
             for k in range(drive.first_motions[s], drive.first_motions[s + 1]):
                 dx, dy, turn = (
@@ -306,7 +307,7 @@ def follow_drive(
                     belief.mean,
                     belief.covariance,
                     belief.reference,
-                    size,
+                    len(start[0]),  # the landmarks follow before a scan
                     dx,
                     dy,
                     turn,
@@ -315,11 +316,16 @@ def follow_drive(
                 )
             first = drive.first_readings[s]
             count = drive.first_readings[s + 1] - first
+            if count == 0:
+                keep(belief, record, b, s)
+                continue
+            carry(belief.covariance, size, belief.mean[0] - x, belief.mean[1] - y)
             for k in range(count):
                 readings[k, 0] = drive.readings[first + k, 0]
                 readings[k, 1] = drive.readings[first + k, 1]
                 ledger[scan.SLOT, k] = slots[drive.landmarks[first + k]]
-            examine(belief, readings, count, ledger, rules, workspace.rows, own)
+            if rules.gate < math.inf or record.innovations.shape[1] > 0:
+                examine(belief, readings, count, ledger, rules, workspace.rows, own)
             status, used, nis = update_belief(
                 belief, size, readings, count, ledger, workspace, rule_values
             )
@@ -331,6 +337,22 @@ def follow_drive(
             record.log_likelihoods[b, s] = log_density(workspace.rows, used, nis)
             size = settle(drive, record, b, s, size, ledger, own, slots, rules.gate)
             keep(belief, record, b, s)
+            at = belief.mean if rules.linearisation == 0 else belief.reference
+            x, y = at[0], at[1]
+
+
+@njit_internal
+def carry(covariance: Array, size: int, dx: float, dy: float) -> None:
+    """Move the covariance of the pose and the landmarks by several motions at once.
+
+    The Jacobians of motions are I + (−Δy, Δx, 0, …) e_θᵀ, so the displacements of the
+    robot, or of its reference, add up.
+    """
+    P = covariance
+    for j in range(3, size):
+        P[0, j] -= dy * P[2, j]
+        P[1, j] += dx * P[2, j]
+        P[j, 0], P[j, 1] = P[0, j], P[1, j]
 
 
 @njit_internal

@@ -25,6 +25,7 @@ WITHIN = 1.92  # ½ χ²(1) at 95 %: how much less likely the ends of an interva
 NOT_ZERO = 1.35  # the same at 90 %, for a parameter that may lie at its end, zero
 NORMAL = 1.96
 ENDS = np.geomspace(1e-6, 10.0, 71)  # [m, rad] where ends are looked for
+AT_ONCE = 10  # of them
 
 
 class Interval(NamedTuple):
@@ -78,22 +79,33 @@ def _profiled(
     likelihoods: Likelihoods, parameters: Array, i: int, most: float
 ) -> Interval:
     """Judge a poorly determined parameter by its profile likelihood."""
-    tried = np.tile(parameters, (len(ENDS), 1))
-    tried[:, i] = ENDS
-    outside = totals(likelihoods(tried)) < most - WITHIN
-    above = np.flatnonzero(outside & (parameters[i] < ENDS))
-    below = np.flatnonzero(outside & (parameters[i] > ENDS))
+    value, level = parameters[i], most - WITHIN
     low, high = 0.0, np.inf
-    if len(above):
-        start = float(ENDS[above[0]])
-        high = profile_crossing(likelihoods, parameters, i, start, most - WITHIN)
-    least = profile_at_zero(likelihoods, parameters, i)
-    if least < most - WITHIN:
-        start = float(ENDS[below[-1]]) if len(below) else 0.5 * parameters[i]
-        low = profile_crossing(likelihoods, parameters, i, start, most - WITHIN)
+    above = _first_outside(likelihoods, parameters, i, ENDS[value < ENDS], level)
+    if above is not None:
+        high = profile_crossing(likelihoods, parameters, i, above, level)
+    least = profile_at_zero(likelihoods, parameters, i) if value > 0 else most
+    if least < level:
+        ends = ENDS[value > ENDS][::-1]
+        below = _first_outside(likelihoods, parameters, i, ends, level)
+        start = 0.5 * value if below is None else below
+        low = profile_crossing(likelihoods, parameters, i, start, level)
     if least < most - NOT_ZERO:
         return Interval("fitted", low, high)
-    return Interval("zero" if len(above) else "unknown", 0.0, high)
+    return Interval("unknown" if above is None else "zero", 0.0, high)
+
+
+def _first_outside(
+    likelihoods: Likelihoods, parameters: Array, i: int, ends: Array, level: float
+) -> float | None:
+    """Return the first of some values of a parameter that is below a level."""
+    for few in np.split(ends, range(AT_ONCE, len(ends), AT_ONCE)):
+        tried = np.tile(parameters, (len(few), 1))
+        tried[:, i] = few
+        outside = np.flatnonzero(totals(likelihoods(tried)) < level)
+        if len(outside):
+            return float(few[outside[0]])
+    return None
 
 
 def _widths(
