@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import forked
 import pytest
 from import_graph import FILES, ROOT, code_lines, graph
 
@@ -49,6 +50,16 @@ for part in (package, package.estimator, package.experiments, package.agents):
 #: No kernel of the core reads a leaf: those of the whole package are these, too.
 KERNELS = f"from slamgym import jit; jit._DIGEST = {jit._DIGEST!r}"
 
+#: A forked process then loads the copy in its folder, and no library again.
+FORGET_SLAMGYM = """
+import gymnasium, sys
+for known in (sys.modules, gymnasium.registry):
+    for name in [name for name in known if name.startswith("slamgym")]:
+        del known[name]
+import slamgym
+assert slamgym.__file__.startswith(sys.path[0])
+"""
+
 #: Rendering takes most of the time of these commands, and loads no module.
 WITHOUT_PICTURES = """
 from slamgym.experiments.figures import style
@@ -85,12 +96,12 @@ def copy_without(site, leaves):
         shutil.rmtree(path) if path.is_dir() else path.with_suffix(".py").unlink()
 
 
-def without_leaves(site, *arguments, **environment):
+def without_leaves(site, *arguments):
     """Run Python with the package that is in a folder."""
     done = subprocess.run(
         [sys.executable, *arguments],
         cwd=site,
-        env={**os.environ, "PYTHONPATH": str(site), **environment},
+        env={**os.environ, "PYTHONPATH": str(site)},
         capture_output=True,
         text=True,
         check=False,
@@ -117,8 +128,8 @@ def test_every_leaf_exists_and_has_one_name():
 @pytest.mark.parametrize("name", LEAVES)
 def test_the_commands_of_the_core_work_without_a_leaf(name, tmp_path):
     copy_without(tmp_path, with_those_that_need(name))
-    code = WITHOUT_PICTURES + COMMANDS
-    without_leaves(tmp_path, "-c", code, NUMBA_DISABLE_JIT="1")
+    code = FORGET_SLAMGYM + WITHOUT_PICTURES + COMMANDS
+    forked.run(code, tmp_path, NUMBA_DISABLE_JIT="1")
 
 
 @pytest.mark.slow

@@ -66,7 +66,8 @@ def without_pictures(monkeypatch):
 @pytest.fixture
 def without_figure(monkeypatch):
     """Draw no figure of a noise study, where only its rows count."""
-    monkeypatch.setattr(figures, "noise_study_figure", lambda _: Figure())
+    for name in ("noise_study_figure", "map_figure"):
+        monkeypatch.setattr(figures, name, lambda _: Figure())
     monkeypatch.setattr(figures, "save_figure", lambda _, path, **__: path.touch())
 
 
