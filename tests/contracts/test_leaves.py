@@ -47,22 +47,15 @@ for part in (package, package.estimator, package.experiments, package.agents):
         getattr(part, name)
 """
 
-#: No kernel of the core reads a leaf: those of the whole package are these, too.
-KERNELS = f"from slamgym import jit; jit._DIGEST = {jit._DIGEST!r}"
-
-#: A forked process then loads the copy in its folder, and no library again.
-FORGET_SLAMGYM = """
+#: A forked process then loads the copy in its folder, and no library again.  Rendering
+#: takes most of the time of the commands, and loads no module.
+PREPARED = """
 import gymnasium, sys
 for known in (sys.modules, gymnasium.registry):
     for name in [name for name in known if name.startswith("slamgym")]:
         del known[name]
-import slamgym
-assert slamgym.__file__.startswith(sys.path[0])
-"""
-
-#: Rendering takes most of the time of these commands, and loads no module.
-WITHOUT_PICTURES = """
 from slamgym.experiments.figures import style
+assert style.__file__.startswith(sys.path[0])
 style.draw_file = lambda figure, path, *_: path.touch()
 """
 MANY_RUNS = """
@@ -94,19 +87,10 @@ def copy_without(site, leaves):
     for place in [place for name in leaves for place in LEAVES[name]]:
         path = target.joinpath(*place.split("."))
         shutil.rmtree(path) if path.is_dir() else path.with_suffix(".py").unlink()
-
-
-def without_leaves(site, *arguments):
-    """Run Python with the package that is in a folder."""
-    done = subprocess.run(
-        [sys.executable, *arguments],
-        cwd=site,
-        env={**os.environ, "PYTHONPATH": str(site)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    # No kernel of the core reads a leaf: those of the whole package are these, too.
+    file = target / "jit.py"
+    same = f"_DIGEST = {jit._DIGEST!r}"
+    file.write_text(file.read_text().replace("_DIGEST = digest_of_sources()", same))
 
 
 def test_the_core_imports_no_leaf():
@@ -128,20 +112,25 @@ def test_every_leaf_exists_and_has_one_name():
 @pytest.mark.parametrize("name", LEAVES)
 def test_the_commands_of_the_core_work_without_a_leaf(name, tmp_path):
     copy_without(tmp_path, with_those_that_need(name))
-    code = FORGET_SLAMGYM + WITHOUT_PICTURES + COMMANDS
+    code = PREPARED + COMMANDS
     forked.run(code, tmp_path, NUMBA_DISABLE_JIT="1")
 
 
 @pytest.mark.slow
 def test_the_core_works_without_any_leaf(tmp_path):
     copy_without(tmp_path, LEAVES)
-    (tmp_path / "with_kernels.py").write_text(KERNELS)
-    code = KERNELS + WITHOUT_PICTURES + COMMANDS + MANY_RUNS
-    without_leaves(tmp_path, "-c", code)
+    forked.run(PREPARED + COMMANDS + MANY_RUNS, tmp_path)
     for name in ("tests", "pyproject.toml"):
         source, target = ROOT / name, tmp_path / name
         (shutil.copytree if source.is_dir() else shutil.copy)(source, target)
     tests = [f"tests/{name}" for name in CORE_TESTS]
     options = ["-q", "-p", "no:cacheprovider", "-n", "0", "-m", "not slow"]
-    options += ["-p", "with_kernels"]
-    without_leaves(tmp_path, "-m", "pytest", *options, *tests)
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", *options, *tests],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr

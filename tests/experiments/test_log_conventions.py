@@ -321,11 +321,7 @@ def test_a_mistake_in_csv_files_of_ones_own_is_named(corridor, name, tmp_path):
     assert words in mistake_in(log, settings).name
 
 
-def test_commands_name_the_mistake_and_suggest_no_noise(
-    corridor, tmp_path, monkeypatch
-):
-    draw = "slamgym.experiments.figures.style.draw_file"
-    monkeypatch.setattr(draw, lambda _, path, *__: path.touch())
+def test_commands_name_the_mistake_and_suggest_no_noise(corridor, tmp_path):
     file = tmp_path / "log.csv"
     write_slamlog(FAR["clockwise"][0](corridor), file)
     text = file.read_text()
