@@ -75,6 +75,10 @@ def test_a_reading_too_near_to_use_is_given_to_no_landmark():
     assert slam.decisions[-1].row_ids == (None, 8)
     assert slam.update([(0.0, 1e-4)], [7]).skipped_ids == (7,)  # nothing is new
     assert slam.decisions[-1].row_ids == (None,)
+    slam = managed(trust_ids=False, confirm=(2, 3))
+    slam.update(AHEAD, [7])
+    assert slam.update([(0.0, 1e-4)], [7]).skipped_ids == (7,)  # would confirm it
+    assert (slam.decisions[-1].row_ids, slam.decisions[-1].added) == ((None,), ())
 
 
 def test_a_new_run_and_a_loaded_state_begin_without_decisions():

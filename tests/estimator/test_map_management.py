@@ -552,6 +552,13 @@ def test_landmarks_seen_side_by_side_are_never_one():
         assert slam.update(pair, [0, 1]).merged_ids == ()
 
 
+@pytest.mark.parametrize("name", ["ekf", "compressed"])
+def test_landmarks_seen_together_are_apart_up_to_twice_the_distance_of_a_merge(name):
+    slam = make(name, {"merge_within": 1.0})
+    slam.update(polar([(4, 0), (4, 1.5), (4, 4.5)]), [0, 1, 2])
+    assert slam.best.pruner.records.apart == {(0, 1)}
+
+
 @pytest.mark.parametrize("name", MANAGEABLE)
 def test_landmarks_are_merged_and_removed_by_hand_too(name):
     slam = make(name, {"merge_within": None})

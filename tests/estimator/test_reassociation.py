@@ -7,7 +7,13 @@ from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.motions import predict_pose
 from slamgym.estimator.smoother import Drive, reassociate, smooth
 from slamgym.estimator.smoother.drive import Sightings
-from slamgym.estimator.smoother.reassociation import NONE, PRICE, _prices, _Search
+from slamgym.estimator.smoother.reassociation import (
+    NONE,
+    PRICE,
+    _Association,
+    _prices,
+    _Search,
+)
 
 MOTION_STD, MEASUREMENT_STD = (0.02, 0.01, 0.01), (0.02, 0.1)
 LAP = 50
@@ -114,6 +120,9 @@ def test_an_association_that_only_leaves_readings_out_stays_as_it_is():
 
 def test_detections_are_counted_as_by_a_plain_loop():
     path, right = two_laps(3)
+    pairs = [(z, ids) if k % 9 else (z[:0], ids[:0]) for k, (z, ids) in
+             enumerate(right.scans)]  # fmt: skip
+    right = right.with_scans([Sightings(*pair) for pair in pairs])
     search = _Search(right)
     labels = np.concatenate([scan.ids for scan in right.scans])
     labels[::7] = NONE
@@ -121,6 +130,8 @@ def test_detections_are_counted_as_by_a_plain_loop():
     for landmark, place in enumerate(WORLD):
         before = None
         for k, pose in enumerate(path):
+            if k % 9 == 0:  # a scan without a reading counts for nothing
+                continue
             (bearing, distance), *_ = predict_measurement(pose, place[None]).measurement
             if distance > search.reach or abs(bearing) > search.width:
                 continue
@@ -172,6 +183,36 @@ def test_only_a_landmark_that_most_scans_show_is_born():
     for k, place in enumerate(state.places):
         born = search.birth(state.poses, np.delete(costs, k, 1), price, prices)
         np.testing.assert_allclose(born, place, atol=0.5)
+
+
+@pytest.mark.parametrize("gap", [30, 31])
+def test_a_visit_ends_with_a_gap_of_more_than_30_scans(gap):
+    search = _Search(two_laps(1)[1])
+    labels, rows = np.full(len(search.owners), NONE), search.starts[[10, 10 + gap]]
+    labels[rows] = 0
+    first, second = search.visits(labels)[rows]
+    assert (first == second) == (gap == 30)
+
+
+def test_the_cost_of_more_readings_is_scaled_to_the_number_of_fewer():
+    def state(used, cost):
+        labels = np.where(np.arange(10) < used, 0, NONE)
+        score = cost + PRICE * (10 - used) + 1.0
+        return _Association(labels, *[np.empty(0)] * 2, score, cost, np.empty(0))
+
+    few, many = state(5, 4.0), state(10, 6.0)
+    assert few.advantage_of(many) == pytest.approx(4.0 - 6.0 / 2)
+    assert many.advantage_of(few) == pytest.approx(6.0 / 2 - 4.0)
+
+
+@pytest.mark.parametrize(("readings", "dies"), [(2, 0), (3, None)])
+def test_a_landmark_dies_with_fewer_than_three_readings(readings, dies):
+    path, right = two_laps(1)
+    search = _Search(right)
+    costs = search.costs(path, WORLD[:1])
+    labels = np.full(len(costs), NONE)
+    labels[np.flatnonzero(costs[:, 0] < PRICE / 2)[:readings]] = 0
+    assert search.death(labels, costs, price=1.0) == dies
 
 
 def test_progress_and_refusals():

@@ -467,6 +467,13 @@ def test_errors_that_known_identities_remove_are_of_the_association():
     found = diagnose(**scores, mistakes=mistakes, known_nees=known)
     assert found.cause == "association"  # though all its errors together are honest
     assert "with known identities" in found.sentence
+    early = (0, 0), (2, 0)  # two steps without a NEES
+    late = {
+        key: np.pad(scores[key], early, constant_values=np.nan)
+        for key in ("nees", "heading_nees")
+    }
+    wide = np.pad(known, early, constant_values=1e6)
+    assert diagnose(**scores | late, mistakes=mistakes, known_nees=wide) == found
     assert diagnose(**scores, known_nees=known).cause == "honest"  # none is wrong
     slightly = nees / np.linspace(1.0, 1.1, RUNS)[:, None]
     close = diagnose(**scores, mistakes=mistakes, known_nees=slightly)

@@ -74,6 +74,15 @@ def test_a_tum_file_is_read_number_by_number(count, tmp_path):
     np.testing.assert_array_equal(true_path(path)[:, 0], TIMES)
 
 
+@pytest.mark.parametrize("climb", [0.0, 0.5])
+def test_a_path_is_spatial_only_if_it_leaves_its_plane(climb, tmp_path):
+    path, heights = tmp_path / "run.tum", HEIGHTS + np.array([[0.0], [climb], [0.0]])
+    turns = Rotation.from_euler("z", POSES[:, 2:]).as_quat()
+    parts = TIMES[:, None], POSES[:, :2], heights, turns, entries(SPATIAL, 21)
+    np.savetxt(path, np.hstack(parts), fmt="%.17g")
+    assert read_estimates([path])["run"].is_spatial == (climb > 0)
+
+
 def test_an_npz_is_read_by_its_seeds_and_holds_the_final_map(tmp_path):
     ids = np.array([[[4, -1], [4, -1], [4, -1]], [[0, -1], [0, 5], [6, 0]]])
     places, their = RNG.normal(size=(2, 3, 2, 2)), RNG.normal(size=(2, 3, 2, 2, 2))
@@ -96,6 +105,6 @@ def test_an_npz_is_read_by_its_seeds_and_holds_the_final_map(tmp_path):
 
 def test_times_outside_a_true_path_or_in_its_gap_are_not_near_it():
     due = np.array([0.0, 1.0, 2.0, 3.0, 9.0, 10.0])
-    times = np.array([-0.1, 0.0, 2.5, 3.04, 5.0, 8.97, 9.5, 10.0, 10.1])
-    near = [False, True, True, True, False, True, True, True, False]
+    times = np.array([-0.1, 0.0, 2.5, 3.04, 3.5, 5.0, 8.97, 9.5, 10.0, 10.1])
+    near = [False, True, True, True, False, False, True, True, True, False]
     assert near_truth(times, due).tolist() == near

@@ -211,7 +211,7 @@ def std_of(P):
 
 
 def swapped(array):
-    return array[[1, 0, *range(2, len(array))]]
+    return array[[0, 1, 5, 3, 4, 2, *range(6, len(array))]]
 
 
 def relative(poses):
@@ -242,8 +242,8 @@ def transposed(poses, covariances):
 
 SWAPPED = (
     "estimates or truths of 2 drives are swapped: the estimate of drive "
-    f"{SEED} fits the truth of drive {SEED + 1} and the estimate of drive "
-    f"{SEED + 1} fits the truth of drive {SEED}."
+    f"{SEED + 2} fits the truth of drive {SEED + 5} and the estimate of drive "
+    f"{SEED + 5} fits the truth of drive {SEED + 2}."
 )
 STRAY = (
     f"{2 * RUNS} poses are far from the truth although their neighbours are not, as "
@@ -404,6 +404,14 @@ def test_a_reading_is_honest_if_its_squares_are_near_1(factor):
     fit = estimate_conventions._fit(truth, PosesAsRead("", poses, claims, True))
     assert fit.nees == pytest.approx(factor, rel=0.1)
     assert fit.is_honest == (factor == 1)
+
+
+def test_lost_drives_that_are_only_nearer_to_other_truths_are_not_swapped():
+    truth, P = np.zeros((2, 5, 3)), np.broadcast_to(np.eye(3), (2, 5, 3, 3))
+    truth[1, :, 0] = 40.0
+    near = truth[::-1] + np.array([15.0, 0, 0]) * np.array([1, -1])[:, None, None]
+    assert estimate_conventions.swapped_drives(truth, near, P, "ab") == ""
+    assert estimate_conventions.swapped_drives(truth, truth[::-1], P, "ab")
 
 
 def test_the_errors_of_a_filter_are_no_stray_poses():
@@ -816,6 +824,12 @@ def test_a_fit_turns_what_it_explains_most_of(noise, turn):
     turned = truth @ np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
     motion = judging._fitted(turned + noise * rng.normal(size=(200, 2)), truth)
     assert motion.angle == pytest.approx(turn, abs=0.1)
+
+
+def test_a_start_that_is_certain_is_no_failure():
+    claims = np.tile(np.eye(3), (2, 4, 1, 1))
+    claims[0, 0], claims[1, 2, 1, 1] = 0.0, -1.0
+    assert judging._invalid(claims, claims, {}) == {1: (2, "a variance is negative")}
 
 
 def test_an_indefinite_covariance_is_a_failed_run(elsewhere):
