@@ -49,7 +49,9 @@ def test_an_empty_map_has_no_error():
         "active_easy", landmarks=RING, sensor={"max_range": 0.5}, steps=2
     )
     assert env.reset(seed=0)[1]["true_rmse"] == 0.0
-    assert math.isnan(run_episode(env, lambda *_: np.zeros(2), 0).true_rmse)
+    episode = run_episode(env, lambda *_: np.zeros(2), 0)
+    assert math.isnan(episode.true_rmse)
+    assert (episode.steps, episode.path.shape) == (2, (3, 2))
 
 
 def test_a_success_is_honest_where_the_truth_agrees():
