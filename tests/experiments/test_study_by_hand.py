@@ -8,7 +8,7 @@ from slamgym.estimator.models.sensors import BEARING_RANGE
 from slamgym.evaluation.error_bound import posterior_bound
 from slamgym.evaluation.noise_findings import CHANNELS
 from slamgym.experiments.monte_carlo_study import monte_carlo
-from slamgym.experiments.monte_carlo_study.run_measures import VARIABLES
+from slamgym.experiments.monte_carlo_study.run_measures import VARIABLES, gaps
 from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
@@ -280,6 +280,13 @@ def test_every_variable_is_that_of_a_loop_by_hand(label, study, runs):
         for name, value in expected.items():
             got = found[name].values[..., :3] if name == "noise_sums" else found[name]
             np.testing.assert_allclose(got, value, 1e-6, 1e-9, err_msg=name)
+
+
+def test_a_gap_is_a_step_without_nees_after_the_first_or_a_scan_without_nis():
+    nees = np.array([[np.nan, np.nan, 3.0, 3.0, 1e200]])
+    nis = np.array([[np.nan, 2.0, np.nan, np.nan, 2.0]])
+    freedom = np.array([[0, 2, 0, 2, 2]])
+    assert gaps(1, nees, nis, freedom).tolist() == [[False, True, False, True, True]]
 
 
 def test_a_run_that_fails_has_its_numbers_up_to_this_step(study, runs):
