@@ -11,7 +11,7 @@ A study of 100 runs gives the figures and the table of a paper. A column of most
 # ``slamgym monte-carlo six_landmarks -e ekf,invariant --runs 100 --figures pdf`` runs it and writes all figures.
 
 from slamgym import monte_carlo
-from slamgym.experiments import nees_figure, runs_figure, save_figure, verdict_table
+from slamgym.experiments import nees_figure, runs_figure, save_figure
 
 results = monte_carlo("six_landmarks", "ekf,invariant", runs=100)
 
@@ -39,7 +39,7 @@ save_figure(page, "results/runs.pdf")
 # ---------
 # State the error frame, the number of runs and the seeds beside the numbers.
 
-table = verdict_table(results)
+table = results.table()
 columns = ["pose NEES / 3", "NIS / degree", "position RMSE [m]"]
 print(table.to_latex(columns=columns, float_format="%.2f"))
 

@@ -72,6 +72,7 @@ def dataset_of(
     """
     import xarray as xr  # noqa: PLC0415
 
+    _offer_table()
     sizes = _sizes(job, runs)
     arrays: dict[str, Any] = {
         name: np.empty(
@@ -162,6 +163,7 @@ def load_results(path: str | Path) -> xr.Dataset:
     """
     import xarray as xr  # noqa: PLC0415
 
+    _offer_table()
     file = Path(path)
     file = file / RESULTS if file.is_dir() else file
     if not file.exists():
@@ -179,6 +181,28 @@ def load_results(path: str | Path) -> xr.Dataset:
         results.close()
         raise ValueError(f"{file} is no result of a Monte Carlo: no {lacking[0]}")
     return results
+
+
+class TableMethod:
+    """The method ``table`` of results."""
+
+    def __init__(self, results: xr.Dataset) -> None:
+        self._results = results
+
+    def __call__(self) -> Any:
+        """Return `verdict_table` of the results."""
+        from .summary import verdict_table  # noqa: PLC0415 (it needs this module)
+
+        return verdict_table(self._results)
+
+
+def _offer_table() -> None:
+    """Give the datasets of xarray the method ``table``."""
+    import xarray as xr  # noqa: PLC0415
+
+    register: Any = xr.register_dataset_accessor
+    if not hasattr(xr.Dataset, "table"):
+        register("table")(TableMethod)
 
 
 def _write(

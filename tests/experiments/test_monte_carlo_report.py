@@ -369,6 +369,8 @@ def test_the_table_of_verdicts_has_the_numbers_of_the_summary():
         assert row["NIS / degree"] == found["nis"]
         assert row["heading RMSE [rad]"] == found["rmse"]["heading"]
     assert "invariant & " in table.to_latex(float_format="%.3g")
+    for results in (dataset, dataset.isel(run=slice(None))):
+        assert results.table().equals(table)
 
 
 def test_the_table_of_verdicts_has_a_row_of_a_filter_that_always_fails():
