@@ -17,6 +17,7 @@ import platform
 import shutil
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -191,9 +192,7 @@ class TableMethod:
 
     def __call__(self) -> Any:
         """Return `verdict_table` of the results."""
-        from .summary import verdict_table  # noqa: PLC0415 (it needs this module)
-
-        return verdict_table(self._results)
+        return import_module(__package__).verdict_table(self._results)
 
 
 def _offer_table() -> None:

@@ -280,6 +280,15 @@ def test_functions_and_classes_that_contributing_names_exist():
     assert named <= known
 
 
+def test_the_paper_cites_all_its_references_and_no_other():
+    text, listed = (
+        (ROOT / "paper" / f"paper.{end}").read_text() for end in ("md", "bib")
+    )
+    cited = re.findall(r"@([a-z]+\d*)\b", text.partition("---\n\n")[2])
+    assert set(cited) == set(re.findall(r"^@\w+\{(\w+),", listed, re.MULTILINE))
+    assert 250 <= len(text.split()) <= 1000
+
+
 def test_version_licence_and_python_agree_everywhere():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     citation = (ROOT / "CITATION.cff").read_text()
