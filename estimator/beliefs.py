@@ -41,7 +41,6 @@ class Belief:
         covariance = np.array(self.covariance, dtype=np.float64)
         given: Any = self.landmark_ids
         ids = tuple(given.tolist() if isinstance(given, np.ndarray) else given)
-        object.__setattr__(self, "landmark_ids", ids)
         size = 3 + 2 * len(ids)
         if mean.shape != (size,) or covariance.shape != (size, size):
             raise ValueError(
@@ -52,10 +51,8 @@ class Belief:
         if not isinstance(given, dict) and len(set(ids)) < len(ids):
             raise ValueError(f"landmark_ids must differ, got {ids}")
         self._chosen(self.frame)
-        mean[2] = wrap_angle(float(mean[2]))
-        for name, array in (("mean", mean), ("covariance", covariance)):
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        owned = self.owning(mean, covariance, ids, self.frame)
+        vars(self).update(vars(owned))
 
     @classmethod
     def marginal(
@@ -82,6 +79,20 @@ class Belief:
         columns = columns_of([slots[i] for i in landmark_ids])
         P = covariance[np.ix_(columns, columns)]
         return cls(mean[columns], P, tuple(landmark_ids), frame)
+
+    @classmethod
+    def owning(
+        cls, mean: Array, covariance: Array, ids: tuple[int, ...], frame: ErrorFrame
+    ) -> Belief:
+        """Return the belief of arrays that nothing else holds, without a copy."""
+        belief = object.__new__(cls)
+        mean[2] = wrap_angle(float(mean[2]))
+        mean.setflags(write=False)
+        covariance.setflags(write=False)
+        vars(belief).update(
+            mean=mean, covariance=covariance, landmark_ids=ids, frame=frame
+        )
+        return belief
 
     @property
     def pose(self) -> Array:

@@ -330,12 +330,14 @@ class GaussianMap:
         if ids is None:
             P, whole = self.covariance[: self.size, : self.size], cast(Any, self.slots)
             return Belief(self.mean[: self.size], P, whole, frame)
-        if not self.parts.numbers[LOWER] or 8 * len(ids) >= len(self.slots):
-            return Belief.marginal(self.mean, self.covariance, self.slots, ids, frame)
         slots = [self.slots[i] for i in ids]
-        columns = np.array(columns_of(slots))  # in the lower half of P
-        at = np.maximum.outer(columns, columns), np.minimum.outer(columns, columns)
-        return Belief(self.mean[columns], self.parts.covariance[at], tuple(ids), frame)
+        columns = np.array(columns_of(slots))
+        if not self.parts.numbers[LOWER] or 8 * len(ids) >= len(self.slots):
+            P = self.covariance[columns[:, None], columns]
+        else:
+            at = np.maximum.outer(columns, columns), np.minimum.outer(columns, columns)
+            P = self.parts.covariance[at]  # its lower half
+        return Belief.owning(self.mean[columns], P, tuple(ids), frame)
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the used part of the arrays."""
