@@ -65,7 +65,7 @@ from ..kernels.scan_update import DONE, OUTCOME, SLOT, USED, usable
 from ..models.bearing_range import wrap_angle
 from ..models.relative_geometry import variance_from_robot
 from ..models.sensors import BEARING_RANGE
-from .loop_closing import ACCURATE, FEWEST_READINGS, LOCAL_STD, NEAR_STDS
+from .loop_closing import ACCURATE, FEWEST_READINGS, LOCAL_STD
 from .policy import LandmarkPolicy
 from .pruning import LandmarkRecords, add_sightings, noise_of_sightings
 from .recent_scans import RecentScan, RecentScans
@@ -520,8 +520,7 @@ def associate_clear(
     is_known = tally.whole[COUNT] == parts.numbers[LANDMARKS]
     if not (is_known and _is_usable(readings, settings.min_range)):
         return none
-    is_astray, known = _known(parts, settings, readings)
-    if is_astray:
+    if _may_be_lost(parts, settings):
         return none
     _, per_scan, longest = _of_density(tally)
     density[:] = settings.density
@@ -531,13 +530,13 @@ def associate_clear(
     if len(seen) > 0:
         share = min(tally.numbers[SHARE] / tally.numbers[SUMS], 1.0)
         add_tentative(tentative, readings, settings.noise, gate, share, every)
-    belief = _part(parts, known)
+    belief = parts.mean, parts.covariance, parts.numbers[LANDMARKS]
     costs, slots, explained = _assign(
         belief, readings, every, settings, ceiling, int(settings.most)
     )
     scan = slots, explained, readings
-    best = _count_best(belief, parts.ids[known], known, tally, costs, scan)
-    costs, slots = _with_rivals(costs, slots, best, ceiling, known)
+    best = _count_best(belief, parts.ids, tally, costs, scan)
+    costs, slots = _with_rivals(costs, slots, best, ceiling)
     if len(costs) > 0 and len(seen) > 0:
         of_new = slots[0] == NEW, density, settings, longest
         _associate_tentative(tentative, readings, of_new, tally, again, chance)
@@ -569,12 +568,11 @@ def _associate_tentative(
 
 @njit_allocating
 def _with_rivals(
-    costs: Array, slots: IntArray, best: int, ceiling: float, known: IntArray
+    costs: Array, slots: IntArray, best: int, ceiling: float
 ) -> tuple[Array, IntArray]:
     """Return the best association and those not far less probable; none to leave it.
 
-    An unpaired reading that is new begins another tentative landmark.  The slots are
-    those of the known landmarks, which become those of the map.
+    An unpaired reading that is new begins another tentative landmark.
     """
     kept, count = np.zeros(len(costs), np.int64), 1
     kept[0], most = best, min(costs[best] + SPREAD, ceiling)
@@ -583,18 +581,13 @@ def _with_rivals(
             if ((slots[k] == NEW) != (slots[best] == NEW)).any():
                 return costs[:0], slots[:0]
             kept[count], count = k, count + 1
-    costs, slots = costs[kept[:count]], slots[kept[:count]]
-    for k in range(count):
-        for i in range(slots.shape[1]):
-            slots[k, i] = known[slots[k, i]] if slots[k, i] >= 0 else slots[k, i]
-    return costs, slots
+    return costs[kept[:count]], slots[kept[:count]]
 
 
 @njit_allocating
 def _count_best(
     belief: tuple[Array, Array, int],
     ids: IntArray,
-    known: IntArray,
     tally: Tally,
     costs: Array,
     scan: tuple[IntArray, IntArray, Array],
@@ -603,8 +596,8 @@ def _count_best(
 
     See `Detections.after`.
     """
-    best, is_telling = 0, np.empty(len(known), np.bool_)
-    mean, P, _ = belief
+    mean, P, n = belief
+    best, is_telling = 0, np.empty(n, np.bool_)
     slots, explained, readings = scan
     _, per_scan, longest = _of_density(tally)
     # The Poisson probability of no other reading.
@@ -613,8 +606,8 @@ def _count_best(
     for k in range(len(slots)):
         for j in range(len(is_telling)):
             is_older = ids[j] < tally.whole[FIRST_NEW]
-            is_telling[j] = is_older and tally.shown[known[j]] >= PROVEN
-        detected, missed = tally.detected.copy(), tally.missed[known]
+            is_telling[j] = is_older and tally.shown[j] >= PROVEN
+        detected, missed = tally.detected.copy(), tally.missed[:n].copy()
         shown = slots[k], explained, readings
         cost, fewer = count_scan(
             (mean, P), shown, is_telling, longest, detected, missed
@@ -623,8 +616,7 @@ def _count_best(
         if k == 0 or costs[k] < costs[best]:
             best, tally.numbers[FEWER] = k, fewer
             _copy(detected.ravel(), tally.next_detected)
-            for j in range(len(known)):
-                tally.next_missed[known[j]] = missed[j]
+            _copy(missed, tally.next_missed)
     return best
 
 
@@ -639,45 +631,24 @@ def _is_usable(readings: Array, min_range: float) -> bool:
     return True
 
 
-@njit_allocating
-def _known(
-    parts: Parts, settings: ClearRules, readings: Array
-) -> tuple[bool, IntArray]:
-    """Return whether the robot may be astray, and what its readings may belong to.
+@njit_internal
+def _may_be_lost(parts: Parts, settings: ClearRules) -> bool:
+    """Return whether the robot may be astray, or landmarks are lost.
 
     See `is_astray` and `without_lost`.
     """
     mean, P, n = parts.mean, parts.covariance, parts.numbers[LANDMARKS]
-    is_astray, is_lost = n >= FEWEST_READINGS, np.zeros(n, np.bool_)
-    local, reach = 0, NEAR_STDS * settings.lost
-    if len(readings) > 0:
-        reach += max(readings[:, 1].max(), 0.0)
+    is_astray, lost, local = n >= FEWEST_READINGS, 0, 0
     for j in range(n):
         c = 3 + 2 * j
         P[c, c + 1] = P[c + 1, c]  # of a large P, this part alone may be out of date
         dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
         std = np.sqrt(max(variance_from_robot(P, c, dx, dy), 0.0))
         is_astray &= std > settings.accurate
-        is_lost[j] = std > settings.lost
+        lost += std > settings.lost
         local += std <= LOCAL_STD * settings.lost
-    lost, least = is_lost.sum(), settings.least
-    if lost == 0 or n < 2 * least or local < least or lost < 2 * least:
-        return is_astray, np.arange(n)
-    for j in range(n):
-        c = 3 + 2 * j
-        is_lost[j] |= np.hypot(mean[c] - mean[0], mean[c + 1] - mean[1]) > reach
-    return is_astray, np.flatnonzero(~is_lost)
-
-
-@njit_allocating
-def _part(parts: Parts, slots: IntArray) -> tuple[Array, Array, int]:
-    """Return mean and covariance of the pose and some landmarks, and their number."""
-    mean, P, n = parts.mean, parts.covariance, len(slots)
-    if n == parts.numbers[LANDMARKS]:
-        return mean, P, n
-    columns = np.arange(3 + 2 * n)
-    columns[3::2], columns[4::2] = 3 + 2 * slots, 4 + 2 * slots
-    return mean[columns], P[columns][:, columns].copy(), n
+    least = settings.least
+    return is_astray or (lost > 0 and min(n, lost) >= 2 * least and local >= least)
 
 
 @njit_allocating
