@@ -221,18 +221,15 @@ def _takes_landmark_ids(belief: Callable[..., Belief]) -> bool:
     return "landmark_ids" in inspect.signature(belief).parameters
 
 
-class _OfInside:
-    """A member of a wrapper: that of the filter inside, where this has one."""
+def _of_inside(name: str) -> property:
+    """Return a member of a wrapper: that of the filter inside, where this has one."""
 
-    def __set_name__(self, wrapper: type, name: str) -> None:
-        self._name = name
+    def member(self: Any) -> Any:
+        if self.passes_on:
+            return getattr(self._inside, name)
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
-    def __get__(self, wrapper: Any, kind: type | None = None) -> Any:
-        if wrapper is None:
-            return self
-        if wrapper.passes_on:
-            return getattr(wrapper._inside, self._name)
-        raise AttributeError(f"{kind} object has no attribute {self._name!r}")
+    return property(member)
 
 
 class FilterWrapper(Interruptible):
@@ -240,8 +237,8 @@ class FilterWrapper(Interruptible):
 
     #: Whether to pass on the optional members that need no more than the filter inside.
     passes_on = True
-    observe_truth, local_view, join, smoothed, belief_limit = (
-        _OfInside() for _ in range(5)
+    observe_truth, local_view, join, smoothed, belief_limit = map(
+        _of_inside, ("observe_truth", "local_view", "join", "smoothed", "belief_limit")
     )
 
     @property

@@ -20,8 +20,8 @@ def environment(name: str, value: str) -> Iterator[None]:
 
 
 def without_scripts_of_the_user() -> contextlib.AbstractContextManager[None]:
-    """Let processes begun in the block import modules of Python, such as random.
+    """Keep the working folder off the import path of processes begun in the block.
 
-    Else a file random.py in the working folder would replace it.
+    Otherwise, a file random.py in it would replace the module of Python.
     """
     return environment("PYTHONSAFEPATH", "1")

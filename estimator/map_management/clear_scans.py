@@ -633,10 +633,7 @@ def _is_usable(readings: Array, min_range: float) -> bool:
 
 @njit_internal
 def _may_be_lost(parts: Parts, settings: ClearRules) -> bool:
-    """Return whether the robot may be astray, or landmarks are lost.
-
-    See `is_astray` and `without_lost`.
-    """
+    """Return whether the robot may be astray, or landmarks are `lost`."""
     mean, P, n = parts.mean, parts.covariance, parts.numbers[LANDMARKS]
     is_astray, lost, local = n >= FEWEST_READINGS, 0, 0
     for j in range(n):
@@ -647,8 +644,8 @@ def _may_be_lost(parts: Parts, settings: ClearRules) -> bool:
         is_astray &= std > settings.accurate
         lost += std > settings.lost
         local += std <= LOCAL_STD * settings.lost
-    least = settings.least
-    return is_astray or (lost > 0 and min(n, lost) >= 2 * least and local >= least)
+    can_match = local >= settings.least and lost >= 2 * settings.least
+    return is_astray or (lost > 0 and can_match)
 
 
 @njit_allocating

@@ -198,7 +198,7 @@ def _open_closed_streams() -> None:
 
 @contextlib.contextmanager
 def _same_look() -> Iterator[None]:
-    """Draw as everywhere: without the user's settings of matplotlib.
+    """Ignore the user's settings of matplotlib during the block.
 
     Some need LaTeX or make figures unreadable, such as a dark background.
     """

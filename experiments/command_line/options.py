@@ -22,6 +22,7 @@ import typer
 
 from ...sim_configs import Scenario, list_presets, load_scenario
 from ...sim_configs.field_types import unknown_choice
+from ...suggestions import imported
 from .commands import BadInputError, BrokenFilterError, Reporter, docstring_of
 
 if TYPE_CHECKING:
@@ -202,7 +203,10 @@ class Options:
         if self.steps is not None:
             changed["steps"] = self.steps
         _refuse_log(name)
-        return load_scenario(name).with_changes(**changed)
+        world = load_scenario(name).with_changes(**changed)
+        if ":" in (kind := world.sensor.kind):  # before workers copy the import path
+            imported(f"{kind}.h", f"cannot import sensor.kind = '{kind}': ")
+        return world
 
     def driver(self, scenario: Scenario) -> "Controller":
         """Make the controller; a random one drives the same path for the same seed.

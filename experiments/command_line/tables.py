@@ -449,11 +449,9 @@ def advice(summary: dict[str, Any]) -> Table:
     rows = [("inflation", text)]
     at_zero = [n["name"] for n in summary["noise"][:3] if n["verdict"] == "zero"]
     if at_zero:
-        text = (
-            f"{', '.join(at_zero)}, because a filter without this noise becomes "
-            "overconfident"
-        )
-        rows.append(("upper end of interval", text))
+        names = ", ".join(at_zero)
+        text = f"{names} instead of 0: without it, a filter becomes overconfident"
+        rows.append(("upper end", text))
     if lost > MOST_REJECTED * count:
         text = (
             f"{lost} of {count} readings ({lost / count:.0%}), which fit no noise: the "

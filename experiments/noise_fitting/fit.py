@@ -182,7 +182,8 @@ def above_zero(noise: Array, table: Sequence[search.FittedNoise]) -> Array:
     """Replace motion noise that may be zero by the upper end of its interval.
 
     A filter without a part of the motion noise soon becomes certain of this part, and
-    then rejects readings that contradict it.  The upper end is almost as likely.
+    then rejects readings that contradict it.  The upper end of the 95 % interval still
+    agrees with them.  Where it is unknown, the noise is that before the fit.
 
     Parameters
     ----------

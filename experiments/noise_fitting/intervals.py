@@ -98,7 +98,7 @@ def _profiled(
 def _first_outside(
     likelihoods: Likelihoods, parameters: Array, i: int, ends: Array, level: float
 ) -> float | None:
-    """Return the first of some values of a parameter that is below a level."""
+    """Return the first value of a parameter whose likelihood is below a level."""
     for few in np.split(ends, range(AT_ONCE, len(ends), AT_ONCE)):
         tried = np.tile(parameters, (len(few), 1))
         tried[:, i] = few

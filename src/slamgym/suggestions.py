@@ -70,7 +70,7 @@ def imported(path: str, refusal: str, *, kind: bool = False) -> Any:
     True
     """
     module, _, name = path.partition(":")
-    if not module.startswith(__package__):
+    if module.partition(".")[0] != __package__:
         sys.path.extend(folder for folder in FOLDERS if folder not in sys.path)
     try:
         return attrgetter(name)(import_module(module))

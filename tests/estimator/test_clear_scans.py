@@ -7,6 +7,8 @@ import pytest
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import UpdateReport, make_estimator
+from slamgym.estimator.association.constellations import Constellations
+from slamgym.estimator.map_management import loop_closing
 from slamgym.estimator.map_management.clear_scans import ClearScans
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
 from slamgym.experiments.run_and_replay.filter_settings import SMOOTHER
@@ -120,17 +122,22 @@ def test_given_identities_of_mapped_landmarks_are_a_clear_scan(count):
     assert np.mean(count) > 0.8
 
 
-def test_a_large_map_whose_covariance_is_half_complete_takes_clear_scans(count):
+@pytest.mark.parametrize(("lost_std", "has_lost"), [(2.0, False), (0.5, True)])
+def test_a_large_map_takes_clear_scans_unless_landmarks_are_lost(
+    count, lost_std, has_lost
+):
     rng = np.random.default_rng(2)
     places = rng.uniform(-40, 40, (180, 2))
     scan = np.stack([np.arctan2(*places.T[::-1]), np.hypot(*places.T)], axis=1)
     near = np.argsort(scan[:, 1])[:9]
     noise = rng.standard_normal((30, 9, 2)) * (0.02, 0.08)
-    twins = [make(clear=clear) for clear in (True, False)]
+    rules = Constellations(lost_std=lost_std)
+    twins = [make(clear=clear, constellations=rules) for clear in (True, False)]
     for slam in twins:
         slam.update(scan, np.arange(len(scan)))
     compare(twins, [((0.0, 0.0), scan[near] + more, None) for more in noise])
-    assert np.mean(count) > 0.5
+    assert loop_closing.lost(twins[0].best.map_view(), rules).any() == has_lost
+    assert (np.mean(count) > 0.5) == (not has_lost)
 
 
 @pytest.mark.parametrize("change", ["remove", "merge", "observe", "load", "resume"])

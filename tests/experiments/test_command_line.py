@@ -388,10 +388,12 @@ def of_a_user(here, monkeypatch):
     sys.modules.pop("of_a_user", None)
 
 
-def test_modules_of_the_user_are_looked_for_only_if_named(of_a_user, monkeypatch):
+def test_modules_of_the_user_are_looked_for_only_if_named(here, of_a_user, monkeypatch):
     monkeypatch.setattr(sys, "path", [each for each in sys.path if each != os.getcwd()])
     assert slamgym("estimators").exit_code == 0
     assert os.getcwd() not in sys.path  # a script gtsam.py is not taken for the library
+    (here / "slamgym_of_a_user.py").write_text("NUMBER = 3\n")
+    assert imported("slamgym_of_a_user:NUMBER", "") == 3
     assert imported(of_a_user, "").__name__ == "Plain"
 
 

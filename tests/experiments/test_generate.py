@@ -5,11 +5,13 @@ import json
 import os
 import pickle
 import random
+import shutil
 import subprocess
 import sys
 import time
 import tracemalloc
 
+import camera
 import forked
 import gymnasium
 import jobs_to_kill
@@ -276,10 +278,13 @@ def test_a_job_of_workers_killed_at_random_ends_with_the_bytes_of_one_process(tm
 
 
 @pytest.mark.slow
-def test_workers_import_no_script_of_the_user_named_like_a_standard_module(tmp_path):
+def test_workers_import_a_sensor_of_the_user_and_no_script_named_random(tmp_path):
     (tmp_path / "random.py").write_text("raise ImportError('a script of the user')")
+    shutil.copy(camera.__file__, tmp_path)
     program = "from slamgym.experiments.command_line.app import main; main()"
+    sensor = ["sensor.kind=camera:AHEAD", "sensor.std=[1, .1]", "sensor.max_range=50"]
     options = ["--episodes", "400", "--jobs", "2", "--out", "drives"]
+    options += [word for change in sensor for word in ("--set", change)]
     line = [sys.executable, "-P", "-c", program, "generate", "six_landmarks", *options]
     subprocess.run(line, cwd=tmp_path, check=True, capture_output=True)
     assert read_manifest(tmp_path / "drives").is_complete

@@ -135,7 +135,7 @@ def test_motion_noise_that_may_be_zero_is_suggested_at_its_upper_end():
         for stage in ("fitted", "suggested")
     )
     assert without > 1 > suggested > 0.5
-    assert "σα, because a filter without this noise" in shown(advice(summary))
+    assert "σα instead of 0: without it" in shown(advice(summary))
     endless = [turn._replace(high=np.inf, before=0.2)] * 3
     assert above_zero(np.zeros(7), endless).tolist() == [0.2, 0.2, 0.2, 0, 0, 0, 0]
 

@@ -109,7 +109,7 @@ def test_other_spellings_of_the_tables_are_the_same_log(folder, odometry, measur
         ("twist.angular.z [mrad/s];t;v_kmh", (1e-3, 1 / 3.6)),
     ],
 )
-def test_units_of_velocities_are_understood_in_any_spelling(folder, names, units):
+def test_units_of_velocities_are_understood_in_more_spellings(folder, names, units):
     rows = [(0.4, 0, 1.0), (0.2, 1, 2.0), (0, 2, 0)]
     turn, drive = units
     lines = [f"{w / turn!r};{t};{v / drive!r}" for w, t, v in rows]
@@ -512,9 +512,10 @@ def test_a_single_file_of_utias_asks_for_its_folder(file, name):
 
 
 def test_a_table_without_the_columns_of_odometry_is_shown_with_them(folder):
-    wheels = "t,v,gyro\n0,1,2\n"
+    place = folder(measurements=MEASUREMENTS, wheels="t,v,gyro\n0,1,2\n", empty="")
+    (place / "old.csv").mkdir()
     with pytest.raises(LogError, match=r"got measurements.csv .*; wheels.csv with"):
-        read_log(folder(measurements=MEASUREMENTS, wheels=wheels))
+        read_log(place)
 
 
 def test_a_folder_of_unknown_tables_names_them(folder):

@@ -17,6 +17,7 @@ file marks them. Comments ``# key: value`` with the keys of a slamlog have the s
 effect as there.
 """
 
+import contextlib
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -471,8 +472,9 @@ def lacking(kind: str, tables: Sequence[Table], source: Path) -> slamlog.LogErro
     heads = {table.file: table.header.text for table in tables}
     if source.is_dir():
         files = (file for file in source.iterdir() if file.suffix.lower() in ENDINGS)
-        for file in sorted(set(files) - set(heads))[:_MOST_SHOWN]:
-            heads[file] = log_lines.read_lines(file)[0].text
+        for file in sorted(set(filter(Path.is_file, files)) - set(heads))[:_MOST_SHOWN]:
+            with contextlib.suppress(slamlog.LogError):
+                heads[file] = log_lines.read_lines(file)[0].text
     shown = (f"{file.name} with {log_lines.shown(heads[file])}" for file in heads)
     got = "; ".join(shown)
     other = "" if source.is_dir() else ", or give the folder of several such files"
