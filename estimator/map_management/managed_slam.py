@@ -214,8 +214,9 @@ class ManagedSlam(FilterWrapper):
         reading = argument_checks.pair("odometry", odometry)
         if type(dt) is not float or dt != 1.0:
             argument_checks.duration(dt)
+        displacement = self._settings.motion_noise.motion.moved(reading)
         with changing(self, "predict"):
-            self._step(lambda h: h.predict(reading, dt))
+            self._step(lambda h: h.predict(reading, dt, displacement))
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -672,14 +673,17 @@ class Hypothesis:
         self.candidates, self.report = Candidates(), UpdateReport()
         self.recent.forget()
 
-    def predict(self, reading: tuple[float, float], dt: float) -> None:
-        """Move by odometry (d, α)."""
+    def predict(
+        self,
+        reading: tuple[float, float],
+        dt: float,
+        displacement: tuple[float, float, float],
+    ) -> None:
+        """Move by odometry (d, α), which is a displacement in the robot's frame."""
         self.filter.predict(reading, dt)
         self.editor.expire()
         if len(self._candidates.tentative.seen):
-            noise = self.motion_noise
-            displacement = noise.motion.moved(reading)
-            variance = noise.over(displacement, dt)
+            variance = self.motion_noise.over(displacement, dt)
             self.tentative = self.tentative.moved(displacement, variance)
         self.recent.note_motions((*reading, dt))
 
