@@ -22,8 +22,7 @@ import numpy as np
 from ..arrays import Array, BoolArray, ComplexArray, IntArray
 from ..jit import fma, jit_in_place, njit_internal
 from ..sim_configs import Scenario
-from ..suggestions import imported
-from .noise_streams import SensorNoise, SensorSettings
+from .noise_streams import SensorNoise, SensorSettings, part_of_sensor
 from .robot import wrapped_bearing
 
 
@@ -218,8 +217,7 @@ def _reading_of_places(kind: str) -> tuple[Any, tuple[bool, bool]]:
     if ":" not in kind:
         of_places = _position if kind == "position" else None
         return of_places, ("bearing" in kind, False)
-    refusal = f"cannot import sensor.kind = '{kind}': "
-    h, wraps = (imported(f"{kind}.{part}", refusal) for part in ("h", "wraps"))
+    h, wraps = (part_of_sensor(kind, part) for part in ("h", "wraps"))
     return partial(_reading_by, h), (bool(wraps[0]), bool(wraps[1]))
 
 

@@ -121,9 +121,19 @@ def field_of_view(sensor: SensorTable) -> float:
     """Return the angle of view: the world's, or that of a user's sensor if smaller."""
     own = 2 * math.pi
     if ":" in sensor.kind:
-        refusal = f"cannot import sensor.kind = '{sensor.kind}': "
-        own = float(imported(f"{sensor.kind}.field_of_view", refusal))
+        own = float(part_of_sensor(sensor.kind, "field_of_view"))
     return min(sensor.field_of_view, own)
+
+
+def part_of_sensor(kind: str, part: str) -> Any:
+    """Return a part of a sensor that the user has written, "module:SENSOR".
+
+    Raises
+    ------
+    ValueError
+        If it cannot be imported.
+    """
+    return imported(f"{kind}.{part}", f"cannot import sensor.kind = '{kind}': ")
 
 
 class WorldNoise:

@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
+from ..sim_configs.field_types import ScenarioTable
+from ..sim_configs.scenario import plain
+
 
 def plain_spec(spec: EnvSpec, steps: int | None = None) -> EnvSpec:
     """Return a specification that JSON can hold, with the length of the episodes."""
@@ -31,14 +34,12 @@ def json_value(value: Any) -> Any:
     >>> json_value({"dtype": np.dtype("float32"), "estimator": Path})
     {'dtype': 'float32', 'estimator': 'pathlib:Path'}
     """
-    if hasattr(value, "model_dump"):
-        return json_value(_without_inf(value.model_dump()))
-    if isinstance(value, Mapping):
-        return {key: json_value(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [json_value(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
+    return plain(value, _replaced)
+
+
+def _replaced(value: Any) -> Any:
+    if isinstance(value, ScenarioTable):
+        return _without_inf(value.model_dump())
     if "<" not in (name := getattr(value, "__qualname__", "<")):
         return f"{value.__module__}:{name}"
     if isinstance(value, Enum):

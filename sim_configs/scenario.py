@@ -7,7 +7,7 @@ uniform between two ends. The number of landmarks never changes.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -631,16 +631,20 @@ def _is_foreign(change: Mapping[str, object], old: Mapping[str, object]) -> bool
     return ":" in str(kind) and kind != old["kind"]
 
 
-def plain(value: Any) -> Any:
-    """Replace arrays, models and other mappings by lists and dicts."""
+def plain(value: Any, replaced: Callable[[Any], Any] = lambda value: value) -> Any:
+    """Replace arrays, models and other mappings by lists and dicts.
+
+    ``replaced`` replaces each value before, also inside of others.
+    """
+    value = replaced(value)
     if isinstance(value, ScenarioTable):
         return value.model_dump()
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
+        return {key: plain(item, replaced) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [plain(item, replaced) for item in value]
     return value
 
 

@@ -22,7 +22,6 @@ import typer
 
 from ...sim_configs import Scenario, list_presets, load_scenario
 from ...sim_configs.field_types import unknown_choice
-from ...suggestions import imported
 from .commands import BadInputError, BrokenFilterError, Reporter, docstring_of
 
 if TYPE_CHECKING:
@@ -204,8 +203,10 @@ class Options:
             changed["steps"] = self.steps
         _refuse_log(name)
         world = load_scenario(name).with_changes(**changed)
-        if ":" in (kind := world.sensor.kind):  # before workers copy the import path
-            imported(f"{kind}.h", f"cannot import sensor.kind = '{kind}': ")
+        if ":" in world.sensor.kind:  # before workers copy the import path
+            from ...envs.noise_streams import part_of_sensor
+
+            part_of_sensor(world.sensor.kind, "h")
         return world
 
     def driver(self, scenario: Scenario) -> "Controller":
