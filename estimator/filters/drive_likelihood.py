@@ -307,7 +307,7 @@ def follow_drive(
                     belief.mean,
                     belief.covariance,
                     belief.reference,
-                    len(start[0]),  # the landmarks follow before a scan
+                    len(start[0]),  # `carry` moves the rest before a scan
                     dx,
                     dy,
                     turn,
@@ -337,7 +337,8 @@ def follow_drive(
             record.log_likelihoods[b, s] = log_density(workspace.rows, used, nis)
             size = settle(drive, record, b, s, size, ledger, own, slots, rules.gate)
             keep(belief, record, b, s)
-            at = belief.mean if rules.linearisation == 0 else belief.reference
+            at_estimate = rules.linearisation == scan.AT_ESTIMATE
+            at = belief.mean if at_estimate else belief.reference
             x, y = at[0], at[1]
 
 

@@ -68,7 +68,7 @@ from ..models.sensors import BEARING_RANGE
 from .loop_closing import ACCURATE, FEWEST_READINGS, LOCAL_STD
 from .policy import LandmarkPolicy
 from .pruning import LandmarkRecords, add_sightings, noise_of_sightings
-from .recent_scans import RecentScan, RecentScans
+from .recent_scans import RecentScans
 
 #: Difference of −2 ln of probabilities: hypotheses e²⁰ = 5e8 times less probable than
 #: the best one are discarded.
@@ -255,9 +255,8 @@ class ClearScans:
 
     def take(self, scan: ClearScan) -> bool:
         """Take in a scan as associated; return False if the filter refuses it."""
-        gaussian, is_given = self._filter.map, scan.slots is None
-        slots = scan.again if scan.slots is None else scan.slots[0]
-        before = self._recent.state_before(scan.number, scan.labels)
+        gaussian, decided = self._filter.map, (scan.row_ids, scan.labels)
+        new = self._recent.new_scan(scan.number, scan.readings, *decided)
         if self._filter is self._slam:
             if gaussian.take_in(update_map, *scan.fed) != DONE:
                 return False
@@ -266,7 +265,9 @@ class ClearScans:
                 self._slam.update(*scan.fed)
             except (ValueError, np.linalg.LinAlgError):
                 return False
-        parts, read = gaussian.parts, (scan.readings, slots, scan.again)
+        parts, is_given = gaussian.parts, scan.slots is None
+        slots = scan.again if scan.slots is None else scan.slots[0]
+        read = scan.readings, slots, scan.again
         is_afar, is_used = count_clear(gaussian.block, self._tally, *read, is_given)
         self._ahead += 1
         if is_afar:
@@ -276,9 +277,7 @@ class ClearScans:
         if not is_used:
             report = self._slam.report()
             unused.update(report.rejected_ids, report.skipped_ids)
-        # The caller may reuse the array of readings.
-        kept = self._recent.motions, scan.readings.copy(), scan.row_ids, scan.labels
-        self._recent.note_clear(RecentScan(scan.number, *kept, before), unused)
+        self._recent.note_clear(new, unused)
         return True
 
     def renew(self, before: Candidates, records: LandmarkRecords) -> Candidates:

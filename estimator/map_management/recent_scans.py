@@ -90,17 +90,25 @@ class RecentScans(Restorable):
     def with_scan(self, plan: ScanAssociation) -> FedScans:
         """Return what to feed to the filter: a new scan, and earlier ones to repeat."""
         decided = tuple(plan.row_ids), tuple(plan.labels)
-        before = self.state_before(plan.scan, decided[1])
-        # The caller may reuse the array of readings.
-        parts = self.motions, plan.readings.copy(), *decided, before
-        scans = [*self.scans, RecentScan(plan.scan, *parts)][-self._window - 1 :]
+        scan = self.new_scan(plan.scan, plan.readings, *decided)
+        scans = [*self.scans, scan][-self._window - 1 :]
         first = _relabel(scans, plan.confirmed) if plan.confirmed else None
         return FedScans(plan, scans, first)
 
-    def state_before(self, number: int, labels: Sequence[int]) -> Before:
-        """Return the filter's state if a tentative landmark begins in the next scan."""
-        begins = self._window and max(labels, default=NO_LABEL) >= number << LABEL_BITS
-        return self._slam.state_dict() if begins else None
+    def new_scan(
+        self,
+        number: int,
+        readings: Array,
+        row_ids: tuple[int | None, ...],
+        labels: tuple[int, ...],
+    ) -> RecentScan:
+        """Return the next scan, before the filter takes it in."""
+        before = None
+        if self._window and max(labels, default=NO_LABEL) >= number << LABEL_BITS:
+            before = self._slam.state_dict()  # a tentative landmark begins in it
+        # The caller may reuse the array of readings.
+        parts = self.motions, readings.copy(), row_ids, labels, before
+        return RecentScan(number, *parts)
 
     def feed(self, fed: FedScans) -> UpdateReport:
         """Update the filter with the last scan, and with earlier sightings if any.
@@ -274,9 +282,6 @@ WINDOW: saved_states.Table = {"motions": MOTIONS, "count": (saved_states.COUNTS,
 
 NO_LANDMARK = np.iinfo(np.int64).min
 
-#: State of the filter before a scan, where a tentative landmark begins in it.
-Before = Mapping[str, Any] | None
-
 #: (d, α) [m, rad] and dt; or one of the rows of a reading of the pose.
 Motion = tuple[float, float, float]
 
@@ -303,7 +308,8 @@ class RecentScan(NamedTuple):
     row_ids: tuple[int | None, ...]
     #: Label of the tentative landmark of each row, or `NO_LABEL`.
     labels: tuple[int, ...]
-    before: Before = None
+    #: State of the filter before the scan, where a tentative landmark begins in it.
+    before: Mapping[str, Any] | None = None
     #: Landmarks removed after it.
     removed: tuple[int, ...] = ()
     #: Landmarks merged after it: (kept, gone).
