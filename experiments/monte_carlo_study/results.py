@@ -192,6 +192,7 @@ class TableMethod:
 
     def __call__(self) -> Any:
         """Return `verdict_table` of the results."""
+        # By its public name: the module that makes it reads results.
         return import_module(__package__).verdict_table(self._results)
 
 

@@ -25,7 +25,7 @@ WITHIN = 1.92  # ½ χ²(1) at 95 %: how much less likely the ends of an interva
 NOT_ZERO = 1.35  # the same at 90 %, for a parameter that may lie at its end, zero
 NORMAL = 1.96
 ENDS = np.geomspace(1e-6, 10.0, 71)  # [m, rad] where ends are looked for
-AT_ONCE = 10  # of them
+AT_ONCE = 10  # of them, in one call
 
 
 class Interval(NamedTuple):

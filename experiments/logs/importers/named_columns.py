@@ -335,9 +335,7 @@ def _unit(text: str) -> str:
 def tables_in(folder: Path) -> list[Table]:
     """Return the files of a folder that are tables of a known kind."""
     found = []
-    for file in sorted(folder.iterdir()):
-        if file.suffix.lower() not in ENDINGS or not file.is_file():
-            continue
+    for file in _files_of(folder):
         try:
             table = read_table(file, log_lines.read_lines(file))
         except slamlog.LogError:
@@ -351,6 +349,12 @@ def tables_in(folder: Path) -> list[Table]:
             wanted = f"a first row with the columns {_EXAMPLES[file.stem.lower()]}"
             raise first.error(wanted, log_lines.shown(first.text))
     return found
+
+
+def _files_of(folder: Path) -> list[Path]:
+    """Return the files of a folder that may be tables."""
+    files = (file for file in sorted(folder.iterdir()) if file.is_file())
+    return [file for file in files if file.suffix.lower() in ENDINGS]
 
 
 def read_named(tables: Sequence[Table], name: str, source: Path) -> slamlog.SlamLog:
@@ -471,8 +475,8 @@ def lacking(kind: str, tables: Sequence[Table], source: Path) -> slamlog.LogErro
         form += ", one row per reading"
     heads = {table.file: table.header.text for table in tables}
     if source.is_dir():
-        files = (file for file in source.iterdir() if file.suffix.lower() in ENDINGS)
-        for file in sorted(set(filter(Path.is_file, files)) - set(heads))[:_MOST_SHOWN]:
+        others = [file for file in _files_of(source) if file not in heads]
+        for file in others[:_MOST_SHOWN]:
             with contextlib.suppress(slamlog.LogError):
                 heads[file] = log_lines.read_lines(file)[0].text
     shown = (f"{file.name} with {log_lines.shown(heads[file])}" for file in heads)
