@@ -14,6 +14,7 @@ from pathlib import Path
 from pkgutil import walk_packages
 from types import FunctionType, ModuleType
 
+import forked
 import numpy as np
 import pytest
 from numba import _dispatcher
@@ -67,32 +68,22 @@ def write(folder, **modules):
 
 def write_kernels(site):
     """Copy the package, add two kernels and a constant, and return their folder."""
-    without = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(Path(slamgym.__file__).parent, site / "slamgym", ignore=without)
+    shutil.copytree(Path(slamgym.__file__).parent, site / "slamgym")
     room = site / "slamgym/estimator"
     write(room, caller=CALLER, callee=CALLEE, constants="FACTOR = 2")
     return room
 
 
-def begun(room, code=ASK, prefix=(), **environment):
+def begun(room, code=ASK, **environment):
     """Start a script in a new process, with the package that contains a folder."""
-    site = str(room.parents[1])
-    environment = {"PYTHONDONTWRITEBYTECODE": "1", "PYTHONPATH": site, **environment}
-    return subprocess.Popen(
-        [*prefix, sys.executable, "-c", textwrap.dedent(code)],
-        env={**os.environ, **environment},
-        cwd=room.parents[1],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    own = {name: os.environ[name] for name in ("NUMBA_CACHE_DIR", "TMPDIR")}
+    code = forked.WITHOUT_SLAMGYM + textwrap.dedent(code)
+    return forked.Script(code, room.parents[1], own | environment)
 
 
-def python(*arguments, **environment):
+def python(room, code=ASK, **environment):
     """Return what a script in a new process writes: its output, its errors."""
-    process = begun(*arguments, **environment)
-    output, errors = process.communicate()
-    assert process.returncode == 0, errors
+    output, errors = begun(room, code, **environment).output()
     return output.split(), errors
 
 
@@ -104,6 +95,7 @@ def answer(room, code=ASK):
 @pytest.fixture
 def room(tmp_path, monkeypatch):
     """Return a folder with two kernels and a constant, and a cache of their own."""
+    forked.start_server()  # it has the usual cache
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     return write_kernels(tmp_path / "k")
@@ -231,14 +223,22 @@ def test_a_read_only_install_without_a_home_can_be_imported(room, tmp_path):
     folders = [home, site, *(f for f in site.rglob("*") if f.is_dir())]
     for folder in folders:
         folder.chmod(0o555)
+    environment = {**os.environ, **UNWRITABLE, "HOME": str(home)}
     try:
-        output, errors = python(room, ASK, prefix, **{**UNWRITABLE, "HOME": str(home)})
+        done = subprocess.run(
+            [*prefix, sys.executable, "-c", textwrap.dedent(ASK)],
+            env={**environment, "PYTHONPATH": str(site)},
+            cwd=site,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
     finally:
         for folder in folders:
             folder.chmod(0o755)
-    assert output == ["7.0", "0"]
-    assert errors.count("Warning") == 1
-    assert str(home) in errors
+    assert done.stdout.split() == ["7.0", "0"]
+    assert done.stderr.count("Warning") == 1
+    assert str(home) in done.stderr
 
 
 @pytest.mark.slow
@@ -254,7 +254,7 @@ def test_processes_that_compile_for_other_types_at_once_do_not_mix_them(room):
     start = time.time() + 3
     codes = [code.format(start=start, call=call) for call in calls]
     processes = [begun(room, code) for code in codes]
-    assert {complex(process.communicate()[0]) for process in processes} == {7}
+    assert {complex(process.output().stdout) for process in processes} == {7}
     again = """
         import numpy as np
         from slamgym.estimator.caller import answer
@@ -327,10 +327,19 @@ def test_lock_files_of_an_editor_are_no_sources(tmp_path, monkeypatch):
     assert digest_of_sources() == before
 
 
+READING = """
+    from ..jit import jit
+    from .models.bearing_range import expected_reading_jit
+
+    @jit
+    def answer(dx, dy):
+        return expected_reading_jit(dx, dy, 0.0)[0]
+"""
 SENSOR = """
-    import numpy as np
     from helpers import scaled
-    from slamgym.estimator import Sensor, make_estimator
+    from slamgym.estimator import Sensor
+    from slamgym.estimator.caller import answer
+    from slamgym.estimator.models.sensor_kernels import for_sensor
 
     def h(x, y):
         return (scaled(x), y), (scaled(1.0), 0.0, 0.0, 1.0)
@@ -338,17 +347,8 @@ SENSOR = """
     def inverse(z0, z1):
         return z0 / scaled(1.0), z1
 
-    slam = make_estimator(
-        "ekf", motion_std=(0.1,) * 3, measurement_std=(0.1, 0.1),
-        sensor=Sensor("far", ("x", "y"), ("m", "m"), h, inverse),
-    )
-    compiled = []
-    from slamgym.jit import on_compilation
-    with on_compilation(lambda: compiled.append(1)):
-        slam.predict((0.0, 0.0))
-        slam.update(np.array([[2.0, 0.0]]), [1])
-        slam.update(np.array([[4.0, 0.0]]), [1])
-    print(slam.belief().landmarks[0, 0], len(compiled))
+    answer = for_sensor(answer, Sensor("far", ("x", "y"), ("m", "m"), h, inverse))
+    print(answer(3.0, 0.0), sum(answer.stats.cache_hits.values()))
 """
 HELPERS = """
     from numba import njit
@@ -364,14 +364,12 @@ HELPERS = """
 @pytest.mark.slow
 def test_kernels_of_a_sensor_follow_its_helpers_in_other_files(room):
     site = room.parents[1]
+    write(room, caller=READING)
     write(site, helpers=HELPERS.format(2.0))
-    first, compiled = answer(room, SENSOR)
-    assert compiled > 0
-    assert answer(room, SENSOR) == (first, 0)
-    write(site, helpers=HELPERS.format(1.0))
-    changed, compiled = answer(room, SENSOR)
-    assert compiled > 0
-    assert changed > first
+    assert answer(room, SENSOR) == (6, 0)
+    assert answer(room, SENSOR) == (6, 1)
+    write(site, helpers=HELPERS.format(4.0))
+    assert answer(room, SENSOR) == (12, 0)
 
 
 USER = """

@@ -49,11 +49,7 @@ for part in (package, package.estimator, package.experiments, package.agents):
 
 #: A forked process then loads the copy in its folder, and no library again.  Rendering
 #: takes most of the time of the commands, and loads no module.
-PREPARED = """
-import gymnasium, sys
-for known in (sys.modules, gymnasium.registry):
-    for name in [name for name in known if name.startswith("slamgym")]:
-        del known[name]
+PREPARED = f"""{forked.WITHOUT_SLAMGYM}
 from slamgym.experiments.figures import style
 assert style.__file__.startswith(sys.path[0])
 style.draw_file = lambda figure, path, *_: path.touch()

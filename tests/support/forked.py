@@ -19,6 +19,14 @@ from typing import NamedTuple
 
 KILLED = -signal.SIGKILL
 
+#: A `Script` that begins so imports slamgym anew, from its folder.
+WITHOUT_SLAMGYM = """
+import gymnasium, sys
+for known in (sys.modules, gymnasium.registry):
+    for name in [name for name in known if name.startswith("slamgym")]:
+        del known[name]
+"""
+
 _CONTEXT = multiprocessing.get_context("forkserver")
 _CONTEXT.set_forkserver_preload(["forked_preload"])
 
