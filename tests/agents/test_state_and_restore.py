@@ -52,7 +52,7 @@ def check(env, seed, *, before=7, after=50):
 @pytest.mark.parametrize("name", PRESETS)
 def test_worlds_continue_from_a_state_to_the_bit(name):
     check(LandmarkWorldEnv(name), 3)
-    for count, mode in ((1000, "NextStep"), (3, "SameStep")):
+    for count, mode in ((100, "NextStep"), (3, "SameStep")):
         check(LandmarkWorldVectorEnv(count, name, autoreset_mode=mode), 5)
 
 
@@ -61,7 +61,7 @@ def test_worlds_continue_from_a_state_to_the_bit(name):
 def test_worlds_with_filters_continue_from_a_state_to_the_bit(name):
     after = 15 if name == "active_hidden" else 50
     check(ActiveSlamEnv(name), 3, after=after)
-    worlds = 3 if name == "active_hidden" else 1000
+    worlds = 3 if name == "active_hidden" else 100
     check(ActiveSlamVectorEnv(worlds, name), 5, after=after)
     check(ActiveSlamVectorEnv(3, name, autoreset_mode="SameStep"), 6, after=after)
 
