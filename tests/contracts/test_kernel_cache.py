@@ -8,7 +8,6 @@ import subprocess
 import sys
 import textwrap
 import time
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from pkgutil import walk_packages
@@ -20,11 +19,11 @@ import pytest
 from numba import _dispatcher
 from numba.core.runtime import _nrt_python
 from numba.core.runtime.nrt import rtsys
+from own_noise import OWN_NOISE
 
 import slamgym
 from slamgym import jit as kernel_cache
 from slamgym.estimator import list_estimators, list_peers, make_estimator
-from slamgym.estimator.models.sensors import POSITION
 from slamgym.jit import (
     digest_of_sources,
     jit,
@@ -594,15 +593,11 @@ def test_kernel_without_counted_references_hands_on_no_array(kernel):
             kernel(np.zeros((3, 2)))
 
 
-def two_stds(noise, _):
-    return np.array(noise[:2])
-
-
 @pytest.mark.parametrize(
     "options",
     [
         *({"name": name} for name in list_estimators()),
-        {"name": "ekf", "sensor": replace(POSITION, name="arrays", std=two_stds)},
+        {"name": "ekf", "sensor": OWN_NOISE},  # which returns arrays
     ],
     ids=lambda options: "-".join(map(str, options.values()))[:20],
 )
