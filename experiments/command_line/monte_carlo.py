@@ -3,6 +3,7 @@
 import contextlib
 import re
 import shlex
+import signal
 import sys
 import threading
 from _thread import interrupt_main
@@ -287,7 +288,7 @@ def _naming_loss(client: Any, address: str) -> Iterator[None]:
 
     def end_if_lost() -> None:
         if client.status == "closed":  # it has tried for 30 s
-            interrupt_main()
+            interrupt_main(signal.SIGTERM)  # a job in the background ignores SIGINT
 
     with client:
         try:

@@ -25,6 +25,7 @@ from slamgym.evaluation import AssociationScores, Gospa, oracle_errors
 from slamgym.experiments.command_line.commands import (
     LostSchedulerError,
     _naming_interrupts,
+    terminable,
 )
 from slamgym.experiments.command_line.monte_carlo import connected
 from slamgym.experiments.monte_carlo_study import (
@@ -720,6 +721,8 @@ def test_a_lost_dask_scheduler_ends_the_wait_for_its_results(tmp_path):
     options = f"--port 0 --no-dashboard --host 127.0.0.1 --scheduler-file {file}"
     command = f"{python} {options}".split()
     scheduler = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    # As in a job that a script has begun with "&".
+    usual = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         while not file.exists() or not file.read_text().endswith("}"):
             assert scheduler.poll() is None
@@ -728,7 +731,7 @@ def test_a_lost_dask_scheduler_ends_the_wait_for_its_results(tmp_path):
         lost = f"the Dask scheduler {address} is lost; what is finished is kept"
 
         def lose() -> None:
-            with _naming_interrupts(), connected("dask", address, None):
+            with terminable(), _naming_interrupts(), connected("dask", address, None):
                 scheduler.kill()
                 for _ in range(600):  # as joblib waits for results
                     time.sleep(0.1)
@@ -737,6 +740,7 @@ def test_a_lost_dask_scheduler_ends_the_wait_for_its_results(tmp_path):
         with quickly, pytest.raises(LostSchedulerError, match=lost):
             lose()
     finally:
+        signal.signal(signal.SIGINT, usual)
         scheduler.kill()
         scheduler.wait()
 
