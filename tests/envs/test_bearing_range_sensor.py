@@ -8,7 +8,7 @@ from far_origins import FAR
 from worlds import RANDOM_MAP
 
 from slamgym.envs.bearing_range import BearingRangeSensor, LineOfSight, hide_identities
-from slamgym.envs.noise_streams import NoiseRows, WorldNoise, row_of
+from slamgym.envs.noise_streams import NoiseRows, SensorSettings, WorldNoise, row_of
 from slamgym.envs.random_numbers import episode_keys
 from slamgym.sim_configs import load_scenario
 
@@ -343,6 +343,14 @@ def test_clutter_is_uniform_over_what_the_sensor_sees_and_poisson_in_number():
         assert gap < 1.95 / math.sqrt(len(share))  # Kolmogorov, 1 in 1000
         assert share[0] > 0.0
         assert share[-1] <= 1.0
+
+
+def test_a_false_reading_may_have_the_longest_range_but_not_the_shortest():
+    settings = SensorSettings.of(HIDDEN.sensor)
+    drawn = np.zeros((1, 19))
+    drawn[0, 0] = settings.counts_below[0, 0]  # the first number that is one reading
+    clutter = WorldNoise(HIDDEN)._clutter(1, drawn, settings)
+    np.testing.assert_array_equal(clutter[0], [(-1.0, 6.0)] + 8 * [(0.0, 0.0)])
 
 
 def test_hidden_identities_without_clutter_reserve_no_rows():

@@ -374,6 +374,14 @@ def test_the_density_is_large_where_new_readings_appear():
     assert ahead > 3 * middle
 
 
+def test_the_share_of_landmarks_is_that_of_the_readings_which_prove_to_be_one():
+    density, scan = UnexplainedDensity(), np.ones((4, 2))
+    for _ in range(500):
+        density = density.after(scan, range(4), landmarks=1)
+    assert density.landmark_share == pytest.approx(0.25)
+    assert density.after(scan, [], landmarks=999).landmark_share == 1.0
+
+
 def test_bearings_of_many_turns_count_in_their_sector():
     far = np.array([[1e200, 2.0], [-1e200, 2.0]])
     within = np.column_stack([wrap_angle(far[:, 0]), far[:, 1]])

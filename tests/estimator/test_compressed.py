@@ -1,9 +1,11 @@
 """The compressed filter is the full filter: whatever it puts off, nothing is lost."""
 
 import copy
+import gc
 import pickle
 import sys
 from pathlib import Path
+from types import FunctionType, ModuleType
 
 import numpy as np
 import pytest
@@ -517,7 +519,26 @@ def test_a_question_may_be_interrupted_while_it_finishes_a_change(base):
 def test_what_it_stores_is_about_half_a_covariance():
     slam = map_all(CompressedEkfSlam(*NOISE), 1000)
     run(slam, wander(1000, 20))
+    assert map_of(slam)._handover is not None  # the largest in a change
     assert slam.nbytes < 0.65 * 8 * 2003**2
+    assert 0.8 < slam.nbytes / bytes_of_arrays(map_of(slam)) < 1.0  # others: scratch
+
+
+def bytes_of_arrays(whole):
+    """Return the memory of all arrays that an object refers to, at any depth."""
+    found, waiting, total = set(), [whole], 0
+    while waiting:
+        part = waiting.pop()
+        if id(part) in found or isinstance(part, type | ModuleType | FunctionType):
+            continue
+        found.add(id(part))
+        if not isinstance(part, np.ndarray):
+            waiting += gc.get_referents(part)
+        elif part.base is None:
+            total += part.nbytes
+        else:
+            waiting.append(part.base)
+    return total
 
 
 @pytest.mark.parametrize(

@@ -400,6 +400,20 @@ def test_a_sighting_of_clutter_does_not_drag_a_new_landmark_along():
     ]
 
 
+def test_the_gate_of_the_best_hypothesis_decides_whether_a_pose_counts():
+    noise = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
+    options = {"gate_probability": 0.99, "management": {"association": "hypotheses"}}
+    slam = make_estimator("ekf", **noise, initial_pose_std=np.full(3, 0.1), **options)
+    state = slam.state_dict()
+    second = {f"1.{k[2:]}": v.copy() for k, v in state.items() if k.startswith("0.")}
+    second["1.filter.mean"][0] = 10.0
+    slam.load_state_dict(state | second | {"costs": np.array([0.0, 1.0])})
+    report = slam.observe_pose([10.0, 0.0], np.eye(2, 3), 0.01 * np.eye(2))
+    assert report.degrees_of_freedom == 0
+    assert [h.cost for h in slam.hypotheses] == [0.0, 1.0]
+    np.testing.assert_array_equal(slam.belief().mean, np.zeros(3))
+
+
 def test_an_interrupted_reading_of_the_pose_leaves_no_hypothesis_behind(slippery_drive):
     world, scans = slippery_drive
     slam, _ = several_hypotheses(scans, world)

@@ -171,6 +171,22 @@ def test_the_caller_may_fill_the_same_array_with_every_scan(association):
     assert_same_bits(reusing.belief(), twin.belief())
 
 
+@pytest.mark.parametrize("edit", ["remove", "merge"])
+def test_a_change_of_the_map_between_repeated_scans_is_made_again(edit):
+    slam = make(management={"confirm": (3, 5), "backdate": True})
+    mapped, new = [(5, 1), (4, -2)], [(4, 6)]
+    for _ in range(3):
+        slam.update(polar(mapped))
+    slam.update(polar(new))  # the first sighting
+    if edit == "remove":
+        slam.remove([1])
+    else:
+        slam.merge(0, 1)
+    slam.update(polar(new))
+    assert slam.update(polar(new)).confirmed_ids == (2,)
+    assert slam.landmark_ids == (0, 2)
+
+
 class Own:
     """A filter without checks that writes into the array that it is given."""
 
