@@ -654,6 +654,23 @@ def test_a_map_in_the_frame_of_the_start_is_judged(offset, claimed, accepted, tm
     assert ("those of the map do not" in entry["reason"]) == (not accepted)
 
 
+@pytest.mark.parametrize(("step", "is_bent"), [(0, True), (-1, False)])
+def test_a_map_is_bent_by_an_uncertain_heading_of_the_start_alone(
+    step, is_bent, tmp_path
+):
+    drives, mine = tmp_path / "drives", tmp_path / "mine"
+    few = JOB | {"episodes": 2, "episodes_per_shard": 2}
+    generate_trajectories("anchored", drives, **few, estimator="invariant")
+    mine.mkdir()
+    for drive in load_trajectories(drives):
+        names = [name for name in vars(drive) if name.startswith("belief_")]
+        arrays = {name: np.array(getattr(drive, name)) for name in names}
+        arrays["belief_pose_covariances"][step, 2, 2] += 1.0
+        np.savez(mine / f"seed_{drive.seed}.npz", **arrays)
+    results = judge(mine, drives)
+    assert bool(np.isnan(results.landmark_deviation_x).all()) == is_bent
+
+
 @pytest.fixture
 def elsewhere(tmp_path, beliefs):
     """Return folders of true paths and of estimates as TUM."""
