@@ -89,7 +89,7 @@ TESTS = {
     "estimator/filters/delayed_landmarks": "sensors saved_states",
     "estimator/filters/drive_likelihood": "drive_likelihood",
     "estimator/filters/imagine": "imagine",
-    "estimator/filters/pose_readings": "pose_readings",
+    "estimator/filters/pose_readings": "pose_readings map_editor",
     "estimator/filters/gaussian_map": (
         "ekf_slam filter_family filter_memory map_management"
     ),
@@ -151,6 +151,7 @@ TESTS = {
     f"{STUDY}/looks": "looks",
     f"{STUDY}/report": "html_report monte_carlo_report efficiency",
     f"{STUDY}/results": "study_by_hand monte_carlo monte_carlo_folder",
+    f"{STUDY}/runner": "study_by_hand monte_carlo monte_carlo_folder looks causes",
     f"{STUDY}/summary": "monte_carlo_report html_report monte_carlo",
     f"{STUDY}/verdict": "monte_carlo_report causes looks monte_carlo",
     "experiments/noise_explorer": "noise_explorer",
@@ -183,7 +184,7 @@ ROOMS = (
     *("agents", "envs", "estimator", "evaluation", "experiments", "sim_configs"),
     "src/slamgym",
 )
-CPU_SECONDS = 600  # of the tests of a mutant, which then count as endless
+CPU_SECONDS = 300  # of the tests of a mutant, which then count as endless
 OUTCOMES = {0: "survived", 1: "killed", 2: "killed", 4: "killed"}  # 2, 4: at import
 EXPLAINED = Path(__file__).with_name("mutants_explained.txt")
 RESULTS = ROOT / "results" / "mutants.jsonl"
@@ -238,10 +239,23 @@ def preload() -> None:
 
 
 def verdict(tests: Tests, file: str = "", text: str = "", function: str = "") -> str:
-    """Run tests in a fork, with another text of a file: killed, survived, or timeout.
+    """Run tests with another text of a file: killed, survived, or timeout.
 
-    The test that fails must pass without the mutant; else the verdict is broken.  A
-    kernel that is changed, and those that call it, are compiled anew.
+    The test that fails must pass without the mutant, and one must run; else the verdict
+    is broken.
+    """
+    code, failed = _in_a_fork(tests, file, text, function)
+    if code == pytest.ExitCode.TESTS_FAILED and not _passes(failed, plain=tests.plain):
+        return "broken"
+    return "timeout" if code < 0 else OUTCOMES.get(code, "broken")
+
+
+def _in_a_fork(
+    tests: Tests, file: str = "", text: str = "", function: str = ""
+) -> tuple[int, str]:
+    """Run tests in a fork; return the exit code, and the test that fails, if any.
+
+    A kernel that is changed, and those that call it, are compiled anew.
     """
     with tempfile.NamedTemporaryFile("r") as failed:
         child = os.fork()
@@ -256,26 +270,24 @@ def verdict(tests: Tests, file: str = "", text: str = "", function: str = "") ->
             if time.monotonic() - began > 3 * CPU_SECONDS:
                 os.killpg(child, signal.SIGKILL)
             time.sleep(0.02)
-        code, name = os.waitstatus_to_exitcode(ended[1]), failed.read()
-    if code == pytest.ExitCode.TESTS_FAILED and not _passes(name, plain=tests.plain):
-        return "broken"
-    return "timeout" if code < 0 else OUTCOMES.get(code, "broken")
+        return os.waitstatus_to_exitcode(ended[1]), failed.read()
 
 
 @cache
 def _passes(test: str, *, plain: bool) -> bool:
     """Whether a test passes without a mutant."""
-    return verdict(Tests((test,), plain)) == "survived"
+    return _in_a_fork(Tests((test,), plain))[0] == pytest.ExitCode.OK
 
 
-class _NotesFailure:
-    """Write the name of the test that fails to a file."""
+class _Notes:
+    """Write the name of the test that fails to a file; note whether any passes."""
 
     def __init__(self, file: str) -> None:
-        self._file = Path(file)
+        self._file, self.is_tested = Path(file), False
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Note a test that fails."""
+        """Note the outcome of a test."""
+        self.is_tested |= report.when == "call" and report.passed
         if report.failed:
             self._file.write_text(report.nodeid)
 
@@ -296,7 +308,10 @@ def _run(tests: Tests, file: str, text: str, function: str, failed: str) -> None
     os.chdir(ROOT)
     options = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", "--tb=no"]
     options += ["-k", NOT_PLAIN] if tests.plain else []
-    code = pytest.main([*options, *tests.files], [_NotesFailure(failed)])
+    notes = _Notes(failed)
+    code = pytest.main([*options, *tests.files], [notes])
+    if code == pytest.ExitCode.OK and not notes.is_tested:  # a library is missing
+        code = pytest.ExitCode.NO_TESTS_COLLECTED
     os._exit(int(code))
 
 

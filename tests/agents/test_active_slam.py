@@ -756,6 +756,10 @@ def test_lanes_show_the_whole_floor(level):
         poses = np.column_stack([points, np.full(60, heading)])
         seen |= grid.visible_from(poses).any(axis=0)
     assert seen.mean() > 0.97
+    sensor, (ways, aside) = scenario.sensor, np.abs(np.diff(lanes, axis=0)).T
+    reach = sensor.max_range * math.sin(min(sensor.field_of_view, math.pi) / 2)
+    steps = np.concatenate([ways[ways > 0], aside[aside > 0]])
+    assert steps.min() > 0.7 * reach  # not more lanes than are needed
 
 
 @pytest.mark.parametrize("name", ["greedy", "mpc"])

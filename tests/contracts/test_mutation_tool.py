@@ -1,5 +1,6 @@
 """The command for mutation testing knows the tests of every file it changes."""
 
+import os
 import sys
 from glob import glob
 from pathlib import Path
@@ -76,3 +77,11 @@ def test_explanations_are_of_functions_that_exist(mutate):
     for place in mutate.explained():
         file, function, _ = place.split(":", 2)
         assert f"def {function}(" in (ROOT / file).read_text() or not function, place
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the tool forks")
+@pytest.mark.parametrize("body", ["assert False", "pytest.skip()"])
+def test_tests_that_fail_anyway_or_are_skipped_judge_no_mutant(mutate, body, tmp_path):
+    file = tmp_path / "test_it.py"
+    file.write_text(f"import pytest\n\n\ndef test_it():\n    {body}\n")
+    assert mutate.verdict(mutate.Tests((str(file),))) == "broken"

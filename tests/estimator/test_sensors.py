@@ -538,6 +538,9 @@ def test_landmarks_are_placed_from_several_poses(label, sensor):
     error = belief.error(pose, LANDMARKS[list(belief.landmark_ids)])
     squared = error @ np.linalg.solve(belief.error_covariance(), error)
     assert squared < 13 * 2.5
+    slam.remove([0])
+    columns = [3 + 2 * slot for slot in slam.slots.values()]
+    np.testing.assert_array_equal(slam.map.mean[columns], slam.belief().landmarks[:, 0])
 
 
 def test_delayed_readings_of_bearing_and_range_wait_for_several_poses():

@@ -78,6 +78,14 @@ def test_evidence_against_a_mean_error_is_at_most_1_on_average_up_to_the_margin(
     assert (total <= 1 + 1e-6) == bool(fair)
 
 
+def test_evidence_against_a_mean_error_is_the_same_in_all_directions_of_the_grid():
+    errors = np.random.default_rng(2).normal(0.8, 1.0, (6, 2, 2))
+    cos, sin = np.cos(np.pi / 4), np.sin(np.pi / 4)
+    turned = errors @ np.array([[cos, sin], [-sin, cos]])
+    one, other = (MeanEProcess(0.3, 1.2).update(each) for each in (errors, turned))
+    np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
 @pytest.mark.parametrize("angle", np.linspace(0, 2 * np.pi, 9)[:-1] + 0.2)
 def test_a_mean_error_is_found_in_every_direction(angle):
     errors = np.random.default_rng(2).standard_normal((60, 1, 2))

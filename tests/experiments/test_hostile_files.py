@@ -335,6 +335,9 @@ def test_a_size_limit_names_the_file_in_its_final_folder(tmp_path):
     ):
         raise OSError(*limit)
     assert caught.value.filename == str(out / "map.png")
+    other = pytest.raises(OSError, match="File too large: 'other'")
+    with other, replace_when_written(tmp_path / "map.png"):
+        raise OSError(*limit, "other")
     unnamed = pytest.raises(OSError, match="out cannot be written: File too large")
     with unnamed, output_folder(out):
         raise OSError(*limit)

@@ -476,7 +476,7 @@ def test_true_poses_of_a_graph_are_taken_by_id(file, vertex):
 def test_true_poses_follow_from_exact_edges(file):
     exact = (
         f"EDGE2 0 1 2 0 {math.pi / 2}\nLANDMARK 1 2 1 2\nEDGE2 1 3 -3 1 0\n"
-        "LANDMARK 3 2 4 1\nLANDMARK 3 4 0 5\n"
+        "LANDMARK 3 2 4 1\nLANDMARK 0 4 -4 -3\n"
     )
     log = read_log(file(ISAM), truth=file(exact, "true.txt"))
     expected = [(0, 0, 0, 0), (1, 2, 0, np.pi / 2), (2, 1, -3, np.pi / 2)]

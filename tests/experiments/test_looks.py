@@ -12,6 +12,7 @@ from slamgym.evaluation.hypothesis_tests import EQUIVALENCE_MARGIN
 from slamgym.experiments.monte_carlo_study import (
     load_results,
     monte_carlo,
+    runner,
     summarise_monte_carlo,
 )
 from slamgym.experiments.monte_carlo_study.looks import Look, Watch, verdict_of, watched
@@ -322,7 +323,7 @@ def test_a_first_verdict_is_that_of_a_study_without_a_folder(tmp_path):
     assert "sequential" not in first["estimators"]["ekf"]
 
 
-def test_a_folder_counts_its_looks_and_a_repeated_one_once(tmp_path):
+def test_a_folder_counts_its_looks_and_a_repeated_one_once(tmp_path, monkeypatch):
     for runs in (16, 32, 32, 48):
         monte_carlo(**JOB, runs=runs, out=tmp_path).close()
     entry = summarise_monte_carlo(load_results(tmp_path))["estimators"]["invariant"]
@@ -330,6 +331,12 @@ def test_a_folder_counts_its_looks_and_a_repeated_one_once(tmp_path):
     assert "look 3, after verdicts on 16 and 32 runs" in entry["sentence"]
     with monte_carlo(**JOB, runs=48, out=tmp_path) as again:
         assert summarise_monte_carlo(again)["estimators"]["invariant"] == entry
+    counted = []
+    monkeypatch.setattr(runner, "error_rate_after", counted.extend)
+    with monte_carlo(**JOB, runs=48, first_run=16, out=tmp_path) as later:
+        assert "looks" not in later.attrs  # the others began with other runs
+    assert counted == []
+    assert json.loads((tmp_path / "job.json").read_text())["looks"][-1] == [16, 48, ""]
     with monte_carlo(**JOB, runs=48, out=tmp_path, fresh=True) as fresh:
         assert "looks" not in fresh.attrs
 

@@ -44,6 +44,7 @@ from slamgym.experiments.monte_carlo_study.run_measures import (
     identified,
 )
 from slamgym.experiments.monte_carlo_study.runner import python_call
+from slamgym.experiments.monte_carlo_study.summary import share
 from slamgym.experiments.run_and_replay.filter_settings import estimator_choices
 from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
@@ -221,9 +222,12 @@ def test_precision_is_compared_with_that_of_true_pose_and_map():
         expected = oracle_errors(runs.true_poses[run], *scans, *world)
         found = float(results.association_oracle_errors[0, run])
         assert 0.01 < expected == pytest.approx(found)
-    entry = summarise_monte_carlo(results)["estimators"]["invariant"]
+    summary = summarise_monte_carlo(results)
+    entry = summary["estimators"]["invariant"]
     mean = float(results.association_oracle_errors.mean())
     assert entry["association"]["oracle_errors"] == pytest.approx(mean)
+    (row,) = (m for m in measures(summary) if m.name == "… with true pose and map")
+    assert row.of(entry) == share(1 - mean)
 
 
 def test_a_report_shows_association_only_where_identities_are_hidden(hidden, whole):
@@ -342,6 +346,8 @@ def test_only_parts_of_one_job_are_merged(tmp_path):
         merge_blocks([tmp_path / "a"], tmp_path / "c")
     with pytest.raises(ValueError, match="first_run must be a multiple"):
         monte_carlo("six_landmarks", "ekf", 20, first_run=5)
+    with pytest.raises(ValueError, match="of block_size = 10 below runs = 20"):
+        monte_carlo("six_landmarks", "ekf", 20, first_run=20, block_size=10)
 
 
 @pytest.mark.usefixtures("own_registry")

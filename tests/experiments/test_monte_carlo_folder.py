@@ -334,6 +334,7 @@ def test_a_folder_of_submaps_is_refused_for_many_runs(tmp_path):
     with pytest.raises(ValueError, match="folder holds the submaps of one run: leave"):
         monte_carlo("six_landmarks", on_disk, 3, out=tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
+    assert not monte_carlo("six_landmarks", "submaps", 1).failed.any()
 
 
 THREADS = """

@@ -443,6 +443,12 @@ def test_true_paths_of_all_formats_are_the_same(file, name):
     np.testing.assert_allclose(np.diff(rows[:, 0]), 1, atol=1e-5)
 
 
+def test_a_true_path_of_numbers_may_have_any_number_of_rows(file):
+    rows = np.arange(24.0).reshape(6, 4) / 100
+    text = "".join("{} {} {} {}\n".format(*row) for row in rows.tolist())
+    np.testing.assert_array_equal(true_path(file(text, "path.txt")), rows)
+
+
 @pytest.mark.parametrize("name", ["tum", "kitti", "csv", "utias", "graph", "slamlog"])
 @pytest.mark.parametrize("kind", ["csv", "graph"])
 def test_the_truth_of_a_log_may_be_in_any_format(folder, file, name, kind):

@@ -187,6 +187,7 @@ def test_minari_loads_a_shard_and_makes_its_world_again(tmp_path, monkeypatch):
     env = data.recover_environment()
     for episode, drive in zip(data.iterate_episodes(), written, strict=True):
         assert episode.truncations.tolist() == [False] * 59 + [True]
+        assert not episode.terminations.any()
         observation, info = env.reset(seed=drive.seed)
         for step in range(61):
             seen = {k: v[step].tolist() for k, v in episode.observations.items()}
