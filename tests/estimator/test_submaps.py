@@ -12,7 +12,11 @@ from scipy.sparse import csc_array
 from town_drives import run
 
 from slamgym.estimator import EkfSlam, InvariantEkfSlam, check_estimator
-from slamgym.estimator.large_maps.elimination import SubmapElimination, dissect
+from slamgym.estimator.large_maps.elimination import (
+    SubmapElimination,
+    common_ancestor,
+    dissect,
+)
 from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.large_maps.submaps.factor import (
     Gaussian,
@@ -773,3 +777,10 @@ def test_rounding_makes_no_variance_negative():
         slam = SubmapSlam((0.1, 0.0, 0.05), (0.1, 0.1))
         slam.predict((distance, turn))
         assert (slam.belief().covariance.diagonal() >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "both"), [(11, 8, 2), (5, 11, 5), (2, 3, 1), (6, 6, 6)]
+)
+def test_the_common_ancestor_of_two_nodes_is_the_deepest_one(one, other, both):
+    assert common_ancestor(one, other) == common_ancestor(other, one) == both

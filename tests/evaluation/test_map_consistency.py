@@ -29,6 +29,14 @@ def test_a_mean_error_that_is_hidden_in_the_squares_is_rejected():
     assert found.mean_p_values.min() < found.p_values.min()
 
 
+def test_a_landmark_that_some_maps_lack_is_tested_over_the_others():
+    errors = HONEST.copy()
+    errors[60:, 3] = np.nan
+    found, alone = map_test(errors), map_test(HONEST[:60])
+    assert found.p_values[3] == alone.p_values[3]
+    assert found.mean_p_values[3] == alone.mean_p_values[3]
+
+
 def test_wrong_covariances_between_landmarks_are_rejected_by_the_whole_map():
     nees, freedom = 2 * (HONEST**2).sum(axis=(1, 2)), np.full(100, 40)
     assert not map_test(HONEST, nees, freedom).accepted
