@@ -68,7 +68,8 @@ def specialised(
 def _recompiled(function: Any, like: Any) -> Any:
     """Compile a function with the options of another one."""
     options = {k: v for k, v in like.targetoptions.items() if k != "nopython"}
-    kernel = njit(**options)(function)
+    pipeline = like._compiler.pipeline_class
+    kernel = njit(**options, pipeline_class=pipeline)(function)
     return kept(kernel) if "_nrt" in options else kernel  # else not one of `.jit`
 
 

@@ -451,6 +451,18 @@ def test_comments_and_places_do_not_change_the_name_of_a_kernel():
     assert name_with(moved) == name_with(USER)
 
 
+def test_a_kernel_has_the_environment_of_the_functions_below_it():
+    @njit_allocating
+    def refuse(value):
+        if value > 3:
+            raise ValueError("too large", value)
+        return value
+
+    with pytest.raises(ValueError, match="too large") as error:
+        jit(lambda value: refuse(value) + 1)(4.0)
+    assert error.value.args == ("too large", 4.0)
+
+
 @pytest.mark.parametrize("decorate", [njit_internal, njit_apart])
 def test_the_compiler_knows_which_arrays_are_apart(decorate):
     def add(target, more):
