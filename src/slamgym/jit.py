@@ -95,7 +95,7 @@ class InternalCode(codegen.JITCodeLibrary):
     """Code of a function that only kernels call, without machine code of its own.
 
     A kernel contains the code of all functions below it, optimised together.  To do so
-    in each of these functions, too, takes half as long again.
+    in each of these functions, too, takes a quarter more time.
     """
 
     def _optimize_final_module(self) -> None:
