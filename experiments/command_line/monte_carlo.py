@@ -288,7 +288,8 @@ def _naming_loss(client: Any, address: str) -> Iterator[None]:
 
     def end_if_lost() -> None:
         if client.status == "closed":  # it has tried for 30 s
-            interrupt_main(signal.SIGTERM)  # a job in the background ignores SIGINT
+            is_deaf = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+            interrupt_main(signal.SIGTERM if is_deaf else signal.SIGINT)
 
     with client:
         try:

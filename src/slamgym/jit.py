@@ -52,7 +52,7 @@ def jit_in_place(function: Kernel) -> Kernel:
 
 
 def njit_internal(function: Kernel) -> Kernel:
-    """Compile a function that only kernels call, in about half the time (`Internal`).
+    """Compile a function that only kernels call, in less time.
 
     As :func:`jit_in_place`, it allocates no arrays, returns none and calls no kernel
     that returns any.  Python can call its ``py_func``.
@@ -94,8 +94,8 @@ def njit_inlined(function: Kernel) -> Kernel:
 class InternalCode(codegen.JITCodeLibrary):
     """Code of a function that only kernels call, without machine code of its own.
 
-    A kernel contains the code of all functions below it, optimised together.  To do so
-    in each of these functions, too, takes a quarter more time.
+    A kernel contains the code of all functions below it, optimised together.  To
+    optimise each of these functions by itself, too, takes a quarter more time.
     """
 
     def _optimize_final_module(self) -> None:
@@ -118,11 +118,11 @@ class InternalCode(codegen.JITCodeLibrary):
 
     @property
     def codegen(self) -> "InternalCode":
-        """What numba passes the environment of the function to."""
+        """The object whose `set_env` numba calls."""
         return self
 
     def set_env(self, _name: str, _environment: Any) -> None:
-        """Do nothing: a kernel has the environments of all functions below it."""
+        """Do nothing: a `KernelCache` sets those of all functions below a kernel."""
 
 
 class Internal(compiler.Compiler):
@@ -155,6 +155,7 @@ def _compile(
         "noalias": apart,
         "_nrt": counted,
     }
+    # The order of sums is chosen once, in the function's own code.
     if not (callable_from_python or reordered):
         options["pipeline_class"] = Internal
     return cast("Kernel", kept(njit(**options)(function)))

@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import data_equivalence
 from slamgym import make_estimator
 from slamgym.agents import ActiveSlamEnv, ActiveSlamVectorEnv
 from slamgym.envs import LandmarkWorldEnv
-from slamgym.envs.vector import LandmarkWorldVectorEnv
+from slamgym.envs.vector import LandmarkWorldVectorEnv, world_batch
 from slamgym.sim_configs import list_presets
 
 PRESETS = [name for name in list_presets() if name != "city"]
@@ -50,7 +50,8 @@ def check(env, seed, *, before=7, after=50):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
-def test_worlds_continue_from_a_state_to_the_bit(name):
+def test_worlds_continue_from_a_state_to_the_bit(name, monkeypatch):
+    monkeypatch.setattr(world_batch, "_READINGS_AT_ONCE", 500)  # several blocks
     check(LandmarkWorldEnv(name), 3)
     for count, mode in ((100, "NextStep"), (3, "SameStep")):
         check(LandmarkWorldVectorEnv(count, name, autoreset_mode=mode), 5)

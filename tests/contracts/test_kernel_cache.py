@@ -290,6 +290,16 @@ def test_a_damaged_file_is_compiled_again(room, tmp_path, kind, size):
     assert answer(room) == (7, 1)
 
 
+@pytest.mark.slow
+def test_a_kernel_is_compiled_with_functions_from_the_cache(room, tmp_path):
+    code = ASK.replace("import answer", "import answer, twice")
+    code = code.replace("answer.stats", "twice.stats")
+    assert answer(room, code) == (7, 0)
+    (index,) = kept(tmp_path, "nbi")
+    index.unlink()
+    assert answer(room, code) == (7, 1)
+
+
 def test_the_states_used_last_are_kept_and_nothing_of_others_is_deleted(
     tmp_path, monkeypatch
 ):

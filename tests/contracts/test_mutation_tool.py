@@ -80,8 +80,13 @@ def test_explanations_are_of_functions_that_exist(mutate):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the tool forks")
-@pytest.mark.parametrize("body", ["assert False", "pytest.skip()"])
-def test_tests_that_fail_anyway_or_are_skipped_judge_no_mutant(mutate, body, tmp_path):
+@pytest.mark.parametrize(
+    ("body", "verdict"),
+    [("assert False", "broken"), ("pytest.skip()", "broken"), ("pass", "survived")],
+)
+def test_tests_that_fail_anyway_or_are_skipped_judge_no_mutant(
+    mutate, body, verdict, tmp_path
+):
     file = tmp_path / "test_it.py"
     file.write_text(f"import pytest\n\n\ndef test_it():\n    {body}\n")
-    assert mutate.verdict(mutate.Tests((str(file),))) == "broken"
+    assert mutate.verdict(mutate.Tests((str(file),))) == verdict

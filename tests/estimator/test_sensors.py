@@ -12,7 +12,7 @@ from comparison import assert_close_beliefs, assert_same_bits, digest
 from dense_ekf import DenseEkf
 from far_origins import far_origins, rounding, shifted
 from numeric_jacobian import numeric_jacobian
-from own_noise import OWN_NOISE, SHIPPED_NOISE
+from own_noise import OWN_NOISE
 from scipy.optimize import least_squares
 
 from slamgym.estimator import (
@@ -179,7 +179,8 @@ def test_every_filter_equals_the_dense_oracle(label, sensor):
 def test_the_default_sensor_made_as_ones_own_gives_the_same_belief(label):
     rng = np.random.default_rng(5)
     noise = {"motion_std": MOTION, "measurement_std": (0.03, 0.1), "min_range": 0.5}
-    sensors = SHIPPED_NOISE, OWN_NOISE
+    noise |= {"range_std_per_metre": 0.02, "bearing_std_metres": 0.1}
+    sensors = BEARING_RANGE, OWN_NOISE
     both = [make_estimator(label, **noise, sensor=sensor) for sensor in sensors]
     for _ in range(6):
         z = reading(BEARING_RANGE, np.zeros(3), LANDMARKS, rng)

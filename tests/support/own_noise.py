@@ -8,10 +8,9 @@ from slamgym.estimator.models.sensors import BEARING_RANGE
 
 
 def grown_std(noise, distance):
-    """Return the deviations as an array; that of the range grows with the range."""
-    return np.array([noise[0] + 0.0 * distance, noise[1] + 0.05 * distance])
+    """Return the deviations as an array; they change with the range."""
+    return np.array([noise[0] + noise[3] / distance, noise[1] + noise[2] * distance])
 
 
-OWN_NOISE = replace(BEARING_RANGE, name="own_noise", std=grown_std)
-#: The same noise from the default sensor.
 SHIPPED_NOISE = BEARING_RANGE.with_noise(range_std_per_metre=0.05)
+OWN_NOISE = replace(SHIPPED_NOISE, name="own_noise", std=grown_std)
