@@ -13,7 +13,7 @@ import shutil
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache, cached_property
 from pathlib import Path
 from types import FunctionType
@@ -101,16 +101,19 @@ class InternalCode(codegen.JITCodeLibrary):
     def _optimize_final_module(self) -> None:
         pass
 
-    def _finalize_final_module(self) -> None:
-        code: Any = self
-        code._finalize_dynamic_globals()
-        code._verify_declare_only_symbols()
-        code._finalized = True
+    def _finalize_final_module(self: Any) -> None:
+        self._finalize_dynamic_globals()
+        self._verify_declare_only_symbols()
+        self._finalized = True
 
-    def serialize_using_object_code(self) -> tuple[str, str, bytes]:
+    def serialize_using_object_code(self: Any) -> tuple[str, str, bytes]:
         """Return what the cache keeps, and :meth:`_Results.rebuild` reads."""
-        code: Any = self
-        return self.name, _INTERNAL, code._get_module_for_linking().as_bitcode()
+        return self.name, _INTERNAL, self._get_module_for_linking().as_bitcode()
+
+    def load(self: Any, bitcode: bytes) -> None:
+        """Take the code that the cache has kept."""
+        self._final_module = cast("Any", codegen).ll.parse_bitcode(bitcode)
+        self.finalize()
 
     def get_pointer_to_function(self, _name: str) -> int:
         """Return the null pointer: Python cannot call the function."""
@@ -155,10 +158,14 @@ def _compile(
         "noalias": apart,
         "_nrt": counted,
     }
+    return cast("Kernel", kept(njit(**options, **compiler_for(options))(function)))
+
+
+def compiler_for(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the option of numba for its compiler, by those of a function."""
     # The order of sums is chosen once, in the function's own code.
-    if not (callable_from_python or reordered):
-        options["pipeline_class"] = Internal
-    return cast("Kernel", kept(njit(**options)(function)))
+    is_internal = options.get("no_cpython_wrapper") and not options.get("fastmath")
+    return {"pipeline_class": Internal} if is_internal else {}
 
 
 def kept(kernel: Any) -> Any:
@@ -413,8 +420,7 @@ class _Results(caching.CompileResultCacheImpl):
         if kind != _INTERNAL:
             return cast("Any", super()).rebuild(target_context, payload)
         library = cast("Any", InternalCode)(target_context.codegen(), name)
-        library._final_module = cast("Any", codegen).ll.parse_bitcode(code)
-        library.finalize()
+        library.load(code)
         parts = dict(zip(_PARTS, others, strict=True))
         for initialise in parts["reload_init"]:
             initialise()

@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from numba import njit
 
-from .jit import Kernel, kept
+from .jit import Kernel, compiler_for, kept
 
 #: Libraries whose versions count in the digest, not their sources.
 LIBRARIES = ("builtins", "math", "numba", "numpy")
@@ -68,8 +68,7 @@ def specialised(
 def _recompiled(function: Any, like: Any) -> Any:
     """Compile a function with the options of another one."""
     options = {k: v for k, v in like.targetoptions.items() if k != "nopython"}
-    pipeline = like._compiler.pipeline_class
-    kernel = njit(**options, pipeline_class=pipeline)(function)
+    kernel = njit(**options, **compiler_for(options))(function)
     return kept(kernel) if "_nrt" in options else kernel  # else not one of `.jit`
 
 
