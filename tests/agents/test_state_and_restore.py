@@ -59,7 +59,8 @@ def test_worlds_continue_from_a_state_to_the_bit(name, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FLOORS)
-def test_worlds_with_filters_continue_from_a_state_to_the_bit(name):
+def test_worlds_with_filters_continue_from_a_state_to_the_bit(name, monkeypatch):
+    monkeypatch.setattr(world_batch, "_READINGS_AT_ONCE", 500)  # several blocks
     after = 15 if name == "active_hidden" else 50
     check(ActiveSlamEnv(name), 3, after=after)
     worlds = 3 if name == "active_hidden" else 100

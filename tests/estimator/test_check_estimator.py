@@ -45,12 +45,18 @@ class TurnsBeforeItDrives(EkfSlam):
         super().predict((d, 0.0), 0.0)
 
 
-class AnswersWithALiveCovariance(EkfSlam):
-    def belief(self):
-        belief = super().belief()
-        self._live = getattr(self, "_live", belief)
-        object.__setattr__(self._live, "covariance", belief.covariance)
-        return belief
+def answers_with_live(*names):
+    """Return a filter whose first belief follows its later ones in these arrays."""
+
+    class Answers(EkfSlam):
+        def belief(self):
+            belief = super().belief()
+            self._live = getattr(self, "_live", belief)
+            for name in names:
+                object.__setattr__(self._live, name, getattr(belief, name))
+            return self._live
+
+    return Answers
 
 
 class AcceptsNan(EkfSlam):
@@ -232,7 +238,9 @@ class NeverGrowsCertain(EkfSlam):
         ),
         (StartsTooCertain, r"0\.09\]\], got \[\[0\.0, 0\.0, 0\.0\]"),
         (TurnsBeforeItDrives, "drive d along the old heading"),
-        (AnswersWithALiveCovariance, "snapshot"),
+        (answers_with_live("mean"), "snapshot"),
+        (answers_with_live("covariance"), "snapshot"),
+        (answers_with_live("mean", "covariance", "landmark_ids"), "snapshot"),
         (IgnoresBearings, "new landmarks: the bearing has the wrong sign: mean"),
         (Overconfident, "the covariance is multiplied by 0.0025: "),
         (NeverGrowsCertain, r"update\(\): the covariance is not updated: "),

@@ -119,7 +119,12 @@ def test_solution_cost_and_covariances_are_those_of_dense_least_squares(example)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("sensor", "std"),
-    [(POSITION, (0.1, 0.2)), (BEARING, (0.03,)), (SENSORS["range"], (0.1,))],
+    [
+        (OWN_NOISE.with_noise(range_std_per_metre=0.0), MEASUREMENT_STD),
+        (POSITION, (0.1, 0.2)),
+        (BEARING, (0.03,)),
+        (SENSORS["range"], (0.1,)),
+    ],
     ids=lambda value: getattr(value, "name", None),
 )
 def test_other_sensors_are_smoothed_as_by_dense_least_squares(sensor, std):
