@@ -95,7 +95,7 @@ class InternalCode(codegen.JITCodeLibrary):
     """Code of a function that only kernels call, without machine code of its own.
 
     A kernel contains the code of all functions below it, optimised together.  To
-    optimise each of these functions by itself, too, takes a quarter more time.
+    optimise each of these functions by itself, too, would take longer.
     """
 
     def _optimize_final_module(self) -> None:
