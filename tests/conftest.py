@@ -42,8 +42,8 @@ def pytest_runtestloop():
     gc.enable()
 
 
-# Where little is compiled.  Of two workers the first begins with the first half of the
-# tests: it goes on there while the other one compiles the filters, else both would.
+# Where little is compiled.  Each worker begins with its share of the list: the first
+# go on there while the last one compiles the filters, else all of them would.
 _FIRST = ("tests/envs/", "tests/sim_configs/", "src/", "tests/experiments/")
 
 
@@ -71,6 +71,12 @@ class Passed:
 
 
 _PASSED = "slamgym/passed"
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers():
+    """Take one worker more than cores: tests wait for the processes that they start."""
+    return (os.cpu_count() or 1) + 1
 
 
 def pytest_configure(config):
