@@ -8,12 +8,14 @@
 
 Each mutant runs the tests that TESTS names for its file, in a process of its own that
 loads the changed text in place of the file; no file is written. The kernels of PLAIN
-run as plain Python, and others that a mutant changes are compiled anew. A test that
-fails must pass without the mutant. Verdicts are kept in ``results/mutants.jsonl``, and
-a stopped run continues where it was. The mutants that survive are listed; those in
-``mutants_explained.txt`` have no effect that matters, for the reason given there.
-mutmut and cosmic-ray write each mutant to disk and start Python and numba anew, which
-would take most of the time here.
+run as plain Python, and others that a mutant changes are compiled anew. If it survives
+them, all kernels are compiled, and the tests with the mark slow and the examples in the
+file judge it, too. A test that fails must pass without the mutant.
+
+Verdicts are kept in ``results/mutants.jsonl``, and a stopped run continues where it
+was. The mutants that survive are listed; those in ``mutants_explained.txt`` have no
+effect that matters, for the reason given there. mutmut and cosmic-ray write each mutant
+to disk and start Python and numba anew, which would take most of the time here.
 """
 
 import argparse
@@ -44,6 +46,7 @@ class Tests(NamedTuple):
 
     files: tuple[str, ...]
     plain: bool = False
+    slow: bool = False  # whether also those that carry this mark
 
 
 SCANS = "association decisions symmetries map_management hypotheses loop_closing"
@@ -238,6 +241,12 @@ def preload() -> None:
     import scipy.stats  # noqa: F401
 
 
+def all_tests_of(file: str) -> Tests:
+    """Return what judges the mutants that survive the other tests of a file."""
+    examples = f"src/slamgym/{file.removeprefix('src/slamgym/')}"
+    return Tests((examples, *tests_of(file).files), slow=True)
+
+
 def verdict(tests: Tests, file: str = "", text: str = "", function: str = "") -> str:
     """Run tests with another text of a file: killed, survived, or timeout.
 
@@ -245,7 +254,8 @@ def verdict(tests: Tests, file: str = "", text: str = "", function: str = "") ->
     is broken.
     """
     code, failed = _in_a_fork(tests, file, text, function)
-    if code == pytest.ExitCode.TESTS_FAILED and not _passes(failed, plain=tests.plain):
+    alone = tests._replace(files=(failed,))
+    if code == pytest.ExitCode.TESTS_FAILED and not _passes(alone):
         return "broken"
     return "timeout" if code < 0 else OUTCOMES.get(code, "broken")
 
@@ -274,9 +284,9 @@ def _in_a_fork(
 
 
 @cache
-def _passes(test: str, *, plain: bool) -> bool:
-    """Whether a test passes without a mutant."""
-    return _in_a_fork(Tests((test,), plain))[0] == pytest.ExitCode.OK
+def _passes(tests: Tests) -> bool:
+    """Whether tests pass without a mutant."""
+    return _in_a_fork(tests)[0] == pytest.ExitCode.OK
 
 
 class _Notes:
@@ -306,7 +316,8 @@ def _run(tests: Tests, file: str, text: str, function: str, failed: str) -> None
         _load_instead(ROOT / file, text)
         _compile_anew(file, function)
     os.chdir(ROOT)
-    options = ["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", "--tb=no"]
+    options = ["-x", "-q", "-p", "no:cacheprovider", "--tb=no"]
+    options += [] if tests.slow else ["-m", "not slow"]
     options += ["-k", NOT_PLAIN] if tests.plain else []
     notes = _Notes(failed)
     code = pytest.main([*options, *tests.files], [notes])
@@ -433,6 +444,8 @@ def _judged(file: str, mutant: Mutant) -> str:
     outcome = verdict(tests, file, changed, mutant.function)
     if outcome != "survived":
         return outcome
+    if verdict(all_tests_of(file), file, changed, mutant.function) == "killed":
+        return "killed"
     _, function, line, change = key_of(file, mutant)
     if f"{file}:{function}: {change}" in explained():
         return "explained"

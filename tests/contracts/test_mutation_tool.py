@@ -90,3 +90,15 @@ def test_tests_that_fail_anyway_or_are_skipped_judge_no_mutant(
     file = tmp_path / "test_it.py"
     file.write_text(f"import pytest\n\n\ndef test_it():\n    {body}\n")
     assert mutate.verdict(mutate.Tests((str(file),))) == verdict
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the tool forks")
+def test_what_survives_is_judged_by_slow_tests_and_by_examples(mutate, tmp_path):
+    file = "src/slamgym/suggestions.py"
+    tests = mutate.all_tests_of(file)
+    assert {*mutate.tests_of(file).files} < {*tests.files}
+    assert mutate.verdict(tests._replace(files=(tests.files[0],))) == "survived"
+    slow = tmp_path / "test_it.py"
+    slow.write_text("import pytest\n\n\n@pytest.mark.slow\ndef test_it():\n    pass\n")
+    assert mutate.verdict(mutate.Tests((str(slow),))) == "broken"  # none ran
+    assert mutate.verdict(tests._replace(files=(str(slow),))) == "survived"
