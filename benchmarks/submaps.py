@@ -18,15 +18,18 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
+import math
 import resource
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from copy import deepcopy
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
+from interleaved import verdict
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -42,8 +45,10 @@ Int = NDArray[np.int64]
 
 MOTION_STD, MEASUREMENT_STD = np.array([0.04, 0.02, 0.01]), np.array([0.01, 0.05])
 SEEN, STEP, ROWS_APART = 10, 2.0, 14.0
-SIZES = (1_000, 3_000, 10_000, 30_000, 100_000)
-CONSOLE = Console(width=130)
+SIZES = (1_000, 2_000, 3_000, 10_000, 30_000, 100_000)
+GOALS = {1_000: 50.0, 2_000: 200.0}  # ms, of the first belief of all landmarks
+GROWTH = 2.0  # exponent of its time
+CONSOLE = Console(width=140)
 
 
 class Reading(NamedTuple):
@@ -67,6 +72,7 @@ class Row(NamedTuple):
     local: float  # ms: local_belief()
     join: float  # s: the first belief of a few landmarks, which joins
     again: float  # ms: another
+    first: float  # ms: the first belief of all landmarks, which joins
     whole: float  # ms: the belief of all landmarks, after the join
     filter_mb: float
     process_mb: float
@@ -136,17 +142,16 @@ def _row(slam: SubmapSlam, times: list[float], pose: Array, landmarks: Array) ->
     at_once = time.thread_time() - began
     known = np.array(slam.landmark_ids)
     some = np.random.default_rng(2).choice(known, 100, replace=False)
+    first = whole = np.nan
+    if len(known) <= slam.belief_limit:
+        # A copy has joined nothing; the first one also compiles, and takes new memory.
+        first = median([seconds(deepcopy(slam).belief) for _ in range(3)])
     began = time.thread_time()
     belief = slam.belief(some)
     joining = time.thread_time() - began
-    began = time.thread_time()
-    slam.belief(some)
-    again = time.thread_time() - began
-    whole = np.nan
+    again = seconds(lambda: slam.belief(some))
     if len(known) <= slam.belief_limit:
-        began = time.thread_time()
-        slam.belief()
-        whole = time.thread_time() - began
+        whole = seconds(slam.belief)
     error = belief.error(pose, landmarks[some])
     nees = error @ np.linalg.solve(belief.error_covariance(), error) / len(error)
     nbytes = slam.nbytes
@@ -161,6 +166,7 @@ def _row(slam: SubmapSlam, times: list[float], pose: Array, landmarks: Array) ->
         1e3 * at_once,
         joining,
         1e3 * again,
+        1e3 * first,
         1e3 * whole,
         nbytes / 1e6,
         _largest_memory(),
@@ -169,6 +175,27 @@ def _row(slam: SubmapSlam, times: list[float], pose: Array, landmarks: Array) ->
         float(np.sqrt(((belief.landmarks - landmarks[some]) ** 2).sum(1).mean())),
         float(nees),
     )
+
+
+def seconds(call: Callable[[], object]) -> float:
+    """Return the CPU time of a call."""
+    began = time.thread_time()
+    call()
+    return time.thread_time() - began
+
+
+def judge(rows: list[Row]) -> None:
+    """Print the times of the first belief beside their goals."""
+    found = {n: row.first for n in GOALS for row in rows if abs(row.landmarks - n) < 50}
+    for size, most in GOALS.items():
+        if size in found:
+            said = verdict(found[size], most, at_least=False)
+            print(f"{size}, first belief(): {found[size]:.0f} ms (<= {most:g}: {said})")
+    if len(found) > 1:
+        small, large = GOALS
+        power = math.log(found[large] / found[small]) / math.log(large / small)
+        said = verdict(power, GROWTH, at_least=False)
+        print(f"growth with the size: n^{power:.2f} (<= {GROWTH:g}: {said})")
 
 
 def _largest_memory() -> float:
@@ -193,6 +220,7 @@ COLUMNS = (
     ("local belief, ms", "{:.2f}"),
     ("join, s", "{:.2f}"),
     ("again, ms", "{:.0f}"),
+    ("first all, ms", "{:.0f}"),
     ("all, ms", "{:.0f}"),
     ("filter, MB", "{:.0f}"),
     ("process, MB", "{:.0f}"),
@@ -260,6 +288,7 @@ def main() -> None:
     sizes = [n for n in SIZES if given.smallest <= n <= given.largest]
     rows = [measure(n, given.submap_size, given.folder) for n in sizes]
     show(rows, markdown=given.markdown)
+    judge(rows)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from ...arrays import Array, BoolArray, IntArray
+from ...jit import jit_in_place
 from .multifrontal import (
     InformationMatrix,
     Node,
@@ -481,40 +482,82 @@ def dissect(unknowns: Sequence[IntArray], positions: Array) -> list[Part]:
         Positions of the submaps [m]; they affect only the cost.
     """
     touches = np.bincount(np.concatenate(unknowns))
-    row = np.empty(len(touches), dtype=np.int64)
+    scratch = np.full(len(touches), -1)
     parts: list[Part] = []
 
     def close(
         submap: int, pieces: Sequence[tuple[IntArray, IntArray]]
     ) -> tuple[IntArray, IntArray]:
         """Join pieces (unknowns, number of submaps inside that touch each)."""
-        every = np.concatenate([piece[0] for piece in pieces])
-        union = np.flatnonzero(among(every, len(touches)))
-        row[union] = np.arange(len(union))
-        places = row[every]
-        weights = np.concatenate([piece[1] for piece in pieces])
-        inside = np.bincount(places, weights).astype(np.int64)
-        done = inside == touches[union]
-        order = np.empty(len(union), dtype=np.int64)
-        order[np.argsort(~done, kind="stable")] = np.arange(len(union))
-        cuts = np.cumsum([len(piece[0]) for piece in pieces])[:-1]
-        where = tuple(np.split(order[places], cuts))
-        parts.append(Part(submap, union[done], union[~done], where))
-        return union[~done], inside[~done]
+        every, weights = (np.concatenate(each) for each in zip(*pieces, strict=True))
+        found = np.empty((3, len(every)), dtype=np.int64)
+        done, n = _join(every, weights, touches, scratch, found)
+        places, order, inside = found
+        where = (places[: len(pieces[0][0])], places[len(pieces[0][0]) :])
+        parts.append(Part(submap, order[:done], order[done:n], where[: len(pieces)]))
+        return order[done:n], inside[done:n]
 
     def halve(chosen: IntArray) -> tuple[IntArray, IntArray]:
         if len(chosen) == 1:
             touched = unknowns[chosen[0]]
             return close(int(chosen[0]), [(touched, np.ones_like(touched))])
-        halves = _halves(chosen, unknowns, positions, len(touches))
+        halves = _halves(chosen, unknowns, positions, scratch)
         return close(-1, [halve(half) for half in halves])
 
     halve(np.arange(len(unknowns)))
     return parts
 
 
+@jit_in_place
+def _join(
+    every: IntArray,
+    weights: IntArray,
+    touches: IntArray,
+    row: IntArray,
+    found: IntArray,
+) -> tuple[int, int]:
+    """Write the union of unknowns, those first that are touched inside alone.
+
+    Parameters
+    ----------
+    every, weights : ndarray, shape (m,)
+        Unknowns, and numbers of submaps inside.
+    touches : ndarray, shape (N,)
+        Numbers of all submaps that touch each unknown.
+    row : ndarray, shape (N,)
+        Scratch of -1, before and after.
+    found : ndarray, shape (3, m)
+        On return, the place of each of ``every`` in the union, the union of n unknowns,
+        and the number of submaps inside that touch each of them.
+
+    Returns
+    -------
+    done, n
+        How many unknowns are touched inside alone, and all.
+    """
+    places, order, inside = found[0], found[1], found[2]
+    n = done = 0
+    for k in range(len(every)):
+        if row[every[k]] < 0:
+            row[every[k]], order[n], inside[n] = n, every[k], 0
+            n += 1
+        inside[row[every[k]]] += weights[k]
+    for i in range(n):
+        if inside[i] == touches[order[i]]:
+            order[i], order[done] = order[done], order[i]
+            inside[i], inside[done] = inside[done], inside[i]
+            done += 1
+    for i in range(n):
+        row[order[i]] = i
+    for k in range(len(every)):
+        places[k] = row[every[k]]
+    for i in range(n):
+        row[order[i]] = -1
+    return done, n
+
+
 def _halves(
-    chosen: IntArray, unknowns: Sequence[IntArray], positions: Array, size: int
+    chosen: IntArray, unknowns: Sequence[IntArray], positions: Array, scratch: IntArray
 ) -> tuple[IntArray, IntArray]:
     """Cut along x or y, whichever leaves fewer unknowns on both sides."""
     middle = len(chosen) // 2
@@ -522,16 +565,21 @@ def _halves(
     for axis in range(2):
         order = chosen[np.argsort(positions[chosen, axis], kind="stable")]
         one, other = (
-            among(np.concatenate([unknowns[k] for k in half]), size)
+            np.concatenate([unknowns[k] for k in half])
             for half in (order[:middle], order[middle:])
         )
-        cuts.append((np.count_nonzero(one & other), order))
+        cuts.append((_count_common(one, other, scratch), order))
     order = min(cuts, key=lambda cut: cut[0])[1]
     return order[:middle], order[middle:]
 
 
-def among(these: IntArray, size: int) -> BoolArray:
-    """Return which of the numbers 0 … size - 1 occur in ``these``, shape (size,)."""
-    found = np.zeros(size, dtype=bool)
-    found[these] = True
-    return found
+@jit_in_place
+def _count_common(one: IntArray, other: IntArray, row: IntArray) -> int:
+    """Count the numbers that occur in both; ``row`` is a scratch of -1."""
+    common = 0
+    row[one] = 0
+    for each in other:
+        if row[each] == 0:
+            common, row[each] = common + 1, 1
+    row[one] = -1
+    return common

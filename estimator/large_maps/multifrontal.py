@@ -27,7 +27,7 @@ from scipy.linalg import lapack
 from scipy.sparse import bsr_array, csc_array
 
 from ...arrays import Array, BoolArray, IntArray
-from ...jit import jit, jit_in_place
+from ...jit import jit
 from ..guards import saved_states
 
 
@@ -213,21 +213,6 @@ def append(covariance: Array, done: int, at: IntArray, T: Array, noise: Array) -
     own = noise + rows[:, at] @ T.T
     covariance[new, :done], covariance[:done, new] = rows, rows.T
     covariance[new, new] = (own + own.T) / 2
-
-
-def permuted(covariance: Array, order: IntArray) -> Array:
-    """Return a matrix with rows and columns in this order, in one pass over memory."""
-    found = np.empty((len(order),) * 2)
-    _permute(covariance, order, found)
-    return found
-
-
-@jit_in_place
-def _permute(matrix: Array, order: IntArray, found: Array) -> None:
-    for i in range(len(order)):
-        row = matrix[order[i]]
-        for j in range(len(order)):
-            found[i, j] = row[order[j]]
 
 
 def solved(lower: Array, right: Array, *, transposed: bool = False) -> Array:
@@ -423,14 +408,14 @@ def _check_rows(counts: IntArray, links: IntArray, blocks: Array) -> None:
         raise ValueError("state['matrix_blocks'] must be a symmetric matrix")
 
 
-_ROWS = 128  # that are copied at a time
+AT_ONCE = 128  # rows that are copied at a time
 
 
 def symmetric(covariance: Array) -> Array:
     """Copy the lower half into the upper one, in place."""
     n = len(covariance)
-    for first in range(0, n, _ROWS):
-        last = min(first + _ROWS, n)
+    for first in range(0, n, AT_ONCE):
+        last = min(first + AT_ONCE, n)
         own = covariance[first:last, first:last]
         own[:] = np.tril(own) + np.tril(own, -1).T
         covariance[first:last, last:] = covariance[last:, first:last].T

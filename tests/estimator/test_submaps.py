@@ -22,6 +22,7 @@ from slamgym.estimator.large_maps.submaps.factor import (
     Gaussian,
     factor_error,
     inverse_spread,
+    quadratic,
     retract,
 )
 from slamgym.estimator.large_maps.submaps.graph import fuse
@@ -387,6 +388,20 @@ def test_the_derivative_of_a_relation_is_that_of_differences(frame, turn):
     expected = numeric_jacobian(error, np.concatenate([start, state]))
     found = factor_error(start, state, mean, frame).jacobian
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("frame", ["additive", "invariant"])
+@pytest.mark.parametrize("fixed", [0, 3])
+def test_a_submap_is_the_square_of_its_error_as_dense_products_compute_it(frame, fixed):
+    rng = np.random.default_rng(5)
+    start, state, mean = rng.normal(size=3), 3 * rng.normal(size=9), rng.normal(size=9)
+    found = factor_error(start, state, mean, frame)
+    error, J = found.error, found.jacobian[:, 3 - fixed :]
+    information = (root := np.tril(rng.normal(size=(9, 9)))).T @ root
+    H, g, cost = quadratic(found, root, information, is_first=fixed == 0)
+    np.testing.assert_allclose(np.triu(H), np.triu(J.T @ information @ J), atol=1e-12)
+    np.testing.assert_allclose(g, -J.T @ information @ error, atol=1e-12)
+    assert cost == pytest.approx(error @ information @ error, rel=1e-12)
 
 
 @pytest.mark.parametrize("frame", ["additive", "invariant"])

@@ -17,20 +17,38 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ....arrays import Array, ComplexArray
+from ....arrays import Array, ComplexArray, IntArray
 from ....jit import jit_in_place, njit_internal
 from ...models.bearing_range import wrap_angle
 from ...models.rigid_motion import ErrorFrame, points_of, state_of
+from ..elimination import Quadratic
 
 # Lower bound of a standard deviation, relative to the largest of the submap.
 SMALLEST_RATIO = 1e-5
 
 
 class FactorError(NamedTuple):
-    """Error of a submap against the world, and its Jacobian."""
+    """Error of a submap against the world, and its derivatives."""
 
-    error: Array  # e, shape (3 + 2n,)
-    jacobian: Array  # ∂e/∂(F_k, F_{k+1}, landmarks), shape (3 + 2n, 6 + 2n)
+    #: ∂e/∂F_k, ∂e/∂θ_{k+1} and e, shape (3 + 2n, 5).
+    columns: Array
+    #: C, the derivative of each point's error by the point itself.
+    across: complex
+
+    @property
+    def error(self) -> Array:
+        """e, shape (3 + 2n,)."""
+        return self.columns[:, 4]
+
+    @property
+    def jacobian(self) -> Array:
+        """∂e/∂(F_k, F_{k+1}, landmarks), shape (3 + 2n, 6 + 2n)."""
+        size = len(self.columns)
+        points = np.delete(np.arange(size), 2)
+        jacobian = np.zeros((size, 3 + size))
+        jacobian[points[:, None], 3 + points] = times(self.across, np.eye(size - 1))
+        jacobian[:, [0, 1, 2, 5]] = self.columns[:, :4]
+        return jacobian
 
 
 def factor_error(
@@ -62,29 +80,23 @@ def factor_error(
     >>> factor_error(np.zeros(3), world, np.array([1.0, 0.0, 0.0, 2.0, 0.0])).error
     array([0., 0., 0., 1., 0.])
     """
-    turn, size = float(wrap_angle(state[2] - start[2] - mean[2])), len(state)
-    error, jacobian = np.empty(size), np.zeros((size, 3 + size))
-    _fill(start, state, mean, turn, frame == "invariant", error, jacobian)
-    return FactorError(error, jacobian)
+    turn = float(wrap_angle(state[2] - start[2] - mean[2]))
+    columns = np.zeros((len(state), 5))
+    across = _fill(start, state, mean, turn, frame == "invariant", columns)
+    return FactorError(columns, across)
 
 
 @jit_in_place
-def _fill(  # noqa: PLR0917 (a kernel takes no keywords)
-    start: Array,
-    state: Array,
-    mean: Array,
-    turn: float,
-    invariant: bool,
-    error: Array,
-    jacobian: Array,
-) -> None:
-    """Write e, and its derivatives other than 0."""
+def _fill(
+    start: Array, state: Array, mean: Array, turn: float, invariant: bool, X: Array
+) -> complex:
+    """Write the columns of a `FactorError` other than 0; return C."""
     turned, ahead = np.exp(-1j * start[2]), np.exp(1j * turn)
     scale, slope = 1.0 + 0.0j, 0.0 + 0.0j
     if invariant:
         scale, slope = inverse_spread_jit(turn)
-    across = scale * turned
-    error[2], jacobian[2, 2], jacobian[2, 5] = turn, -1.0, 1.0
+    across: complex = scale * turned
+    X[2, 4], X[2, 2], X[2, 3] = turn, -1.0, 1.0
     for row in range(0, len(state) - 1, 2):
         x = row + (row > 0)  # 0, then 3, 5, …
         seen = turned * complex(state[x] - start[0], state[x + 1] - start[1])
@@ -94,13 +106,12 @@ def _fill(  # noqa: PLR0917 (a kernel takes no keywords)
             expected *= ahead
             by_turn = slope * (seen - expected) - scale * 1j * expected
         found, by_start = scale * (seen - expected), -1j * scale * seen - by_turn
-        error[x], error[x + 1] = found.real, found.imag
-        for at, sign in ((0, -1.0), (3 + x, 1.0)):
-            jacobian[x, at] = jacobian[x + 1, at + 1] = sign * across.real
-            jacobian[x + 1, at] = sign * across.imag
-            jacobian[x, at + 1] = -sign * across.imag
-        jacobian[x, 2], jacobian[x + 1, 2] = by_start.real, by_start.imag
-        jacobian[x, 5], jacobian[x + 1, 5] = by_turn.real, by_turn.imag
+        X[x, 0], X[x, 1], X[x + 1, 0] = -across.real, across.imag, -across.imag
+        X[x + 1, 1] = -across.real
+        X[x, 2], X[x + 1, 2] = by_start.real, by_start.imag
+        X[x, 3], X[x + 1, 3] = by_turn.real, by_turn.imag
+        X[x, 4], X[x + 1, 4] = found.real, found.imag
+    return across
 
 
 def inverse_spread(turn: float) -> tuple[complex, complex]:
@@ -121,6 +132,79 @@ def inverse_spread(turn: float) -> tuple[complex, complex]:
 inverse_spread_jit = njit_internal(inverse_spread)
 
 
+def quadratic(
+    found: FactorError, root: Array, information: Array, *, is_first: bool = False
+) -> Quadratic:
+    """Return the squared error eᵀ P⁻¹ e as a function of the unknowns of the submap.
+
+    The Jacobian is dense in few columns X: those of F_k and of θ_{k+1}.  In the others,
+    each point has the 2 × 2 block C on the diagonal.  With their matrix D::
+
+        H = [Xᵀ Λ X  Xᵀ Λ D; ·  Dᵀ Λ D],    Λ X = L⁻ᵀ (L⁻¹ X)
+
+    needs only products with few columns, and 2 × 2 blocks Cᵀ Λ_ij C.
+
+    Parameters
+    ----------
+    found : FactorError
+    root, information : ndarray, shape (3 + 2n, 3 + 2n)
+        L⁻¹, where L Lᵀ = P, and Λ = P⁻¹.
+    is_first : bool
+        Whether F_k is fixed, and no unknown.
+
+    Returns
+    -------
+    H, g, c
+        Upper triangle of H, in c − 2 gᵀ x + xᵀ H x.
+    """
+    fixed = 0 if is_first else 3
+    W = root @ found.columns[:, 3 - fixed :]
+    size = fixed + len(W)
+    H, g = np.empty((size, size)), np.empty(size)
+    _fill_quadratic(information, found.across, root.T @ W, W.T @ W, H, g)
+    return H, g, float(W[:, -1] @ W[:, -1])
+
+
+@jit_in_place
+def _fill_quadratic(
+    information: Array,
+    across: complex,
+    response: Array,
+    product: Array,
+    H: Array,
+    g: Array,
+) -> None:
+    """Write the upper triangle of H, and g; see `quadratic`."""
+    a, b, many = across.real, across.imag, len(product) - 1
+    fixed, last = many - 1, len(information) - 1
+    for k in range(many):
+        at = k if k < fixed else fixed + 2
+        g[at] = -product[k, many]
+        for m in range(k, many):
+            H[at, m if m < fixed else fixed + 2] = product[k, m]
+    for row in range(0, last, 2):
+        i = row + (row > 0)  # 0, then 3, 5, …
+        u, v = fixed + i, fixed + i + 1
+        for k in range(many + 1):
+            x, y = response[i, k], response[i + 1, k]
+            x, y = a * x + b * y, a * y - b * x
+            at = k if k < fixed else fixed + 2
+            if k == many:
+                g[u], g[v] = -x, -y
+            elif at < u:
+                H[at, u], H[at, v] = x, y
+            else:
+                H[u, at], H[v, at] = x, y
+        for column in range(row, last, 2):
+            j = column + (column > 0)
+            p, q = information[i, j], information[i, j + 1]
+            r, s = information[i + 1, j], information[i + 1, j + 1]
+            p, q, r, s = a * p + b * q, a * q - b * p, a * r + b * s, a * s - b * r
+            j += fixed
+            H[u, j], H[u, j + 1] = a * p + b * r, a * q + b * s
+            H[v, j], H[v, j + 1] = a * r - b * p, a * s - b * q
+
+
 def retract(mean: Array, error: Array, frame: ErrorFrame) -> Array:
     """Return the state with this error against the mean, shape (3 + 2n,)."""
     if frame == "additive":
@@ -131,10 +215,23 @@ def retract(mean: Array, error: Array, frame: ErrorFrame) -> Array:
     return state_of(points, float(mean[2]) + turn)
 
 
-def regularised(P: Array) -> Array:
-    """Return a covariance with an increased diagonal, so that it can be solved with."""
-    largest = float(np.max(np.diagonal(P)))
-    return P + np.eye(len(P)) * max(SMALLEST_RATIO**2 * largest, 1e-18)
+def regularised(P: Array, rows: IntArray) -> Array:
+    """Return rows and columns of a covariance, so that they can be solved with.
+
+    The diagonal is increased.
+    """
+    part = np.empty((len(rows), len(rows)))
+    _fill_part(P, rows, part)
+    diagonal = np.einsum("ii->i", part)
+    diagonal += max(SMALLEST_RATIO**2 * float(diagonal.max()), 1e-18)
+    return part
+
+
+@jit_in_place
+def _fill_part(P: Array, rows: IntArray, part: Array) -> None:
+    for i in range(len(rows)):
+        for j in range(len(rows)):
+            part[i, j] = P[rows[i], rows[j]]
 
 
 # --------------------------------------------------------------------------------------
@@ -150,6 +247,14 @@ class Gaussian(NamedTuple):
 
     mean: Array  # (x, y, θ, l1x, l1y, …), shape (3 + 2n,)
     covariance: Array  # (3 + 2n, 3 + 2n)
+    #: The row of the covariance of each entry of the mean, if it has another order.
+    order: IntArray | None = None
+
+    def block(self, rows: IntArray, columns: slice = slice(None)) -> Array:
+        """Return rows of the covariance, in the order of the mean."""
+        if self.order is None:
+            return self.covariance[rows, columns]
+        return self.covariance[self.order[rows]].take(self.order[columns], axis=1)
 
 
 def times(factor: complex, rows: Array) -> Array:

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, solve_triangular
-from scipy.linalg.blas import dsyrk
 
 from .... import argument_checks
 from ....arrays import Array, IntArray
@@ -28,7 +27,7 @@ from ...models.rigid_motion import (
     seen_from,
     state_of,
 )
-from ..multifrontal import pairs, symmetric
+from ..multifrontal import AT_ONCE, pairs
 from ..undo import Undo, attributes, undo_all
 from .closed_submaps import ClosedSubmaps, Region
 from .factor import Gaussian, retract, times, with_uncertain_start
@@ -120,8 +119,8 @@ class SubmapGraph:
     def join(self) -> None:
         """Move the active submap to its frame in the joined map."""
         joined = self.closed.join(self.chain.joined)
-        frame = with_uncertain_start(joined.marginal(NO_SLOTS), *self.chain.start)
-        self.chain.rebase(joined.frames, *frame)
+        last = with_uncertain_start(joined.marginal(NO_SLOTS), *self.chain.start)
+        self.chain.rebase(joined.frames, last.mean, last.covariance)
         self.closed.discard_frames()
 
     def close(self) -> None:
@@ -132,7 +131,7 @@ class SubmapGraph:
         OSError
             If the submap cannot be written; the belief is then unchanged.
         """
-        mean, covariance = self.active.gaussian()
+        mean, covariance, _ = self.active.gaussian()
         self.is_overdue = True
         submap = Submap(self._active_slots, mean, covariance)
         self.closed = self.closed.with_appended(submap)
@@ -248,7 +247,7 @@ def fuse(
 def _in_invariant(world: Gaussian, rows: IntArray) -> Array:
     """Return some rows of the covariance in the coordinates ξ."""
     lever = state_of(1j * points_of(world.mean), 0.0)
-    half = world.covariance[rows] - np.outer(lever[rows], world.covariance[2])
+    half = world.block(rows) - np.outer(lever[rows], world.block(np.array([2])))
     return np.asarray(half - np.outer(half[:, 2], lever))
 
 
@@ -326,7 +325,7 @@ def _composed(
         T[:, 5] += T[:, 3:] @ state_of(1j * points_of(own), 0.0)
     at = np.r_[0:3, cut : cut + len(own)]
     rows = T @ (local.covariance - V[:, at].T @ V)
-    covariance = np.zeros((2 * len(points) + 1,) * 2)
+    covariance = np.empty((2 * len(points) + 1,) * 2)
     _fill_map(covariance, world, lever, V)
     few = np.r_[0:3, cut : len(covariance)]
     covariance[few, 3:cut] = rows[:, 3:cut] + np.outer(rows[:, 2], lever[3:])
@@ -346,22 +345,19 @@ def _fill_map(covariance: Array, world: Gaussian, lever: Array, V: Array) -> Non
 
     The turn of the map about its origin adds d = J (q − q before) to the derivatives.
     """
-    P, cut = world.covariance, len(lever)
-    covariance[3:cut, 3:cut] = P[3:, 3:]
-    if not len(V):
-        return
+    cut, heading = len(lever), world.block(np.array([2]))[0]
     d = lever - state_of(1j * points_of(world.mean), 0.0)
-    u = P[2] + d * (P[2, 2] / 2)
-    sizes = float(np.linalg.norm(u)), float(np.linalg.norm(d))
-    scale = np.sqrt(sizes[0] / sizes[1]) if all(sizes) else 1.0
-    both, gap = scale * d + u / scale, scale * d - u / scale
-    lost = [gap / np.sqrt(2), *(V[:, :cut] + np.outer(V[:, 2], lever))]
-    for sign, rows in ((1.0, [both / np.sqrt(2)]), (-1.0, lost)):
-        root = np.zeros((len(rows), len(covariance)))
-        root[:, 3:cut] = np.array(rows)[:, 3:]
-        # The transposes are contiguous in Fortran order: nothing is copied.
-        dsyrk(sign, root.T, 1.0, covariance.T, overwrite_c=1)
-    symmetric(covariance)
+    u = heading + d * (heading[2] / 2)
+    W = np.vstack([u, d, V[:, :cut] + np.outer(V[:, 2], lever)])
+    left = np.vstack([W[1], W[0], -W[2:]])
+    for first in range(3, cut, AT_ONCE):
+        own, so_far = slice(first, min(first + AT_ONCE, cut)), slice(3, first)
+        here = slice(3, own.stop)
+        rows = world.block(np.arange(own.start, own.stop), here)
+        rows += left[:, own].T @ W[:, here]
+        covariance[own, so_far] = rows[:, : first - 3]
+        covariance[so_far, own] = rows[:, : first - 3].T
+        covariance[own, own] = as_covariance(rows[:, first - 3 :])
 
 
 def part_of(
@@ -372,7 +368,7 @@ def part_of(
     Parameters
     ----------
     map_ : Gaussian
-        Of n landmarks.
+        Of n landmarks; the belief keeps its covariance.
     order : ndarray, shape (n,)
         Slots of these landmarks.
     wanted : ndarray, shape (v,)
@@ -386,7 +382,7 @@ def part_of(
     covariance = map_.covariance
     if not np.array_equal(rows, np.arange(len(covariance))):
         covariance = covariance[rows[:, None], rows]
-    return Belief(map_.mean[rows], covariance, ids, "invariant")
+    return Belief.owning(map_.mean[rows], covariance, ids, "invariant")
 
 
 ORIGIN = (0.0, 0.0, 0.0)

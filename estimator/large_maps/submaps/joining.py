@@ -14,18 +14,19 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_solve
+from scipy.linalg import lapack
 from scipy.sparse import coo_array
 
 from ....arrays import Array, IntArray
 from ...models.rigid_motion import ErrorFrame, compose, points_of
 from ..elimination import Quadratic, SubmapElimination, dissect
-from ..multifrontal import append, pairs, permuted, solved
+from ..multifrontal import append, pairs
 from .factor import (
     FactorError,
     Gaussian,
     factor_error,
     inverse_spread,
+    quadratic,
     regularised,
     times,
 )
@@ -35,7 +36,7 @@ from .store import Submap
 CONVERGED = 1e-9
 # A part of the map with more entries per unknown uses the covariance of all unknowns.
 MANY = 0.75
-# Number of submaps whose factors are kept from one iteration to the next: 20 MB.
+# Number of submaps whose factors are kept from one iteration to the next: 40 MB.
 MOST_KEPT = 500
 
 
@@ -92,7 +93,7 @@ class JoinedMap:
             [self._unknowns(k) for k in range(self._count)], frames[:-1, :2]
         )
         self._elimination: SubmapElimination | None = None
-        self._kept: dict[int, tuple[Array, Array]] = {}
+        self._kept: dict[int, tuple[Array, Array, Array]] = {}
         values = np.concatenate([frames[1:].ravel(), self._points.ravel()])
         if not minimise(self._linearise, values, converged):
             raise np.linalg.LinAlgError(
@@ -130,13 +131,13 @@ class JoinedMap:
             private, where = self._private_landmarks(k, slots[held]), 3 + pairs(held)
             mean[where] = private.points
             owned.append(Owned(where, self._unknowns(k), private))
-        is_large = len(mean) > MANY * (cut + self._points.size)
+        is_large = len(slots) > 0 and len(mean) > MANY * (cut + self._points.size)
         covariance = self._large_covariance if is_large else self._small_covariance
-        return Gaussian(mean, covariance(len(mean), rows, columns, owned))
+        return Gaussian(mean, *covariance(len(mean), rows, columns, owned))
 
     def _small_covariance(
         self, size: int, rows: IntArray, columns: IntArray, owned: Sequence[Owned]
-    ) -> Array:
+    ) -> tuple[Array]:
         """Return the covariance of a small part of the map, from the factors.
 
         Parameters
@@ -157,12 +158,12 @@ class JoinedMap:
         at_unknowns, at_rows, values = map(np.concatenate, zip(*entries, strict=True))
         shape = (size, 3 * self._count + self._points.size)
         A = coo_array((values, (at_rows, at_unknowns)), shape).tocsc()
-        return own + self._factors.covariance(A)
+        return (own + self._factors.covariance(A),)
 
     def _large_covariance(
         self, size: int, rows: IntArray, columns: IntArray, owned: Sequence[Owned]
-    ) -> Array:
-        """Return the covariance of a large part, from that of all unknowns."""
+    ) -> tuple[Array, IntArray]:
+        """Return that of a large part and its order, from that of all unknowns."""
         P, places = self._factors.inverse(size - len(rows))
         done, order = len(places), np.empty(size, dtype=np.int64)
         order[rows] = places[columns]
@@ -170,7 +171,7 @@ class JoinedMap:
             append(P, done, places[unknowns], private.jacobian, private.covariance)
             order[where] = done + np.arange(len(where))
             done += len(where)
-        return permuted(P, order)
+        return P, order
 
     @property
     def _factors(self) -> SubmapElimination:
@@ -189,20 +190,18 @@ class JoinedMap:
 
     def _normal_equations(self, index: int) -> Quadratic:
         """Return the squared error of a submap as a function of its unknowns."""
-        mean, root = self._factor(index)
-        error, jacobian = self._error(index, mean)
-        W = root @ np.column_stack([jacobian, error])
-        J, w = W[:, :-1], W[:, -1]
-        return J.T @ J, -J.T @ w, float(w @ w)
+        mean, root, information = self._factor(index)
+        found = self._error(index, mean)
+        return quadratic(found, root, information, is_first=index == 0)
 
-    def _factor(self, index: int) -> tuple[Array, Array]:
-        """Return m̂ of the shared part of a submap, and L⁻¹, where L Lᵀ = P."""
+    def _factor(self, index: int) -> tuple[Array, Array, Array]:
+        """Return m̂ of the shared part of a submap, L⁻¹, where L Lᵀ = P, and P⁻¹."""
         found = self._kept.get(index)
         if found is None:
             submap, rows = self._load(index), self._rows[index]
-            P = regularised(submap.covariance[rows[:, None], rows])
-            root = solved(np.linalg.cholesky(P).astype(np.float64), np.eye(len(P)))
-            found = submap.mean[rows], root
+            lower = np.linalg.cholesky(regularised(submap.covariance, rows))
+            root = lapack.dtrtri(lower.T, overwrite_c=1)[0].T
+            found = submap.mean[rows], root, root.T @ root
             if self._count <= MOST_KEPT:
                 self._kept[index] = found
         return found
@@ -211,8 +210,7 @@ class JoinedMap:
         """Return the error of the shared part of a submap, and its Jacobian."""
         points = self._points[self._shared[k]].ravel()
         world = np.concatenate([self.frames[k + 1], points])
-        error, jacobian = factor_error(self.frames[k], world, mean, self._error_frame)
-        return FactorError(error, jacobian if k else jacobian[:, 3:])
+        return factor_error(self.frames[k], world, mean, self._error_frame)
 
     def _unknowns(self, index: int) -> IntArray:
         """Return the unknowns of a submap: two frames, one if it is the first."""
@@ -222,9 +220,11 @@ class JoinedMap:
     def _private_landmarks(self, index: int, wanted: IntArray) -> PrivateLandmarks:
         submap = self._load(index)
         rows = self._rows[index]
-        error = self._error(index, submap.mean[rows])
-        start = self.frames[index]
-        return private_landmarks(submap, rows, wanted, start, error, self._error_frame)
+        factor, start = self._error(index, submap.mean[rows]), self.frames[index]
+        found = private_landmarks(
+            submap, rows, wanted, start, factor, self._error_frame
+        )
+        return found if index else found._replace(jacobian=found.jacobian[:, 3:])
 
 
 # --------------------------------------------------------------------------------------
@@ -388,7 +388,7 @@ def align(start: Array, covariance: Array, seen: Array, landmarks: Array) -> Arr
     >>> align(np.zeros(3), np.diag([1.0, 1.0, 1e-9]), seen, seen + [0.0, 1.0]).round(2)
     array([0.  , 0.75, 0.  ])
     """
-    prior = np.linalg.inv(regularised(covariance))
+    prior = np.linalg.inv(regularised(covariance, np.arange(3)))
     weight = 2 / max(covariance[0, 0] + covariance[1, 1], 1e-18)
     q, goal = seen[:, 0] + 1j * seen[:, 1], landmarks[:, 0] + 1j * landmarks[:, 1]
     pose = start.copy()
@@ -416,7 +416,7 @@ class PrivateLandmarks(NamedTuple):
     """n landmarks of a single submap, in the world."""
 
     points: Array  # (2n,) [m]
-    jacobian: Array  # by the unknowns of the submap, shape (2n, u)
+    jacobian: Array  # by frames and shared landmarks of the submap, shape (2n, u)
     covariance: Array  # conditional covariance given these unknowns, shape (2n, 2n)
 
 
@@ -446,18 +446,17 @@ def private_landmarks(
     start : ndarray, shape (3,)
         Frame of the submap in the world.
     factor : FactorError
-        e_b, and its derivative by the unknowns of the submap.  The derivative by
-        ``start`` comes first; it is left out if the frame is fixed.
+        e_b.
     frame : {"additive", "invariant"}
         Coordinates of the error.
     """
-    error, jacobian = factor
-    by_slot = {slot: place for place, slot in enumerate(submap.slots.tolist())}
-    rows = 3 + pairs([by_slot[slot] for slot in wanted.tolist()])
+    error, jacobian = factor.error, factor.jacobian
+    sorter = np.argsort(submap.slots)
+    rows = 3 + pairs(sorter[np.searchsorted(submap.slots, wanted, sorter=sorter)])
     P = submap.covariance
     P_bp = P[shared[:, None], rows]
-    lower = np.linalg.cholesky(regularised(P[shared[:, None], shared]))
-    G = cho_solve((lower, True), P_bp, check_finite=False).T
+    lower = np.linalg.cholesky(regularised(P, shared))
+    G = lapack.dpotrs(lower.T, P_bp)[0].T
     points = submap.mean[rows[::2]] + 1j * submap.mean[rows[1::2]]
     moved = (G @ error).view(np.complex128)
     by_unknowns = G @ jacobian
@@ -473,10 +472,9 @@ def private_landmarks(
         by_unknowns -= np.outer(by_turn.view(np.float64), jacobian[2])
     out = np.exp(1j * start[2])
     by_unknowns = times(out / scale, by_unknowns)
-    if by_unknowns.shape[1] > len(error):  # the start is an unknown, too
-        by_unknowns[0::2, 0] += 1.0
-        by_unknowns[1::2, 1] += 1.0
-        by_unknowns[:, 2] += (1j * out * seen).view(np.float64)
+    by_unknowns[0::2, 0] += 1.0
+    by_unknowns[1::2, 1] += 1.0
+    by_unknowns[:, 2] += (1j * out * seen).view(np.float64)
     noise = P[rows[:, None], rows] - G @ P_bp
     noise = times(out / scale, times(out / scale, noise).T)
     world = complex(*start[:2]) + out * seen

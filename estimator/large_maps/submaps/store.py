@@ -314,11 +314,9 @@ class LandmarkIndex(Mapping[int, int]):
 
     def slots_of(self, names: Sequence[int]) -> IntArray:
         """Return the slots of landmarks and links by their names, shape (n,)."""
-        slots = (self._slots.get(name) for name in names)
-        known = [
-            slot_of_link(name) if slot is None else slot
-            for name, slot in zip(names, slots, strict=True)
-        ]
+        known = [*map(self._slots.get, names)]
+        if None in known:
+            known = [self._slots.get(name, slot_of_link(name)) for name in names]
         return np.array(known, dtype=np.int64)
 
 
