@@ -15,7 +15,7 @@ import numpy as np
 
 from ..arrays import AnyArray, Array, BoolArray, IntArray
 from .logs.importers.any_format import read_true_path
-from .logs.log_lines import LogLine, read_lines
+from .logs.log_lines import LogLine, plain_rows, read_lines
 from .logs.slamlog import LogError
 from .trajectories.manifest import MANIFEST, load_trajectories
 from .trajectories.trajectory import BELIEFS, Trajectory, array_of
@@ -57,7 +57,7 @@ def true_path(path: Path) -> Array:
     """
     if is_tum(path):
         lines = content_lines(path)
-        rows = np.array([tum_row(line)[:8] for line in lines])
+        rows = np.array([row[:8] for row in tum_rows(lines)])
         headings = planar_headings(rows[:, 4:8], lines)
         found = np.column_stack([rows[:, :3], headings])
         places = [f"{line.file}, line {line.number}" for line in lines]
@@ -107,6 +107,7 @@ _CSV = (
     "pose,t,x,y,θ and 6 or 9 entries of its covariance, or "
     "landmark,id,x,y and 3 or 4 entries of its covariance"
 )
+_POSE = "pose,"
 _TUM = "t x y z qx qy qz qw and 6, 9, 21 or 36 entries of a covariance"
 _ENDINGS = (".csv", ".tum", ".txt", ".npz")
 _UNIT = 0.1  # largest difference of the length of a quaternion from 1
@@ -303,9 +304,13 @@ def content_lines(path: Path) -> list[LogLine]:
 
 
 def _of_csv(path: Path) -> DriveEstimate:
+    lines = content_lines(path)
+    table = _plain_poses(lines)
+    if table is not None:
+        lines = [line for line in lines if not line.text.startswith(_POSE)]
     poses: list[list[float]] = []
     places: dict[int, list[float]] = {}
-    for line in content_lines(path):
+    for line in lines:
         kind, *fields = (field.strip() for field in line.text.split(","))
         if kind == "pose":
             line.check_count(fields, (10, 13), _CSV)
@@ -318,7 +323,8 @@ def _of_csv(path: Path) -> DriveEstimate:
             places[name] = [line.to_real(field) for field in fields[1:]]
         else:
             raise line.error(_CSV, repr(kind))
-    table = _even(path, poses, _CSV)
+    if table is None:
+        table = _even(path, poses, _CSV)
     of_map = _even(path, list(places.values()), _CSV) if places else np.zeros((0, 5))
     return DriveEstimate(
         str(path),
@@ -329,6 +335,15 @@ def _of_csv(path: Path) -> DriveEstimate:
         landmarks=of_map[:, :2],
         landmark_covariances=square(of_map[:, 2:], 2),
     )
+
+
+def _plain_poses(lines: Sequence[LogLine]) -> Array | None:
+    """Return the rows of all poses of a csv; None if each has to be read by itself."""
+    of_poses = [line.text for line in lines if line.text.startswith(_POSE[:-1])]
+    if not (of_poses and all(text.startswith(_POSE) for text in of_poses)):
+        return None
+    table = plain_rows([text[len(_POSE) :] for text in of_poses], ",")
+    return table if table is not None and table.shape[1] in (10, 13) else None
 
 
 def tum_row(line: LogLine) -> list[float]:
@@ -342,14 +357,22 @@ def tum_row(line: LogLine) -> list[float]:
     return numbers
 
 
+def tum_rows(lines: Sequence[LogLine]) -> Array | list[list[float]]:
+    """Read rows as :func:`tum_row` does, in less time where all are alike."""
+    table = plain_rows([line.text for line in lines])
+    if table is None or table.shape[1] - 8 not in (0, *_TUM_SIZES):
+        return [tum_row(line) for line in lines]
+    is_unit = abs(np.linalg.norm(table[:, 4:8], axis=1) - 1) <= _UNIT
+    return table if is_unit.all() else [tum_row(line) for line in lines]
+
+
 def tum_table(path: Path) -> tuple[Array, list[LogLine]]:
     """Read the rows of a TUM file with covariances, and their lines."""
-    lines, rows = content_lines(path), []
-    for line in lines:
-        rows.append(tum_row(line))
-        if len(rows[-1]) == 8:
-            raise line.error(_TUM, "no covariance")
-    return _even(path, rows, _TUM), lines
+    lines = content_lines(path)
+    rows = tum_rows(lines)
+    if short := [line for line, row in zip(lines, rows, strict=True) if len(row) == 8]:
+        raise short[0].error(_TUM, "no covariance")
+    return rows if isinstance(rows, np.ndarray) else _even(path, rows, _TUM), lines
 
 
 def _of_tum(path: Path) -> DriveEstimate:

@@ -588,7 +588,10 @@ def _invalid(
     deviations = np.sqrt(np.where(variances > 0, variances, np.inf))
     correlations = np.nan_to_num(additive / deviations[..., None])
     correlations = correlations / deviations[:, :, None]
-    indefinite = np.linalg.eigvalsh(correlations)[..., 0] < _INDEFINITE
+    # One that whitens errors is definite, and needs no eigenvalues.
+    unsure = ~np.isfinite(whitened(np.zeros(variances.shape), additive)).all(axis=2)
+    indefinite = np.zeros_like(unsure)
+    indefinite[unsure] = np.linalg.eigvalsh(correlations[unsure])[..., 0] < _INDEFINITE
     found: dict[int, Failure] = {}
     for reason, wrong in (
         ("an entry of the covariance is not finite", ~np.isfinite(gaps)),

@@ -40,7 +40,7 @@ from .estimate_files import (
     paired,
     paths_by_label,
     square,
-    tum_row,
+    tum_rows,
     tum_table,
 )
 from .monte_carlo_study import verdict
@@ -456,7 +456,7 @@ def _true_paths(path: Path) -> Iterator[tuple[Any, _Path]]:
             yield name, (times, _poses_of(rows))
         return
     lines = content_lines(path)
-    rows = np.array([tum_row(line)[:8] for line in lines])
+    rows = np.array([row[:8] for row in tum_rows(lines)])
     kept = growing_rows(rows, [f"{path}, line {line.number}" for line in lines])
     yield name_of(path), (rows[kept, 0], _poses_of(rows[kept, 1:]))
 

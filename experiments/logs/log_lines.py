@@ -182,6 +182,22 @@ def split_fields(text: str) -> list[str]:
     return [field.strip(" \t\"'") for field in text.split(separator)]
 
 
+def plain_rows(texts: Sequence[str], separator: str | None = None) -> Array | None:
+    """Read rows of numbers at once; None if `LogLine.to_reals` has to read each line.
+
+    Examples
+    --------
+    >>> plain_rows(["1,2", "3,4e5"], ","), plain_rows(["1,2", "3,east"], ",")
+    (array([[1.e+00, 2.e+00],
+           [3.e+00, 4.e+05]]), None)
+    """
+    try:
+        rows = np.loadtxt(texts, delimiter=separator, comments=None, ndmin=2)
+    except ValueError:
+        return None
+    return rows if (abs(rows) <= LARGEST).all() else None
+
+
 def is_number(field: str) -> bool:
     """Whether a field is a number, finite or not."""
     try:
