@@ -1,6 +1,7 @@
 """The command for mutation testing knows the tests of every file it changes."""
 
 import os
+import subprocess
 import sys
 from glob import glob
 from pathlib import Path
@@ -102,3 +103,21 @@ def test_what_survives_is_judged_by_slow_tests_and_by_examples(mutate, tmp_path)
     slow.write_text("import pytest\n\n\n@pytest.mark.slow\ndef test_it():\n    pass\n")
     assert mutate.verdict(mutate.Tests((str(slow),))) == "broken"  # none ran
     assert mutate.verdict(tests._replace(files=(str(slow),))) == "survived"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the tool forks")
+def test_an_example_in_a_file_sees_the_changed_text():
+    code = """
+import sys
+sys.path.insert(0, "tests")
+import mutate
+file = "src/slamgym/suggestions.py"
+examples = mutate.all_tests_of(file).files[0]
+tests, text = mutate.Tests((examples,), slow=True), mutate.source_of(file)
+changed = text.replace("_SIMILAR = 0.6", "_SIMILAR = 0.99")
+sys.stderr.write(f"{mutate.verdict(tests)} {mutate.verdict(tests, file, changed)}")
+"""
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stderr.endswith("survived killed")

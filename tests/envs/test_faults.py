@@ -104,3 +104,15 @@ def test_faulty_observations_stay_within_the_observation_space():
     for _ in range(29):
         assert env.observation_space.contains(env.step([1.0, 1.0])[0])
     assert np.isfinite(largest_noise(2.1))
+
+
+def test_the_observation_space_holds_the_reading_of_a_landmark_at_the_longest_range():
+    plain, biased = (
+        LandmarkWorldEnv(BASE.with_changes(faults=faults, sensor={"max_range": 9}))
+        for faults in ({}, {"range_bias": 3.0})
+    )
+    ranges = [
+        each.observation_space["landmarks"].high[0, 1] for each in (plain, biased)
+    ]
+    assert ranges[0] >= 9
+    assert ranges[1] == pytest.approx(ranges[0] + 3)

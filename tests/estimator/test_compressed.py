@@ -587,6 +587,18 @@ def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(change, messag
     assert_same_bits(before, slam.belief())
 
 
+@pytest.mark.parametrize("row", [0, 2, -1])
+def test_a_saved_variance_of_a_local_landmark_must_be_positive(row):
+    local = CompressedEkfSlam(*NOISE, base="invariant", local_size=20)
+    state = run(map_all(local, 60), wander(60, 10)).state_dict()
+    P, virtual = state["local_covariance"].copy(), state["counts"][0]
+    assert virtual > 0
+    own = range(3 + 2 * virtual, len(P))
+    P[own[row], own[row]] *= -1
+    with pytest.raises(ValueError, match=r"state\['local_covariance'\]"):
+        local.load_state_dict(state | {"local_covariance": P})
+
+
 def test_a_saved_scale_must_be_triangular():
     slam = map_all(CompressedEkfSlam(*NOISE), 100)
     state = run(slam, wander(100, 5, jumping=True)).state_dict()

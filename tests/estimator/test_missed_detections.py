@@ -173,6 +173,7 @@ def test_a_new_landmark_costs_what_the_scans_before_its_first_should_have_shown(
         for scan in range(6):
             views.append(random_view(rng, landmarks=0))
             views[-1].mean[0] = 2.0 * scan
+            views[-1].covariance[0, 0] += rng.choice([0.0, 9.0])
             detections = detections.with_pose(scan, views[-1], LONGEST)
         view, first = random_view(rng), int(rng.integers(7))
         expected, missed = 0.0, {}

@@ -1,6 +1,7 @@
 """The batch smoother against dense least squares, RTS, GTSAM, and its own promises."""
 
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -214,6 +215,18 @@ def test_readings_of_poses_are_those_of_dense_least_squares():
     components = sum(len(H) for _, _, H, _ in fixes)
     freedom = 2 * 6 * 12 - 2 * 6 + components
     assert made.cost_per_degree == pytest.approx(2 * made.cost / freedom)
+
+
+def test_only_the_heading_of_a_pose_reading_is_wrapped_in_any_order_of_components():
+    costs = []
+    for order in permutations(range(3)):
+        result, *_ = recorded()
+        H = np.eye(3)[[*order]]
+        z = H @ smooth(result).poses[-1] + H @ (20.0, -20.0, 2 * np.pi)
+        result.observe_pose(z, H, H @ np.diag((100.0, 100.0, 0.01)) @ H.T)
+        costs.append(smooth(result).cost)
+    assert costs[0] > 1
+    assert costs == pytest.approx([costs[0]] * len(costs), rel=1e-9)
 
 
 def test_a_recorded_filter_smooths_its_readings_of_poses():

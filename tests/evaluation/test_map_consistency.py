@@ -50,6 +50,15 @@ def test_a_matrix_with_a_negative_eigenvalue_is_rejected():
     assert (found.indefinite, found.all_runs) == (1, 100)
 
 
+def test_of_maps_without_any_nees_those_whose_landmarks_are_known_are_tested():
+    errors, freedom = HONEST[:10].copy(), np.full(10, 40)
+    errors[3, 0] = np.inf
+    nees = np.full(10, np.inf)
+    nees[[7, 8]], freedom[[7, 8]] = np.nan, 0  # no map
+    found = map_test(errors, nees, freedom)
+    assert (found.runs, found.indefinite, found.joint) == (7, 8, False)
+
+
 def test_a_map_without_nees_is_not_shown_to_be_consistent():
     errors = HONEST.copy()
     errors[0, 0] = np.inf

@@ -70,6 +70,12 @@ def test_a_recording_holds_the_beliefs_of_every_step(tmp_path, monkeypatch):
         R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         found = R @ np.diag([long**2, short**2]) @ R.T / 9
         np.testing.assert_allclose(found, P, rtol=1e-5, atol=1e-8)
+    robot = [content for place, content in logged if place == "world/ekf/robot"]
+    assert len(robot) == 2
+    for step, arrow in enumerate(robot):
+        place = values(arrow, "origins")[0, :2]
+        np.testing.assert_allclose(place, trace.poses[step, :2], atol=1e-6)
+    assert trace.poses[1, 0] > 0.5
     nis = [content for place, content in logged if place == "plots/nis/ekf"]
     assert values(nis[0], "scalars") == pytest.approx(trace.nis[1] / trace.nis_dof[1])
 
