@@ -400,8 +400,13 @@ def with_less_noise(scenario: Scenario, factor: float) -> Scenario:
     >>> with_less_noise(load_scenario("six_landmarks"), 0.5).motion.std
     (0.125, 0.05, 0.05)
     """
-    start = {"std": [factor * std for std in scenario.start.std]}
-    return with_noise_times(scenario, factor, factor).with_changes(start=start)
+    changes: dict[str, Any] = {
+        name: {"std": factor * sensor.std}
+        for name in ("gps", "compass")
+        if (sensor := getattr(scenario, name)) is not None
+    }
+    changes["start"] = {"std": [factor * std for std in scenario.start.std]}
+    return with_noise_times(scenario, factor, factor).with_changes(**changes)
 
 
 def with_noise_times(scenario: Scenario, motion: float, sensor: float) -> Scenario:

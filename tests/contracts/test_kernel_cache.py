@@ -11,7 +11,7 @@ import time
 from importlib import import_module
 from pathlib import Path
 from pkgutil import walk_packages
-from types import FunctionType, ModuleType
+from types import FunctionType, ModuleType, SimpleNamespace
 
 import forked
 import numpy as np
@@ -298,6 +298,52 @@ def test_a_kernel_is_compiled_with_functions_from_the_cache(room, tmp_path):
     (index,) = kept(tmp_path, "nbi")
     index.unlink()
     assert answer(room, code) == (7, 1)
+
+
+@njit_internal
+def unchanged(x):
+    return x
+
+
+class Files:
+    """Files of a kernel that hold this, or are damaged."""
+
+    def __init__(self, found):
+        self.found, self.flushes = found, 0
+
+    def _load_overload(self, signature, _):
+        if isinstance(self.found, Exception):
+            raise self.found
+        return self.found
+
+    def flush(self):
+        self.flushes += 1
+
+
+def code_for(*types):
+    return SimpleNamespace(signature=SimpleNamespace(args=types))
+
+
+@pytest.mark.parametrize(
+    ("found", "is_loaded", "flushes"),
+    [
+        (code_for("float64"), True, 0),
+        (code_for("int64"), False, 0),
+        (None, False, 0),
+        (ValueError("damaged"), False, 1),
+    ],
+)
+def test_only_whole_code_for_the_same_types_is_loaded(
+    monkeypatch, found, is_loaded, flushes
+):
+    files = Files(found)
+    monkeypatch.setattr(kernel_cache.KernelCache, "_files", files)
+    cache = kernel_cache.KernelCache(unchanged)
+    loaded = cache.load_overload(("float64",), unchanged.targetctx)
+    assert loaded is (found if is_loaded else None)
+    assert files.flushes == flushes
+    monkeypatch.setattr(kernel_cache.KernelCache, "_files", None)
+    assert cache.load_overload(("float64",), unchanged.targetctx) is None
 
 
 def test_the_states_used_last_are_kept_and_nothing_of_others_is_deleted(

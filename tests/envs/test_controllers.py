@@ -246,6 +246,14 @@ def test_a_wanderer_stays_near_its_home(seed):
     assert np.linalg.norm(path[:, :2] - (3.0, 4.0), axis=1).max() < 5.0 + 3.0
 
 
+def test_a_wanderer_has_its_home_amid_the_planned_path_and_reaches_its_corners():
+    path = planned_path(load_scenario("corridor"))[:, :2]
+    driver = RandomWalk.for_scenario("corridor", rng())
+    low, high = path.min(axis=0), path.max(axis=0)
+    assert driver.home == tuple((low + high) / 2)
+    assert driver.reach == pytest.approx(np.linalg.norm(low - driver.home))
+
+
 def test_within_its_reach_a_wanderer_is_free():
     free, bound = (
         RandomWalk(rng(), ROBOT, dt=0.5, reach=reach) for reach in (math.inf, 9.0)

@@ -191,6 +191,21 @@ def test_a_new_landmark_costs_what_the_scans_before_its_first_should_have_shown(
     assert max(costs) > 5
 
 
+def test_a_pose_that_is_uncertain_to_one_side_may_have_been_near_on_that_side():
+    counts, costs = np.multiply.outer([9.0, 10.0, 0.0], np.ones((SECTORS, RINGS))), []
+    for axis in range(2):
+        variances = np.full(3, 1e-4)
+        variances[axis] = 4.0
+        pose, place = np.array([0.0, 0.0, axis * np.pi / 2]), np.zeros(2)
+        place[axis] = LONGEST + 3.0  # within two deviations of it
+        start = MapView(pose, np.diag(variances), ())
+        detections = Detections()._replace(detected=counts)
+        detections = detections.with_pose(0, start, LONGEST)
+        view = MapView(np.append(pose, place), np.diag([0, 0, 0, 1e-4, 1e-4]), (1,))
+        costs.append(detections.cost_of_new(view, {1: 1}, LONGEST))
+    assert 0.1 < costs[0] == pytest.approx(costs[1])
+
+
 @pytest.mark.parametrize(("confirm", "dear"), [((1, 1), []), ((3, 8), [8])])
 def test_only_scans_before_the_first_sighting_make_a_landmark_dear(confirm, dear):
     slam = make_estimator(

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.special import xlogy
 
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.motions import predict_pose
@@ -170,6 +171,47 @@ def test_two_landmarks_for_one_do_not_lower_the_score():
     places = np.vstack([first.places, np.zeros((50, 2))])
     places[53] = first.places[3]
     assert search.smoothed(labels, first.poses, places).score > first.score + 10
+
+
+def test_the_score_is_the_negative_logarithm_of_the_evidence():
+    path, right = two_laps(4)
+    search = _Search(renamed(right, dropped))
+    state = search.first(path)
+    unused = np.count_nonzero(state.labels == NONE)
+    assert unused > 20
+    best = smooth(
+        renamed(right, lambda k, ids: np.where(np.isin(ids, (4, 8)), -1, ids))
+    )
+    spread = np.linalg.slogdet(best.covariance([0])[3:, 3:])[1]
+    area = np.prod(np.ptp(search.located(path), axis=0))
+    counts = search.detections(state.poses, state.places, state.labels)
+    rates = counts / counts.sum(axis=1, keepdims=True)
+    expected = best.cost - spread / 2 + len(state.places) * np.log(area / (2 * np.pi))
+    expected += PRICE * unused - xlogy(counts, rates).sum()
+    assert state.cost == pytest.approx(best.cost, rel=1e-4)
+    assert state.score == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("followed", "rebuilt", "lowest"),
+    [(1, 2, 2), (2, 1, 2), (2, None, 2), (None, 1, 1), (-1, -2, 0), (None, None, 0)],
+)
+def test_the_lowest_score_decides_whatever_its_cost(
+    monkeypatch, followed, rebuilt, lowest
+):
+    path, right = two_laps(1)
+    first = _Search(right).first(path)
+
+    def lower(by):
+        score, cost = first.score - 1000.0 * (by or 0), first.cost + 10.0 * (by or 0)
+        return None if by is None else first._replace(score=score, cost=cost)
+
+    monkeypatch.setattr(_Search, "followed", lambda _: lower(followed))
+    monkeypatch.setattr(_Search, "settled", lambda _, state: state)
+    monkeypatch.setattr(_Search, "rebuilt", lambda *_: lower(rebuilt))
+    found = reassociate(right, start=path)
+    assert (found.first_score, found.changed) == (first.score, lowest > 0)
+    assert found.score == lower(lowest).score
 
 
 def test_only_a_landmark_that_most_scans_show_is_born():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slamgym.estimator import list_estimators, make_batch, make_estimator
+from slamgym.estimator import Belief, list_estimators, make_batch, make_estimator
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.02, 0.1)}
 
@@ -25,6 +25,14 @@ def test_a_belief_a_report_and_a_managed_filter_show_what_they_hold():
     report = slam.update([(0.0, 2.0)])
     assert repr(report).endswith("of 0 degrees of freedom, 1 added, 1 confirmed")
     assert repr(slam.belief()).startswith("Belief of 1 landmark, pose (0.000 ± 0.000 m")
+
+
+def test_the_error_of_a_marginal_is_additive_by_default():
+    whole = np.arange(7.0), np.diag(np.arange(1.0, 8.0))
+    part = Belief.marginal(*whole, {3: 0, 5: 1}, [5])
+    assert part.frame == "additive"
+    np.testing.assert_array_equal(part.landmarks, [(5.0, 6.0)])
+    np.testing.assert_array_equal(part.covariance.diagonal(), [1, 2, 3, 6, 7])
 
 
 def test_a_batch_shows_its_runs():

@@ -20,7 +20,13 @@ from slamgym.estimator.models.sensors import (
     SENSORS,
     from_bearing_range,
 )
-from slamgym.estimator.smoother import Drive, SmoothingSlam, reassociate, smooth
+from slamgym.estimator.smoother import (
+    Drive,
+    RecordedSlam,
+    SmoothingSlam,
+    reassociate,
+    smooth,
+)
 from slamgym.estimator.smoother.optimiser import start_of
 
 START_STD = (0.1, 0.2, 0.05)
@@ -558,6 +564,12 @@ def test_readings_below_the_minimum_range_are_skipped():
     made = Drive(MOTION_STD, MEASUREMENT_STD, min_range=1.0)
     made.update([(0.0, 0.5), (0.1, 2.0)], [0, 1])
     assert made.landmark_ids == (1,)
+
+
+def test_readings_that_a_filter_skips_are_not_in_its_drive():
+    slam = RecordedSlam(make_estimator("ekf", min_range=1.0, **NOISE), **NOISE)
+    slam.update([(0.0, 0.5), (0.1, 2.0)], [0, 1])
+    assert slam.recorded().landmark_ids == slam.landmark_ids == (1,)
 
 
 @pytest.mark.parametrize("backdate", [False, True])

@@ -599,6 +599,26 @@ def test_what_is_kept_of_the_elimination_is_that_of_the_whole_map_at_any_time(
     assert world.elimination.nodes.max() > deepest
 
 
+def test_a_leaf_that_grows_is_dissected_and_what_was_kept_of_it_is_dropped(monkeypatch):
+    rng = np.random.default_rng(1)
+    monkeypatch.setattr(landmark_dissection, "LEAF", 4)
+    places = rng.uniform(0, 20, (60, 2))
+    places[30:] = rng.uniform(0, 5, (30, 2))  # all near one corner
+    dense, world = town_information(rng, places, 1.2), SparseMap()
+    world.grow(60)
+    world.first[:120] = places.ravel()
+    for count in (30, 40, 50, 60):
+        known = np.arange(count)
+        now = dense[: 2 * count, : 2 * count]
+        world.information.replace(known, now)
+        world.elimination.revise(world.information, world.first, known)
+        nodes = world.elimination.nodes[:count]
+        leaves = [n for n in set(nodes) if not np.isin(nodes, (2 * n, 2 * n + 1)).any()]
+        assert max(np.count_nonzero(nodes == n) for n in leaves) <= 8
+        local = known[np.argsort(places[:count] @ (1.0, 1.0))[-6:]]
+        assert_eliminates(world.elimination, world.information, dense, known, local)
+
+
 def assert_eliminates(elimination, matrix, dense, known, local):
     """Hold C, T and Λ_HH⁻¹ against the dense matrix of the known landmarks."""
     around = elimination.eliminate(matrix, local)

@@ -72,6 +72,16 @@ def test_it_keeps_the_contract(base, limits):
     )
 
 
+@pytest.mark.parametrize(("limit", "steps"), [(0.021, 5), (0.019, 4)])
+def test_a_submap_ends_where_its_heading_exceeds_the_limit(limit, steps):
+    slam, k = made(heading_limit=limit, submap_size=99), 0
+    while slam.closed_count == 0:
+        k += 1
+        slam.predict((0.5, 0.0))
+        slam.update([(0.0, 3.0)], [k])  # a new landmark corrects nothing
+    assert k == steps  # σ is 0.01 √k
+
+
 # --- the joined map against the full filter, and against a dense solution -------------
 
 

@@ -29,6 +29,13 @@ def test_a_mean_error_that_is_hidden_in_the_squares_is_rejected():
     assert found.mean_p_values.min() < found.p_values.min()
 
 
+@pytest.mark.parametrize(("offset", "accepted"), [(0.24, True), (0.33, False)])
+def test_a_mean_error_counts_beyond_a_quarter_of_a_deviation(offset, accepted):
+    errors = np.random.default_rng(5).standard_normal((3000, 1, 2))
+    errors += (offset, 0.0) - errors.mean(axis=0)
+    assert map_test(errors).accepted == accepted
+
+
 def test_a_landmark_that_some_maps_lack_is_tested_over_the_others():
     errors = HONEST.copy()
     errors[60:, 3] = np.nan
@@ -111,6 +118,12 @@ def test_errors_that_only_the_whole_map_or_its_own_frame_shows_are_rejected(whic
     parts = list(scores_of(HONEST))
     parts[which] = 3 * parts[which]
     assert MapEvidence().update(*parts)[0][30] > np.log(200)
+
+
+def test_landmarks_without_a_nees_in_the_map_are_no_evidence():
+    parts = scores_of(HONEST)
+    parts[3][:, 5:] = np.nan
+    assert MapEvidence().update(*parts)[0].max() < np.log(20)
 
 
 def test_a_negative_eigenvalue_is_certain_evidence_from_its_run_on():

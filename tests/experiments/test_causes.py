@@ -15,6 +15,10 @@ from slamgym.experiments.monte_carlo_study import (
 from slamgym.experiments.monte_carlo_study.filtered_runs import noise_of_runs
 from slamgym.experiments.monte_carlo_study.report import escaped as escape
 from slamgym.experiments.monte_carlo_study.report import html_report
+from slamgym.experiments.monte_carlo_study.runner import (
+    with_less_noise,
+    with_noise_times,
+)
 from slamgym.experiments.monte_carlo_study.verdict import diagnosis_lines
 from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
@@ -91,6 +95,22 @@ def test_runs_with_less_noise_are_those_of_a_world_with_less_noise():
         np.testing.assert_allclose(found[f"small_noise_nees_{frame}"][repeated], nees)
     error = again.position_error[:, 1:].mean("step")
     np.testing.assert_allclose(found.small_noise_position_error[repeated], error)
+
+
+def test_every_noise_is_multiplied_by_its_own_factor():
+    world = WORLD.with_changes(
+        sensor={"range_std_per_metre": 0.02}, gps={"std": 0.5}, compass={"std": 0.1}
+    )
+    apart = with_noise_times(world, 2.0, 3.0)
+    np.testing.assert_allclose(apart.motion.std, 2 * np.array(world.motion.std))
+    np.testing.assert_allclose(apart.sensor.std, 3 * np.array(world.sensor.std))
+    assert apart.sensor.range_std_per_metre == pytest.approx(0.06)
+    less = with_less_noise(world, 0.1)
+    for table in ("motion", "sensor", "start", "gps", "compass"):
+        before, after = (np.array(getattr(w, table).std) for w in (world, less))
+        np.testing.assert_allclose(after, 0.1 * before)
+    assert less.sensor.range_std_per_metre == pytest.approx(0.002)
+    assert with_less_noise(WORLD, 0.1).gps is None
 
 
 def test_linearisation_is_the_fault_of_one_filter_and_not_of_the_other():

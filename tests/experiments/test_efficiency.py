@@ -9,6 +9,7 @@ from slamgym.experiments.monte_carlo_study.report import (
     measures,
     monte_carlo_table,
 )
+from slamgym.experiments.monte_carlo_study.verdict import _heading_knowledge, scores_of
 from slamgym.sim_configs import load_scenario
 
 RUNS = 30
@@ -27,10 +28,21 @@ def summary(results):
 
 def test_efficiency_is_the_bound_by_the_mean_squared_error(results, summary):
     found = results.sel(estimator="invariant").isel(step=slice(1, None))
-    ratio = found.position_bound.mean() / (found.position_error_invariant**2).mean()
-    entry = summary["estimators"]["invariant"]["efficiency"]["pose"]
-    assert entry["value"] == pytest.approx(float(ratio))
-    assert entry["interval"][0] < entry["value"] < entry["interval"][1]
+    for name, bound, error in (
+        ("pose", found.position_bound, found.position_error_invariant),
+        ("heading", found.heading_bound, found.heading_error),
+        ("map", found.map_bound, found.map_error_centred),
+    ):
+        entry = summary["estimators"]["invariant"]["efficiency"][name]
+        assert entry["value"] == pytest.approx(float(bound.mean() / (error**2).mean()))
+        assert entry["interval"][0] < entry["value"] < entry["interval"][1]
+
+
+def test_the_heading_is_compared_with_what_can_be_known(results):
+    scores = scores_of(results, "invariant", "invariant")
+    end = results.sel(estimator="invariant").isel(step=-1)
+    expected = end.heading_std**2 / end.heading_bound
+    np.testing.assert_allclose(_heading_knowledge(scores), expected)
 
 
 def test_no_filter_is_significantly_better_than_the_bound(summary):

@@ -384,6 +384,23 @@ def test_of_two_edges_between_neighbours_the_odometry_leads_forward(file):
     assert log.header["left_out"] == "1 loop closures between poses"
 
 
+@pytest.mark.parametrize(
+    ("odometry", "closure"),
+    [
+        ("ODOMETRY 1 0 1 0 0", "EDGE2 0 1 2 0 0"),
+        ("EDGE2 0 1 2 0 0", "EDGE2 1 0 1 0 0"),
+        ("EDGE2 0 1 2 0 0 1 0 0 1 0 1", "EDGE2 0 1 1 0 0"),
+    ],
+)
+def test_of_several_edges_the_odometry_does_not_depend_on_their_order(
+    file, odometry, closure
+):
+    reading = "LANDMARK 1 2 3 4"
+    alone = read_log(file(f"{odometry}\n{reading}")).events
+    for lines in ([odometry, closure, reading], [closure, odometry, reading]):
+        assert_events_agree(read_log(file("\n".join(lines))).events, alone, tolerance=0)
+
+
 def test_odometry_whose_ids_do_not_grow_is_followed_from_line_to_line(file):
     falling = ISAM.replace("ODOMETRY 0 1", "ODOMETRY 9 1").replace("1 3 -2", "1 5 -2")
     log = read_log(file(falling.replace("LANDMARK 3", "LANDMARK 5")))

@@ -15,7 +15,13 @@ from slamgym.experiments.monte_carlo_study import (
     runner,
     summarise_monte_carlo,
 )
-from slamgym.experiments.monte_carlo_study.looks import Look, Watch, verdict_of, watched
+from slamgym.experiments.monte_carlo_study.looks import (
+    Look,
+    Watch,
+    error_rate_after,
+    verdict_of,
+    watched,
+)
 from slamgym.experiments.monte_carlo_study.runner import python_call
 from slamgym.experiments.monte_carlo_study.verdict import scores_of
 
@@ -349,6 +355,18 @@ def test_damaged_looks_are_refused_in_one_sentence(damaged, tmp_path):
     file.write_text(json.dumps(table), encoding="utf-8")
     with pytest.raises(ValueError, match=r"job\.json is damaged: looks must be"):
         monte_carlo(**JOB, runs=8, out=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("looks", "rate"),
+    [((), 0.05), (("",), 0.01), (("decided",), 0.05), (("", "decided"), 0.01),
+     (("decided", ""), 0.05)],
+)  # fmt: skip
+def test_only_a_first_verdict_on_a_chosen_number_of_runs_takes_from_the_rate(
+    looks, rate
+):
+    every = [Look(0, 50 * k, until) for k, until in enumerate(looks, start=1)]
+    assert error_rate_after(every) == rate
 
 
 def test_an_honest_folder_that_is_extended_five_times_is_rarely_refused():

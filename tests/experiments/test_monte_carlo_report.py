@@ -171,6 +171,17 @@ def test_grid_steps_are_numbered_as_the_results_number_them():
     assert grid["steps"][-1] == 29
 
 
+def test_a_refusal_at_one_step_names_it_as_the_results_number_it():
+    rng = np.random.default_rng(1)
+    nees = rng.chisquare(3, (60, 20))
+    dof, nis = np.full(nees.shape, 2), rng.chisquare(2, nees.shape)
+    nees[:, 8] *= 2
+    report = evaluate_consistency(nees, nis, dof, frame="invariant", rng=rng)
+    worst = report.family_steps[report.family.rejected]
+    assert worst.tolist() == [8]
+    assert "at step 9 (p" in judge(report, 0, 60).reason  # step 0 is the start
+
+
 def test_the_ekf_is_refused_and_the_invariant_filter_is_consistent():
     entries = summarise_monte_carlo(typical())["estimators"]
     assert entries["ekf"]["verdict"] == "not consistent"

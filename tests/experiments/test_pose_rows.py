@@ -49,6 +49,18 @@ def test_a_recorded_log_reads_back_bit_by_bit(log, tmp_path):
     assert sum(np.isfinite(row.reading[0]) for row in rows) == 7
 
 
+def test_a_row_gives_the_filter_what_is_read_with_its_variances():
+    gps = PoseRow(1.0, (4.0, 5.0, NAN), (0.5, NAN)).arguments
+    both = PoseRow(1.0, (4.0, 5.0, 0.3), (0.5, 0.1)).arguments
+    for found, z, R in (
+        (gps, [4.0, 5.0], [0.25, 0.25]),
+        (both, [4.0, 5.0, 0.3], [0.25, 0.25, 0.01]),
+    ):
+        np.testing.assert_array_equal(found[0], z)
+        np.testing.assert_array_equal(found[1], np.eye(3)[: len(z)])
+        np.testing.assert_allclose(found[2], np.diag(R))
+
+
 def test_a_replay_feeds_the_filter_as_a_loop_by_hand_does(log):
     settings = settings_for(log, estimator="invariant")
     replayed, slam = replay(log, settings.make(log.start)), settings.make(log.start)

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from slamgym import smooth
 from slamgym.estimator import Belief, Drive, EkfSlam, UpdateReport, make_estimator
+from slamgym.experiments.command_line import tables
 from slamgym.experiments.command_line.tables import key_figures, landmark_table
 from slamgym.experiments.logs.ground_truth import (
     path_accuracy,
@@ -383,6 +384,12 @@ def test_a_start_known_for_certain_has_no_nees():
     assert summary["steps"] == 3
     assert summary["mean"] == pytest.approx(nees[1:].mean())
     assert summary["per_degree"] == pytest.approx(nees[1:].mean() / 3)
+
+
+def test_the_final_pose_is_written_with_its_deviations():
+    covariance = [[0.04, 0.02, 0.01], [0.02, 0.09, 0.03], [0.01, 0.03, None]]
+    text = tables._pose([1.0, -2.0, 0.5], covariance)
+    assert text == "x 1.000 ± 0.200 m, y -2.000 ± 0.300 m, θ 0.500 ± - rad"
 
 
 def test_poses_whose_covariance_is_singular_are_counted():

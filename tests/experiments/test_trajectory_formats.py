@@ -12,6 +12,7 @@ from presets import PRESETS
 
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.slamlog import OdometryRow, write_slamlog
+from slamgym.experiments.run_and_replay.log_replay import replay
 from slamgym.experiments.trajectories import (
     driven_episodes,
     generate_trajectories,
@@ -20,6 +21,7 @@ from slamgym.experiments.trajectories import (
 from slamgym.experiments.trajectories.driven_episodes import drive_episodes
 from slamgym.experiments.trajectories.formats import (
     FORMATS,
+    filtered_path,
     to_slamlog,
     trajectory_format,
 )
@@ -277,6 +279,18 @@ def turning(seed):
     return drives("loop", "open_loop", seeds=(seed,), **TURNING)[0]
 
 
+def test_a_graph_begins_where_an_invariant_filter_is():
+    (drive,) = drives("loop", steps=40, seeds=(3,), motion={"noise_at_rest": True})
+    poses, landmarks = filtered_path(drive)
+    run = replay(to_slamlog(drive), "invariant")
+    gaps = poses - run.trace.poses
+    gaps[:, 2] = wrapped(gaps[:, 2])
+    np.testing.assert_allclose(gaps[1:], 0, atol=1e-12)
+    for landmark, place in landmarks.items():
+        at = run.belief.landmarks[run.belief.landmark_ids.index(landmark)]
+        np.testing.assert_allclose(place, at, atol=1e-12)
+
+
 @pytest.mark.parametrize("end", ["", "_gtsam"])
 def test_our_own_importer_reads_the_graph(tmp_path, end):
     drive = turning(0)
@@ -345,8 +359,10 @@ def test_the_information_of_odometry_is_that_of_the_noise(tmp_path):
     assert abs(np.mean(cost) - 3.0) < 4 * np.sqrt(6 / 300)  # χ² of 3 per edge
 
 
-def test_the_information_of_positions_is_that_of_the_readings(tmp_path):
-    cost, drive = [], turning(0)
+@pytest.mark.parametrize("growth", [0.0, 0.1])
+def test_the_information_of_positions_is_that_of_the_readings(tmp_path, growth):
+    more = {"sensor": TURNING.get("sensor", {}) | {"range_std_per_metre": growth}}
+    cost, drive = [], drives("loop", "open_loop", seeds=(0,), **TURNING | more)[0]
     fmt("g2o").write([drive], tmp_path / "shard")
     first = len(drive.landmarks)
     graph = tmp_path / "shard" / "seed_00000000.g2o"
