@@ -1,9 +1,10 @@
-"""Name the convention that estimates break: `mistake_in`.
+"""Name the convention that estimates break: `mistake_in_estimates`.
 
 A program that writes degrees, another order, or the covariance of another error is
-wrong in a way that its NEES shows but does not name. `mistake_in` reads the estimates
-in every other convention, and names the one that makes their errors honest, or far
-smaller. An honest filter has nothing to name, nor has one that is wrong in any reading.
+wrong in a way that its NEES shows but does not name. `mistake_in_estimates` reads the
+estimates in every other convention, and names the one that makes their errors honest,
+or far smaller. An honest filter has nothing to name, nor has one that is wrong in any
+reading.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -62,7 +63,7 @@ class _Agreement(NamedTuple):
     errors: tuple[float, float]
 
 
-def mistake_in(
+def mistake_in_estimates(
     truth: Array,
     poses: Array,
     claims: Array,
@@ -96,7 +97,7 @@ def mistake_in(
     >>> truth = rng.uniform(-9, 9, (20, 50, 3))
     >>> poses = truth + rng.normal(0, 0.1, truth.shape)
     >>> claims = np.broadcast_to(np.eye(3) * 0.1, (20, 50, 3, 3))
-    >>> print(mistake_in(truth, poses, claims, truth[:, 0]))
+    >>> print(mistake_in_estimates(truth, poses, claims, truth[:, 0]))
     standard deviations in place of variances: read so, NEES / 3 is 1.0..., not ...
     """
     if _are_same(truth, poses):
@@ -136,7 +137,7 @@ class _Errors(NamedTuple):
 
     frame: str
     decides: str
-    #: As in `mistake_in`.
+    #: As in `mistake_in_estimates`.
     truth_at: Callable[[float], Array] | None = None
 
 

@@ -743,7 +743,7 @@ def _mistakes(parts: Sequence[_Part], task: _Task, frame: str, decides: str) -> 
     ratios = np.concatenate([p.block["pose_nees_invariant"] for p in parts]) / 3
     return (
         estimate_conventions.swapped_drives(truth, poses, additive, task.names)
-        or estimate_conventions.mistake_in(
+        or estimate_conventions.mistake_in_estimates(
             *(first[0], first[1], first[2], first[3], frame),
             decides=decides,
             truth_at=None if others else truth_at,

@@ -1,11 +1,11 @@
-"""Name the convention that a log breaks: `mistake_in`.
+"""Name the convention that a log breaks: `mistake_in_log`.
 
 A log with clockwise bearings, degrees or shifted rows looks like a log with much noise.
-`mistake_in` reads a part of the log in each of the conventions that are often confused,
-and names the one in which its readings agree with its odometry. If they agree as given,
-a longer part of the log can still show that the robot turns before it drives, or that
-the scans stand one row too late. It names nothing if no convention explains the log. No
-truth is needed.
+`mistake_in_log` reads a part of the log in each of the conventions that are often
+confused, and names the one in which its readings agree with its odometry. If they agree
+as given, a longer part of the log can still show that the robot turns before it drives,
+or that the scans stand one row too late. It names nothing if no convention explains the
+log. No truth is needed.
 
 Symbols
 -------
@@ -128,7 +128,7 @@ class LogAsRead(NamedTuple):
     moved: int = 0
 
 
-def mistake_in(
+def mistake_in_log(
     log: slamlog.SlamLog, settings: FilterSettings
 ) -> WrongConvention | None:
     """Return the convention that a log breaks, or None if it is not known.
@@ -153,11 +153,11 @@ def mistake_in(
     >>> world = load_scenario("loop").with_changes(steps=60)
     >>> driver = OpenLoop(action_sequence(world), world.robot)
     >>> log = record_episode(world, driver, seed=0)
-    >>> mistake_in(log, settings_for(log)) is None
+    >>> mistake_in_log(log, settings_for(log)) is None
     True
     >>> for scan in log.scans:
     ...     scan.measurements[:] = scan.measurements[:, ::-1]  # range first
-    >>> mistake_in(log, settings_for(log)).name
+    >>> mistake_in_log(log, settings_for(log)).name
     'the range stands before the bearing'
     """
     is_usual = log.motion in slamlog.UNICYCLES and "sensor" not in log.header
@@ -176,7 +176,7 @@ def explaining(log: slamlog.SlamLog, settings: FilterSettings) -> Iterator[None]
     try:
         yield
     except np.linalg.LinAlgError as error:
-        mistake = mistake_in(log, settings)
+        mistake = mistake_in_log(log, settings)
         if mistake is None:
             raise
         raise np.linalg.LinAlgError(f"{error}. {mistake}") from error

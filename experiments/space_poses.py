@@ -245,7 +245,9 @@ def judge_in_space(
         report = evaluate_consistency(
             nees, none, none, dof=6, frame="invariant", rng=rng
         )
-        decided, reason = verdict.judge(report, len(report.failed_runs), len(nees))[:2]
+        decided, reason = verdict.verdict_of_report(
+            report, len(report.failed_runs), len(nees)
+        )[:2]
         tested = len(report.family_steps)
     (label,) = named
     return {

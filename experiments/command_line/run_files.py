@@ -163,7 +163,7 @@ def _filtered(
 def mistake_in(log: SlamLog, settings: FilterSettings) -> Any:
     """Return the convention that a log breaks; None if it is unknown."""
     conventions = leaf("experiments.log_conventions")
-    return conventions and conventions.mistake_in(log, settings)
+    return conventions and conventions.mistake_in_log(log, settings)
 
 
 def explaining(log: SlamLog, settings: FilterSettings) -> AbstractContextManager[None]:

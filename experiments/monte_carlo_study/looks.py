@@ -1,9 +1,9 @@
 """The verdict on a study that grows: one that runs until it is decided, or is extended.
 
 A first verdict on a number of runs that was chosen beforehand needs no more than the
-tests of :func:`.verdict.judge`, and `verdict_of` returns theirs. If runs are added
-after a look at the verdict, these tests would reject an honest filter more often than
-in 5 % of cases. Later verdicts therefore follow from the tests of
+tests of :func:`.verdict.verdict_of_report`, and `verdict_of` returns theirs. If runs
+are added after a look at the verdict, these tests would reject an honest filter more
+often than in 5 % of cases. Later verdicts therefore follow from the tests of
 :mod:`slamgym.evaluation.sequential_tests`, which hold their error rates at all looks
 together: :class:`Watch` applies them to the runs in their order. If a study is
 extended, its first verdict has 4 % of the 5 %, and all later ones have 1 % together.
@@ -46,13 +46,13 @@ from .verdict import (
     POSE_ONLY,
     EstimatorScores,
     Verdict,
-    judge,
     map_not_shown,
     map_refusal,
     map_scores,
     parts_of,
     report_of,
     squared_errors,
+    verdict_of_report,
     with_failures,
 )
 
@@ -258,7 +258,7 @@ def verdict_of(
     ----------
     scores : EstimatorScores
         Results of the estimator. Their attributes ``until`` and ``looks`` list earlier
-        looks; without them, this is the verdict of :func:`.verdict.judge`.
+        looks; without them, this is the verdict of :func:`.verdict.verdict_of_report`.
     frame : {"invariant", "additive"}
         Error coordinates of the NEES.
     watch : Watch, optional
@@ -267,7 +267,7 @@ def verdict_of(
     failed, runs = len(scores.failures), len(scores.good)
     report = report_of(scores, frame) if scores.good.sum() > 1 else None
     if report is None or not is_sequential(scores):
-        return judge(report, failed, runs)
+        return verdict_of_report(report, failed, runs)
     watch = watch or watched(scores, frame)
     verdict = _sequential_verdict(scores, frame, report, watch)
     return with_failures(verdict, failed, runs)

@@ -209,7 +209,7 @@ def summarise_estimator(
         end [m²]; ``efficiency``, see :func:`.summary.efficiency_summary`;
         ``diagnosis``, see :func:`.verdict.diagnosis_summary`; ``seeds_sentence``, the
         seeds of runs that deserve a look;
-        ``association``, see :func:`.association.association_summary`;
+        ``association``, see :func:`.summary.association_of_runs`;
         ``unused_readings``, the share of readings of known identity that corrected
         nothing and added no landmark, None where identities are hidden or readings of
         a sensor may wait.
@@ -244,7 +244,7 @@ def summarise_estimator(
             scores, frame, verdict, report.map if report else None
         ),
         "seeds_sentence": seeds_sentence(scores, frame, _errors_of_bad_runs(scores)),
-        "association": association_summary(scores),
+        "association": association_of_runs(scores),
         "unused_readings": _unused_readings(scores),
     }
 
@@ -448,7 +448,7 @@ def _declared(frame: ErrorFrame) -> list[Measure]:
     # fmt: on
 
 
-#: Rows of a world that hides identities, of :func:`association_summary`.
+#: Rows of a world that hides identities, of :func:`association_of_runs`.
 _ASSOCIATION: tuple[tuple[Any, ...], ...] = (
     ("median_ate.hidden", "path (ATE), median run, raw [m]"),
     ("median_ate.known", "… with known identities [m]"),
@@ -698,7 +698,7 @@ def _entry(found: Efficiency) -> dict[str, Any] | None:
     return {"value": finite(found.value), "interval": [*map(finite, found.interval)]}
 
 
-def association_summary(scores: EstimatorScores) -> dict[str, Any] | None:
+def association_of_runs(scores: EstimatorScores) -> dict[str, Any] | None:
     """Summarise the association of one estimator; None where identities are known.
 
     Parameters

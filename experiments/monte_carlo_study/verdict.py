@@ -1,4 +1,4 @@
-"""Reduce a consistency report to one word and one sentence: `judge`.
+"""Reduce a consistency report to one word and one sentence: `verdict_of_report`.
 
 Warnings about the results, and the cause of an inconsistency, are entries of the
 summary and sentences. `scores_of` selects the results that count.
@@ -106,7 +106,9 @@ FITTED = Verdict(
 )
 
 
-def judge(report: ConsistencyReport | None, failed: int, runs: int) -> Verdict:
+def verdict_of_report(
+    report: ConsistencyReport | None, failed: int, runs: int
+) -> Verdict:
     """Reduce a report to a verdict.
 
     Parameters

@@ -306,3 +306,17 @@ def test_hooks_use_what_is_installed():
     hooks = (ROOT / ".pre-commit-config.yaml").read_text()
     assert set(re.findall(r"repo: (\S+)", hooks)) == {"local"}
     assert set(re.findall(r"language: (\S+)", hooks)) == {"system"}
+
+
+def test_references_in_docstrings_lead_to_names_that_exist():
+    places = dict.fromkeys(PACKAGES, "")  # text by the name of a module or a class
+    for folder in ("src/slamgym", *PACKAGES):
+        for file in (ROOT / folder).rglob("*.py"):
+            text = file.read_text()
+            for place in (file.stem, *re.findall(r"^class (\w+)", text, re.M)):
+                places[place] = places.get(place, "") + text
+    named = re.compile(r":(?:func|class|meth|data|attr):`~?\.?(?:\w+\.)*?(\w+)\.(\w+)`")
+    for place, name in named.findall("".join(places.values())):
+        if place not in ("slamgym", "linalg", *PACKAGES):  # another library
+            found = rf"(def|class) {name}\b|\b{name}\b *[:=]"
+            assert re.search(found, places.get(place, "")), f"{place}.{name}"

@@ -28,7 +28,7 @@ from slamgym.experiments import (
 from slamgym.experiments.estimate_conventions import (
     PosesAsRead,
     additive_covariances,
-    mistake_in,
+    mistake_in_estimates,
     stray_poses,
 )
 from slamgym.experiments.judging import NO_FILE
@@ -389,7 +389,9 @@ def test_deviations_alone_are_not_read_in_another_frame(correlation):
     truth = poses + xi
     truth[..., 0] -= poses[..., 1] * xi[..., 2]
     truth[..., 1] += poses[..., 0] * xi[..., 2]
-    said = mistake_in(truth, poses, np.broadcast_to(P, (20, 50, 3, 3)), truth[:, 0])
+    said = mistake_in_estimates(
+        truth, poses, np.broadcast_to(P, (20, 50, 3, 3)), truth[:, 0]
+    )
     frame = "covariances of the right-invariant error (the world's frame): read so"
     assert said.startswith(frame) if correlation else not said
 

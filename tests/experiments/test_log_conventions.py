@@ -14,7 +14,7 @@ from slamgym.estimator.models.bearing_range import wrap_angle
 from slamgym.experiments.log_conventions import (
     _Comparison,
     events_of,
-    mistake_in,
+    mistake_in_log,
     part_of,
 )
 from slamgym.experiments.logs import (
@@ -160,7 +160,7 @@ SHIFTED = {  # and a world whose motions differ enough to show it
 
 
 def mistake_of(log):
-    return mistake_in(log, settings_for(log, **noise_or_assumed(log, {})))
+    return mistake_in_log(log, settings_for(log, **noise_or_assumed(log, {})))
 
 
 @pytest.mark.parametrize("name", FAR)
@@ -197,7 +197,7 @@ def test_a_wrong_noise_is_no_mistake_of_conventions(name, factor):
         for std in (right.motion_std, right.measurement_std)
     )
     settings = replace(right, motion_std=motion, measurement_std=sensor)
-    assert mistake_in(log, settings) is None
+    assert mistake_in_log(log, settings) is None
 
 
 def test_outliers_are_no_mistake_of_conventions(corridor):
@@ -235,7 +235,7 @@ def test_nothing_is_named_where_only_the_noise_is_wrong(name, factors):
         )
     )
     settings = replace(right, motion_std=motion, measurement_std=sensor)
-    assert mistake_in(log, settings) is None
+    assert mistake_in_log(log, settings) is None
 
 
 def test_a_mistake_is_named_where_a_scan_shows_many_landmarks():
@@ -318,7 +318,7 @@ def test_a_mistake_in_csv_files_of_ones_own_is_named(corridor, name, tmp_path):
     change, words = FAR[name]
     log = read_log(csv_of(change(corridor), tmp_path / "own"))
     settings = settings_for(log, **NOISE)
-    assert words in mistake_in(log, settings).name
+    assert words in mistake_in_log(log, settings).name
 
 
 def test_commands_name_the_mistake_and_suggest_no_noise(corridor, tmp_path):

@@ -34,10 +34,10 @@ from slamgym.experiments.monte_carlo_study.verdict import (
     KINDS,
     coarse_bearings,
     diagnosis_lines,
-    judge,
     run_warnings,
     scores_of,
     seeds_sentence,
+    verdict_of_report,
 )
 from slamgym.sim_configs import load_scenario
 
@@ -179,7 +179,9 @@ def test_a_refusal_at_one_step_names_it_as_the_results_number_it():
     report = evaluate_consistency(nees, nis, dof, frame="invariant", rng=rng)
     worst = report.family_steps[report.family.rejected]
     assert worst.tolist() == [8]
-    assert "at step 9 (p" in judge(report, 0, 60).reason  # step 0 is the start
+    assert (
+        "at step 9 (p" in verdict_of_report(report, 0, 60).reason
+    )  # step 0 is the start
 
 
 def test_the_ekf_is_refused_and_the_invariant_filter_is_consistent():
@@ -297,13 +299,13 @@ def test_a_heading_better_known_than_at_the_start_is_pointed_out():
     ],
 )
 def test_verdicts_on_white_nees(factor, runs, word, said):
-    verdict = judge(white_report(factor, runs), 0, runs)
+    verdict = verdict_of_report(white_report(factor, runs), 0, runs)
     assert verdict.word == word
     assert said in verdict.reason
 
 
 def test_the_number_of_runs_that_a_verdict_names_suffices():
-    reason = judge(white_report(1.0, 15, steps=2), 0, 15).reason
+    reason = verdict_of_report(white_report(1.0, 15, steps=2), 0, 15).reason
     named = int(re.search(r"about ([\d,]+) in total", reason)[1].replace(",", ""))
     rng = np.random.default_rng(2)
 
@@ -327,7 +329,7 @@ def test_few_runs_of_a_consistent_filter_are_called_wrong_in_5_percent(runs):
         nees = np.repeat(rng.chisquare(3, (runs, 1)), 4, axis=1)
         nis = rng.chisquare(2, (runs, 4))
         report = evaluate_consistency(nees, nis, dof, frame="invariant", rng=rng)
-        found = judge(report, 0, runs).word == "not consistent"
+        found = verdict_of_report(report, 0, runs).word == "not consistent"
         assert not (found and report.accepted)
         wrong += found
     assert wrong <= 0.05 * repetitions
@@ -335,7 +337,7 @@ def test_few_runs_of_a_consistent_filter_are_called_wrong_in_5_percent(runs):
 
 @pytest.mark.parametrize("runs", [3, 5, 9])
 def test_few_runs_of_a_filter_that_is_far_off_are_found(runs):
-    assert judge(white_report(8.0, runs), 0, runs).word == "not consistent"
+    assert verdict_of_report(white_report(8.0, runs), 0, runs).word == "not consistent"
 
 
 @pytest.mark.slow
@@ -361,7 +363,7 @@ def test_summary_and_page_of_very_few_runs_hold_no_absurd_number(runs, request):
 
 
 def test_a_few_bad_runs_that_make_the_average_are_pointed_out():
-    verdict = judge(white_report(1.0, 200, outliers=4), 0, 200)
+    verdict = verdict_of_report(white_report(1.0, 200, outliers=4), 0, 200)
     assert verdict.word == "not consistent"
     assert (
         "; 3 of 200 runs make this average: without them, it is 1.17" in verdict.reason
@@ -473,7 +475,7 @@ def test_few_runs_are_noted_once_for_all_estimators_and_warned_of_in_each():
 def test_a_single_run_is_called_a_run():
     (note,) = summarise_monte_carlo(typical().isel(run=[0]))["notes"]
     assert note.startswith("Only 1 run: at least 20 are needed")
-    assert judge(None, 0, 1).reason.startswith("1 of 1 run succeeded:")
+    assert verdict_of_report(None, 0, 1).reason.startswith("1 of 1 run succeeded:")
     failed = with_failures(typical(), [("ekf", run, 1, "a") for run in range(39)])
     assert "ekf: only 1 run succeeded; at" in summarise_monte_carlo(failed)["notes"][1]
     one = diagnose(None, np.ones((1, 5)), np.ones((1, 5)))
