@@ -131,11 +131,13 @@ def _widths(
 #
 #     ℓ_p = ℓ + ½ g_oᵀ I_oo⁻¹ g_o,    dℓ_p/dθ_i = g_i − I_io I_oo⁻¹ g_o
 #
-# (Venzon, Moolgavkar, Applied Statistics 37(1), 1988).
+# (Venzon, Moolgavkar, Applied Statistics 37(1), 1988).  Where the likelihood jumps, the
+# others may be most likely just before the jump, and a step across it is not taken.
 
 MOST = 20  # iterations
 CLOSE = 2e-3  # in ℓ and in θ, where they end
 FARTHEST = 1.0  # the most that one changes θ
+OF_OTHERS = np.array([1.0, 0.3, 0.1, 0.0])  # shares of their change that are tried
 GREATEST = 100.0  # [m, rad] from which on a parameter has no end
 
 
@@ -181,18 +183,23 @@ def profile_crossing(
     along, theta = restricted(likelihoods, here, free), np.log(here[free])
     at = int(np.flatnonzero(free == i)[0])
     o = np.flatnonzero(free != i)
+    moves, known = True, None  # whether other parameters can still gain
     for _ in range(MOST):
-        found = scores(along, theta)
+        found = scores(along, theta, here=known, beside_jumps=True)
         information, g = found.information + FAINT * np.eye(len(theta)), found.gradient
         inverse = np.linalg.inv(information[np.ix_(o, o)])
-        rise = 0.5 * float(g[o] @ inverse @ g[o])
-        slope = float(g[at] - information[at, o] @ inverse @ g[o])
+        rise = 0.5 * float(g[o] @ inverse @ g[o]) * moves
+        slope = float(g[at] - information[at, o] @ inverse @ g[o] * moves)
         step = _newton_step(level - found.value - rise, slope, up=up)
         change = inverse @ (g[o] - information[o, at] * step)
-        theta[o] += np.clip(change, -FARTHEST, FARTHEST)
-        theta[at] += step
-        if not np.log(LEAST) < theta[at] < np.log(GREATEST):
+        tried = np.tile(theta, (len(OF_OTHERS), 1))
+        tried[:, o] += np.outer(OF_OTHERS, np.clip(change, -FARTHEST, FARTHEST))
+        tried[:, at] += step
+        if not np.log(LEAST) < tried[0, at] < np.log(GREATEST):
             return np.inf if up else 0.0
+        by_step = along(np.exp(tried))
+        best = int(np.argmax(totals(by_step)))
+        theta, known, moves = tried[best], by_step[best], OF_OTHERS[best] > 0
         if abs(step) < CLOSE and rise < CLOSE:
             break
     end = float(np.exp(theta[at]))

@@ -35,6 +35,7 @@ from ..run_and_replay.log_replay import Progress, replay
 Likelihoods = Callable[[Array], Array]
 
 NARROW = 0.01  # step of the differences, in θ
+JUMP = 0.1  # in ℓ_s, between both sides of θ: no smooth ℓ_s bends so much
 FARTHEST = 2.0  # the most that an iteration changes one θ
 SHARES = (8.0, 3.0, 1.5, 1.0, 0.5, 0.15)  # of the step that are tried at once
 FAINT = 0.05  # information on θ beside which that of the readings is none
@@ -132,11 +133,11 @@ def maximise(
 
 
 def _climb(likelihoods: Likelihoods, theta: Array, most: int) -> _Climb:
-    damping, passes, here = 1e-3, 0, None
+    damping, passes, here, known = 1e-3, 0, None, None
     for _ in range(most):
         if here is None:
-            here = scores(likelihoods, theta)
-            passes += 2 * len(theta) + 1
+            here = scores(likelihoods, theta, here=known)
+            passes += 2 * len(theta) + (known is None)
         step = _step(here, damping)
         if 0.5 * float(here.gradient @ step) < GAIN:
             return _Climb(theta, here, True, passes)
@@ -144,16 +145,17 @@ def _climb(likelihoods: Likelihoods, theta: Array, most: int) -> _Climb:
             break
         steps = np.clip(np.outer(SHARES, step), -FARTHEST, FARTHEST)
         tried = np.clip(theta + steps, np.log(LEAST), np.log(GREATEST))
-        found = totals(likelihoods(np.exp(tried)))
+        by_step = likelihoods(np.exp(tried))
+        found = totals(by_step)
         passes += len(tried)
         best = int(np.argmax(found))
         if found[best] > here.value:
             damping *= 0.2 if SHARES[best] >= 0.5 else 4
-            theta, here = tried[best], None
+            theta, here, known = tried[best], None, by_step[best]
         else:
             damping *= 30
     if here is None:
-        here = scores(likelihoods, theta)
+        here = scores(likelihoods, theta, here=known)
     return _Climb(theta, here, False, passes)
 
 
@@ -167,16 +169,40 @@ def _of_other_sizes(climb: _Climb) -> Array:
     return tried
 
 
-def scores(likelihoods: Likelihoods, theta: Array) -> Scores:
-    """Return ℓ, its gradient and I at one θ, of 2p + 1 passes."""
+def scores(
+    likelihoods: Likelihoods,
+    theta: Array,
+    *,
+    here: Array | None = None,
+    beside_jumps: bool = False,
+) -> Scores:
+    """Return ℓ, its gradient and I at one θ, of 2p + 1 passes.
+
+    Parameters
+    ----------
+    likelihoods : callable
+    theta : ndarray, shape (p,)
+    here : ndarray, shape (S,), optional
+        The log likelihoods there, if they are known.
+    beside_jumps : bool
+        A filter that linearises a reading once more from some θ on makes ℓ_s jump.
+        Whether the slope is then that of the side without the jump.
+    """
     offsets, p = NARROW * np.eye(len(theta)), len(theta)
-    tried = np.concatenate([theta[None], theta + offsets, theta - offsets])
-    around = likelihoods(np.exp(tried))
-    above, below = around[1 : p + 1], around[p + 1 :]
+    points = [] if here is not None else [theta[None]]
+    around = likelihoods(np.exp(np.vstack([*points, theta + offsets, theta - offsets])))
+    here = around[0] if here is None else here
+    above, below = around[-2 * p : -p], around[-p:]
     usable = np.isfinite(above) & np.isfinite(below)
     slopes = np.zeros_like(above)
     slopes[usable] = (above[usable] - below[usable]) / (2 * NARROW)
-    return Scores(float(totals(around[:1])[0]), slopes.sum(axis=1), slopes @ slopes.T)
+    if beside_jumps:
+        sides = (above - here) / NARROW, (here - below) / NARROW
+        jumps = usable & (np.abs(sides[0] - sides[1]) * NARROW > JUMP)
+        nearer = np.where(np.abs(sides[0]) < np.abs(sides[1]), *sides)
+        slopes[jumps] = nearer[jumps]
+    value = float(totals(here[None])[0])
+    return Scores(value, slopes.sum(axis=1), slopes @ slopes.T)
 
 
 def curvature(likelihoods: Likelihoods, theta: Array, widths: Array) -> Array:

@@ -366,6 +366,24 @@ def test_the_profile_is_that_of_fitting_the_other_parameter_anew(start):
     assert found == pytest.approx(expected, rel=0.01)
 
 
+def test_the_end_beside_a_jump_of_the_likelihood_is_found_in_few_steps():
+    best = maximise(two_spreads, np.array([[1.0, 1.0]]))
+    level, edge, calls = best.log_likelihood - 1.92, 1.01 * best.parameters[0], []
+
+    def jumping(parameters):
+        calls.append(parameters)
+        found = two_spreads(parameters)
+        found[:, 7] -= 5.0 * (parameters[:, 0] > edge)
+        return found
+
+    found = profile_crossing(jumping, best.parameters, 1, 0.2, level)
+    expected = brentq(
+        lambda b: two_spreads(np.array([[edge, b]])).sum() - level, 1e-3, 0.8
+    )
+    assert found == pytest.approx(expected, rel=0.05)
+    assert len(calls) < 20
+
+
 def test_the_whiteness_is_that_of_the_readings_used(example):
     assert all(white.p_value > 1e-3 for white in example.fitted.whiteness)
 
