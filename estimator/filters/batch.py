@@ -397,7 +397,7 @@ class BatchSlam(Restorable):
 
 def can_batch(estimator: object) -> bool:
     """Whether a filter consists of the shared kernels only, and can run in batches."""
-    shared = ("predict", "update", "belief", "_move_pose", "_update_map")
+    shared = ("predict", "update", "belief", "move_kernel", "update_kernel")
     return isinstance(estimator, EkfSlam) and all(
         getattr(type(estimator), name) is getattr(EkfSlam, name) for name in shared
     )

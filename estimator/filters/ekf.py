@@ -309,8 +309,8 @@ class EkfSlam(MapFilter):
     _frame: ClassVar[int] = scan.ADDITIVE
 
     #: The kernels of both steps.
-    _update_map: ClassVar[UpdateKernel] = staticmethod(update_map)
-    _move_pose: ClassVar[Callable[..., None]] = staticmethod(move_pose)
+    update_kernel: ClassVar[UpdateKernel] = staticmethod(update_map)
+    move_kernel: ClassVar[Callable[..., None]] = staticmethod(move_pose)
     #: Error messages of further statuses of the update.
     _refusals: ClassVar[Mapping[int, str]] = {}
 
@@ -373,7 +373,7 @@ class EkfSlam(MapFilter):
             forward, sideways, turn = noise.motion.moved(odometry)
         if not (type(dt) is float and dt == 1.0 and noise.at_rest):
             weight = noise.weight((forward, sideways, turn), dt)
-        self._move_pose(self.map.block, forward, sideways, turn, weight)
+        self.move_kernel(self.map.block, forward, sideways, turn, weight)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -406,7 +406,9 @@ class EkfSlam(MapFilter):
         readings = argument_checks.scan(measurements, self.sensor.columns)
         ids = argument_checks.identity_array(landmark_ids, len(readings), self)
         kernel = (
-            self._update_map if self._reads_bearing_range else self._kernel_of_sensor()
+            self.update_kernel
+            if self._reads_bearing_range
+            else self._kernel_of_sensor()
         )
         status = self.map.take_in(kernel, readings, ids)
         if status != DONE:
@@ -416,7 +418,7 @@ class EkfSlam(MapFilter):
     def _kernel_of_sensor(self) -> UpdateKernel:
         from ..models.sensor_kernels import for_sensor  # noqa: PLC0415 (compiled anew)
 
-        kernel: UpdateKernel = for_sensor(self._update_map, self.sensor)
+        kernel: UpdateKernel = for_sensor(self.update_kernel, self.sensor)
         return kernel
 
     @property

@@ -71,7 +71,7 @@ class RobocentricEkfSlam(EkfSlam):
        55(1), 2007.
     """
 
-    _update_map = staticmethod(update_and_move)
+    update_kernel = staticmethod(update_and_move)
     _refusals: ClassVar = {TAKEN: f"landmark_ids must be above {RESERVED[1]}"}
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:

@@ -241,5 +241,5 @@ class UnscentedSlam(EkfSlam):
     .. [2] I. Arasaratnam, S. Haykin, Cubature Kalman filters, IEEE TAC 54(6), 2009.
     """
 
-    _update_map = staticmethod(update_by_points)
-    _move_pose = staticmethod(move_by_points)
+    update_kernel = staticmethod(update_by_points)
+    move_kernel = staticmethod(move_by_points)

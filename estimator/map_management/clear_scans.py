@@ -88,7 +88,7 @@ class ClearScan(NamedTuple):
     #: the landmarks were given.
     slots: IntArray | None
     #: Place of the tentative landmark of each reading, or below 0, shape (m,).
-    again: IntArray
+    tentative_slots: IntArray
     #: The readings that the filter uses, and their landmarks.
     fed: tuple[Array, IntArray]
     #: The landmark of each reading, and the label of its tentative landmark.
@@ -135,7 +135,7 @@ class ClearScans:
             isinstance(inside, EkfSlam)
             and type(inside).predict is EkfSlam.predict
             and type(inside).update is EkfSlam.update
-            and type(inside)._update_map is update_map
+            and inside.update_kernel is update_map
             and type(inside.map) is GaussianMap
             and inside.sensor == BEARING_RANGE
             and inside.rules.gate == math.inf
@@ -186,12 +186,12 @@ class ClearScans:
             if not all(map(inside.slots.__contains__, row_ids)):
                 return None
             kept, given = known.after_scan(self._policy.confirm[1]), (readings, ids)
-            again = np.zeros(count, np.int64)
+            tentative_slots = np.zeros(count, np.int64)
             decided = given, row_ids, none, (), (), kept
-            return ClearScan(readings, number, (0.0,), None, again, *decided)
+            return ClearScan(readings, number, (0.0,), None, tentative_slots, *decided)
         tentative = known.mean, known.covariance, known.seen
         found = associate_clear(inside.block, self._tally, tentative, readings, ceiling)
-        costs, slots, again, chance, density = found
+        costs, slots, tentative_slots, chance, density = found
         if not len(costs):
             return None
         marks, fed = slots[0].tolist(), (readings, inside.parts.ids[slots[0]])
@@ -203,7 +203,7 @@ class ClearScans:
             unclear = [k for k, slot in enumerate(marks) if slot == AMBIGUOUS]
             pairs = zip(row_ids, marks, strict=True)
             row_ids = tuple([i if slot >= 0 else None for i, slot in pairs])
-        rest = again, fed, row_ids, none, tuple(new), tuple(unclear), known
+        rest = tentative_slots, fed, row_ids, none, tuple(new), tuple(unclear), known
         scan = ClearScan(readings, number, costs.tolist(), slots, *rest)
         if not len(chance) and not new:
             return scan
@@ -217,17 +217,22 @@ class ClearScans:
         See `ScanAssociation`.  ``chance`` is the probability to miss each of them, and
         ``density`` that of readings of no known landmark [1 / (rad m)].
         """
-        (needed, scans), again = self._policy.confirm, scan.again
+        (needed, scans), tentative_slots = self._policy.confirm, scan.tentative_slots
         numbers, known = tally_of(self._tally).numbers, scan.following
-        rows = np.flatnonzero(again >= 0)
+        rows = np.flatnonzero(tentative_slots >= 0)
         if len(rows):
-            shown = again[rows], scan.readings[rows], self._noise, density[rows]
+            shown = (
+                tentative_slots[rows],
+                scan.readings[rows],
+                self._noise,
+                density[rows],
+            )
             known = known.with_sightings(*shown)
         known = known.with_misses(chance)
-        fresh = [row for row in scan.tentative_rows if again[row] < 0]
+        fresh = [row for row in scan.tentative_rows if tentative_slots[row] < 0]
         if (len(rows) and known.proven(needed).any()) or (fresh and needed == 1):
             return None
-        labels = np.append(known.labels, NO_LABEL)[np.maximum(again, -1)]
+        labels = np.append(known.labels, NO_LABEL)[np.maximum(tentative_slots, -1)]
         labels[fresh] = [(scan.number << LABEL_BITS) + row for row in fresh]
         if fresh:
             share = min(float(numbers[SHARE] / numbers[SUMS]), 1.0)
@@ -242,9 +247,9 @@ class ClearScans:
         The best one comes first.  Those that the filter refuses are left out.
         """
         gaussian, found = self._filter.map, []
-        every = () if scan.slots is None else scan.slots
+        assignments = () if scan.slots is None else scan.slots
         ids, names = gaussian.parts.ids, [*gaussian.slots]
-        for cost, slots in zip(scan.costs, every, strict=True):
+        for cost, slots in zip(scan.costs, assignments, strict=True):
             rows, copy = slots >= 0, aligned_copy(gaussian.block)
             if cost <= ceiling and (
                 update_map(copy, scan.readings[rows], ids[slots[rows]]) == DONE
@@ -253,8 +258,8 @@ class ClearScans:
                 found.append((cost, MapView(after.mean, after.covariance, names)))
         return found
 
-    def take(self, scan: ClearScan) -> bool:
-        """Take in a scan as associated; return False if the filter refuses it."""
+    def update(self, scan: ClearScan) -> bool:
+        """Update by a scan as associated; return False if the filter refuses it."""
         gaussian, decided = self._filter.map, (scan.row_ids, scan.labels)
         new = self._recent.new_scan(scan.number, scan.readings, *decided)
         if self._filter is self._slam:
@@ -266,8 +271,8 @@ class ClearScans:
             except (ValueError, np.linalg.LinAlgError):
                 return False
         parts, is_given = gaussian.parts, scan.slots is None
-        slots = scan.again if scan.slots is None else scan.slots[0]
-        read = scan.readings, slots, scan.again
+        slots = scan.tentative_slots if scan.slots is None else scan.slots[0]
+        read = scan.readings, slots, scan.tentative_slots
         is_afar, is_used = count_clear(gaussian.block, self._tally, *read, is_given)
         self._ahead += 1
         if is_afar:
@@ -288,13 +293,13 @@ class ClearScans:
         self.forget()
         if not ahead:
             return before
-        records.misses, records.information = tally.misses, tally.information
+        records.misses, records.information = tally.miss_counts, tally.information
         known, numbers = before.detections, tally.numbers.tolist()
         lost = LostEvidence(*numbers[EVIDENCE:SUMS])
         lost = lost._replace(first_new=int(tally.whole[FIRST_NEW]))
         detections = known._replace(
             detected=tally.detected,
-            missed=_renewed(known.missed, records.ids, tally.missed, 1.0),
+            missed=_renewed(known.missed, records.ids, tally.miss_chances, 1.0),
             shown=_renewed(known.shown, records.ids, tally.shown, 0),
             lost=lost,
             path=np.vstack([known.path, *path]) if path else known.path,
@@ -355,7 +360,7 @@ COUNT, FIRST_NEW, NEWEST, HAS_PLACE, WHOLE = 0, 1, 2, 3, 4
 
 # The numbers after these: evidence that the run is lost, the sums of the density, the
 # last place on the path, the evidence of the scan that waits, and the settings.
-EVIDENCE, SUMS, SHARE, PLACE, FEWER, SETTINGS, NUMBERS = 0, 8, 11, 13, 15, 16, 40
+EVIDENCE, SUMS, SHARE, PLACE, FEWER, SETTINGS, NUMBERS = 0, 8, 11, 13, 15, 16, 34
 
 
 class Tally(NamedTuple):
@@ -365,12 +370,12 @@ class Tally(NamedTuple):
     numbers: Array  # (NUMBERS,)
     cells: Array  # (SECTORS, RINGS), of `UnexplainedDensity`
     detected: Array  # (3, SECTORS, RINGS), of `Detections`
-    missed: Array  # this and the next (n,), of `Detections`, in the order of the map
-    shown: IntArray
-    misses: IntArray  # this (n,) and the next (n, 3), of `LandmarkRecords`
+    miss_chances: Array  # `missed` of `Detections` (n,), in the order of the map
+    shown: IntArray  # (n,), of `Detections`
+    miss_counts: IntArray  # this (n,) and the next (n, 3), of `LandmarkRecords`
     information: Array
     next_detected: Array  # these (3 SECTORS RINGS,) and (n,) of a scan that waits
-    next_missed: Array
+    next_miss_chances: Array
 
 
 class ClearRules(NamedTuple):
@@ -428,11 +433,11 @@ def new_tally(
         density[:5],
     )
     tally.numbers[PLACE:FEWER] = place.ravel() if len(place) else 0.0
-    tally.numbers[SETTINGS : SETTINGS + len(settings)] = settings
+    tally.numbers[SETTINGS:] = settings
     tally.cells[:], tally.detected[:] = density.cells, detections.detected
-    tally.missed[:] = [detections.missed.get(i, 1.0) for i in ids]
+    tally.miss_chances[:] = [detections.missed.get(i, 1.0) for i in ids]
     tally.shown[:] = [detections.shown.get(i, 0) for i in ids]
-    tally.misses[:], tally.information[:] = records.misses, records.information
+    tally.miss_counts[:], tally.information[:] = records.misses, records.information
     return block
 
 
@@ -514,8 +519,12 @@ def associate_clear(
     """
     parts, tally, rows = parts_jit(block), tally_jit(tally_block), len(readings)
     settings, seen = settings_jit(tally), tentative[2]
-    density, again, chance = np.empty(rows), np.full(rows, NEW), np.ones(len(seen))
-    none = np.empty(0), np.empty((0, rows), np.int64), again, chance, density
+    density, tentative_slots, chance = (
+        np.empty(rows),
+        np.full(rows, NEW),
+        np.ones(len(seen)),
+    )
+    none = np.empty(0), np.empty((0, rows), np.int64), tentative_slots, chance, density
     is_known = tally.whole[COUNT] == parts.numbers[LANDMARKS]
     if not (is_known and _is_usable(readings, settings.min_range)):
         return none
@@ -525,21 +534,23 @@ def associate_clear(
     density[:] = settings.density
     if np.isnan(settings.density):
         fill_density(tally.cells, readings, longest, per_scan, density)
-    every, gate = density.copy(), settings.new_gate
+    in_all, gate = density.copy(), settings.new_gate
     if len(seen) > 0:
         share = min(tally.numbers[SHARE] / tally.numbers[SUMS], 1.0)
-        add_tentative(tentative, readings, settings.noise, gate, share, every)
+        add_tentative(tentative, readings, settings.noise, gate, share, in_all)
     belief = parts.mean, parts.covariance, parts.numbers[LANDMARKS]
     costs, slots, explained = _assign(
-        belief, readings, every, settings, ceiling, int(settings.most)
+        belief, readings, in_all, settings, ceiling, int(settings.most)
     )
     scan = slots, explained, readings
     best = _count_best(belief, parts.ids, tally, costs, scan)
     costs, slots = _with_rivals(costs, slots, best, ceiling)
     if len(costs) > 0 and len(seen) > 0:
         of_new = slots[0] == NEW, density, settings, longest
-        _associate_tentative(tentative, readings, of_new, tally, again, chance)
-    return costs, slots, again, chance, density
+        _associate_tentative(
+            tentative, readings, of_new, tally, tentative_slots, chance
+        )
+    return costs, slots, tentative_slots, chance, density
 
 
 @njit_allocating
@@ -548,7 +559,7 @@ def _associate_tentative(
     readings: Array,
     of_new: tuple[BoolArray, Array, ClearRules, float],
     tally: Tally,
-    again: IntArray,
+    tentative_slots: IntArray,
     chance: Array,
 ) -> None:
     """Fill the tentative landmark of each new reading, and the chance to miss each."""
@@ -558,7 +569,7 @@ def _associate_tentative(
         view = mean, P, len(seen)
         _, found, _ = _assign(view, readings[new], density[new], settings, np.inf, 1)
         for k in range(len(new)):
-            again[new[k]] = found[0, k]
+            tentative_slots[new[k]] = found[0, k]
     counts = tally.next_detected.copy().reshape(tally.detected.shape)
     nothing = new[:0], new[:0], readings[:0]
     is_telling = np.zeros(len(seen), np.bool_)
@@ -601,12 +612,12 @@ def _count_best(
     _, per_scan, longest = _of_density(tally)
     # The Poisson probability of no other reading.
     others = 2 * per_scan if np.isnan(settings_jit(tally).density) else 0.0
-    _copy(tally.missed, tally.next_missed)
+    _copy(tally.miss_chances, tally.next_miss_chances)
     for k in range(len(slots)):
         for j in range(len(is_telling)):
             is_older = ids[j] < tally.whole[FIRST_NEW]
             is_telling[j] = is_older and tally.shown[j] >= PROVEN
-        detected, missed = tally.detected.copy(), tally.missed[:n].copy()
+        detected, missed = tally.detected.copy(), tally.miss_chances[:n].copy()
         shown = slots[k], explained, readings
         cost, fewer = count_scan(
             (mean, P), shown, is_telling, longest, detected, missed
@@ -615,7 +626,7 @@ def _count_best(
         if k == 0 or costs[k] < costs[best]:
             best, tally.numbers[FEWER] = k, fewer
             _copy(detected.ravel(), tally.next_detected)
-            _copy(missed, tally.next_missed)
+            _copy(missed, tally.next_miss_chances)
     return best
 
 
@@ -684,7 +695,7 @@ def count_clear(
     tally_block: Array,
     readings: Array,
     slots: IntArray,
-    again: IntArray,
+    tentative_slots: IntArray,
     given: bool,
 ) -> tuple[bool, bool]:
     """Count a clear scan that the filter has taken in.
@@ -695,7 +706,7 @@ def count_clear(
         As of `associate_clear`.
     readings : ndarray, shape (m, 2)
         Rows (β, r) [rad, m].
-    slots, again : ndarray of int64, shape (m,)
+    slots, tentative_slots : ndarray of int64, shape (m,)
         The best association, and the tentative landmarks, as in `ClearScan`.
     given : bool
         Whether the landmarks were given; else the counts of the scan wait.
@@ -715,7 +726,7 @@ def count_clear(
     fed, used, strange = 0, 0, 0
     for k in range(count):
         if slots[k] < 0:
-            if again[k] < 0:
+            if tentative_slots[k] < 0:
                 seen[1, new], new = k, new + 1
                 strange += slots[k] == NEW
             continue
@@ -729,7 +740,7 @@ def count_clear(
         fed += 1
     if not given:
         _copy(tally.next_detected, tally.detected.ravel())
-        _copy(tally.next_missed, tally.missed)
+        _copy(tally.next_miss_chances, tally.miss_chances)
         newest = tally.whole[NEWEST]
         lost = evidence_of_misses_jit(lost, tally.numbers[FEWER], newest)
         is_afar = settings.keeps_path > 0 and _is_afar(parts, tally, longest / RINGS)
@@ -745,7 +756,7 @@ def count_clear(
     sums[2], sums[4] = count_readings(tally.cells, readings, seen[1, :new], lengths)
     sums[0], sums[1] = MEMORY * sums[0] + new, MEMORY * sums[1] + 1
     sums[3] = MEMORY * sums[3]
-    counts, heading = (tally.misses, tally.information), parts.mean[2]
+    counts, heading = (tally.miss_counts, tally.information), parts.mean[2]
     add_sightings(counts, seen[0, :used], shown[:used], heading, settings.sighting)
     return is_afar, used == fed
 

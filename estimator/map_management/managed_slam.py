@@ -65,7 +65,10 @@ Result = TypeVar("Result")
 TRIED = 4
 
 #: Largest number of hypotheses whose poses overlap.
-PER_BASIN = 3
+MOST_OVERLAPPING = 3
+
+#: Largest number of hypotheses that are astray and searched for places.
+MOST_ASTRAY = 3
 
 #: Least variance of a pose that counts, against rounding [m², rad²].
 NIL = 1e-12
@@ -249,19 +252,19 @@ class ManagedSlam(FilterWrapper):
             count = len(readings)
             ids = argument_checks.identity_array(landmark_ids, count, None)
         with changing(self, "update"):
-            report = self._take_clear(readings, ids)
+            report = self._update_clear(readings, ids)
             if report is not None:
                 return report
         with self._changing("update"):
             if ids is None:
-                return self._take(self._branches(readings))
+                return self._update_by(self._branches(readings))
             names: list[int] = ids.tolist()
             argument_checks.refuse_repeated(names)
             given = [
                 Branch(h.cost, h, partial(h.as_given, readings, names))
                 for h in self._hypotheses
             ]
-            return self._take(given)
+            return self._update_by(given)
 
     def observe_pose(
         self, reading: ArrayLike, matrix: ArrayLike, covariance: ArrayLike
@@ -287,7 +290,7 @@ class ManagedSlam(FilterWrapper):
                 pairs = zip(costs, reports, strict=True)
                 costs = [cost + cost_of(report) for cost, report in pairs]
             ranked = sorted(zip(costs, every, strict=True), key=itemgetter(0))
-            return self._take_over(ranked)
+            return self._continue_with(ranked)
 
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Marginalise mapped landmarks by hand, shape (n,); all else stays.
@@ -336,7 +339,7 @@ class ManagedSlam(FilterWrapper):
             loaded = [best, *(self._fresh() for _ in costs[1:])]
             for k in reversed(range(len(costs))):  # last the one in use
                 loaded[k].load_state_dict(without_prefix(state, str(k)))
-            self._take_over([*zip(costs, loaded, strict=True)])
+            self._continue_with([*zip(costs, loaded, strict=True)])
 
     def snapshot(self) -> tuple[Any, ...]:
         """Return the present state of every hypothesis, for :meth:`resume`."""
@@ -349,7 +352,7 @@ class ManagedSlam(FilterWrapper):
             for hypothesis in self._hypotheses:
                 hypothesis.recent.forget()
             self._spare = self._made
-            self._take_over([(cost, self._resumed(own)) for cost, own in kept])
+            self._continue_with([(cost, self._resumed(own)) for cost, own in kept])
             self.steps = steps
 
     def __repr__(self) -> str:
@@ -357,44 +360,44 @@ class ManagedSlam(FilterWrapper):
         several = f", best of {count} hypotheses" if count > 1 else ""
         return f"Managed {self.filter!r}{several}"
 
-    def _take_clear(self, readings: Array, ids: IntArray | None) -> UpdateReport | None:
-        """Take in a scan if it is clear in every hypothesis: see `ClearScans`."""
-        ceiling, ranked = np.inf, list[ClearBranch]()
-        for h in self._hypotheses:
-            scan = h.associate_clear(readings, ids, ceiling - h.cost)
-            if scan is None:
-                return None
-            ranked.append((h.cost + scan.costs[0], h, scan))
-            ceiling = min(ceiling, ranked[-1][0] + SPREAD)
-        if len(ranked) > 1:
-            ranked = sorted([r for r in ranked if r[0] <= ceiling], key=itemgetter(0))
-        has_rivals = any(
-            cost <= ceiling - h.cost for _, h, scan in ranked for cost in scan.costs[1:]
-        )
-        if has_rivals and self._is_split(ranked, ceiling):
-            return None
-        taken = self._taken(ranked)
+    # A clear scan: one way to associate it in each hypothesis, see `ClearScans`.
+
+    def _update_clear(
+        self, readings: Array, ids: IntArray | None
+    ) -> UpdateReport | None:
+        """Update by a scan if it is clear in every hypothesis; else return None."""
+        taken: list[tuple[float, Hypothesis]] = []
+        for cost, h, scan in self._clear_branches(readings, ids):
+            if h.update_clear(scan):
+                self.steps += not taken  # so that a later error leaves the mark
+                taken.append((cost, h))
         if not taken:
             return None
         if len(self._hypotheses) == 1:
             return taken[0][1].report
         chosen = distinct([h for _, h in taken], self.policy.hypotheses)
-        return self._take_over([pair for pair in taken if pair[1] in chosen])
+        return self._continue_with([pair for pair in taken if pair[1] in chosen])
 
-    def _taken(self, ranked: Sequence[ClearBranch]) -> list[tuple[float, Hypothesis]]:
-        """Let hypotheses take in a clear scan; return those that do.
-
-        The first one counts the step, so that an error in a later one leaves the mark.
-        """
-        taken: list[tuple[float, Hypothesis]] = []
-        for cost, h, scan in ranked:
-            if h.take_clear(scan):
-                self.steps += not taken
-                taken.append((cost, h))
-        return taken
+    def _clear_branches(
+        self, readings: Array, ids: IntArray | None
+    ) -> Sequence[ClearBranch]:
+        """Return the best association in each hypothesis; none if it is not clear."""
+        ceiling, ranked = np.inf, list[ClearBranch]()
+        for h in self._hypotheses:
+            scan = h.associate_clear(readings, ids, ceiling - h.cost)
+            if scan is None:
+                return ()
+            ranked.append((h.cost + scan.costs[0], h, scan))
+            ceiling = min(ceiling, ranked[-1][0] + SPREAD)
+        if len(ranked) > 1:
+            ranked = sorted([r for r in ranked if r[0] <= ceiling], key=itemgetter(0))
+        return () if self._is_split(ranked, ceiling) else ranked
 
     def _is_split(self, ranked: Sequence[ClearBranch], ceiling: float) -> bool:
         """Return whether a scan that seemed clear splits one of these hypotheses."""
+        others = ((h, cost) for _, h, scan in ranked for cost in scan.costs[1:])
+        if not any(cost <= ceiling - h.cost for h, cost in others):
+            return False
         tried = [
             (h.cost + cost, k, (view, scan.following.labels.tobytes()))
             for _, h, scan in ranked
@@ -437,7 +440,7 @@ class ManagedSlam(FilterWrapper):
         """
         parts: list[Hypothesis] = []
         found = ((h, h.places_of_scan(readings)) for h in astray)
-        for h, places in islice(filter(itemgetter(1), found), PER_BASIN):
+        for h, places in islice(filter(itemgetter(1), found), MOST_ASTRAY):
             for place in places:
                 part = self._resumed(h.snapshot())
                 reports = part.move_to(*place)
@@ -448,7 +451,7 @@ class ManagedSlam(FilterWrapper):
                     parts.append(part)
         return parts
 
-    def _take(self, branches: Sequence[Branch]) -> UpdateReport:
+    def _update_by(self, branches: Sequence[Branch]) -> UpdateReport:
         """Update filters by their associations, and continue with the best of them."""
         plans = [branch.complete() for branch in branches]
         every: list[Hypothesis] = []
@@ -470,9 +473,11 @@ class ManagedSlam(FilterWrapper):
             kept.append((cost + fed.plan.price, h))
         kept.sort(key=itemgetter(0))
         chosen = distinct([h for _, h in kept], self.policy.hypotheses)
-        return self._take_over([pair for pair in kept if pair[1] in chosen])
+        return self._continue_with([pair for pair in kept if pair[1] in chosen])
 
-    def _take_over(self, ranked: Sequence[tuple[float, Hypothesis]]) -> UpdateReport:
+    def _continue_with(
+        self, ranked: Sequence[tuple[float, Hypothesis]]
+    ) -> UpdateReport:
         """Continue with hypotheses and their costs, the best first; return its report.
 
         All others are reused later.
@@ -507,7 +512,7 @@ class ManagedSlam(FilterWrapper):
         with self._changing(call, anew=anew):
             best = self._hypotheses[0]
             change(best)
-            self._take_over([(0.0, best)])
+            self._continue_with([(0.0, best)])
 
     def _step(self, step: Callable[[Hypothesis], Result]) -> list[Result]:
         """Take a step with every hypothesis; the first one refuses what all would."""
@@ -646,10 +651,10 @@ class Hypothesis:
         assert self._clear is not None
         return self._clear.tried(scan, ceiling)
 
-    def take_clear(self, scan: ClearScan) -> bool:
-        """Take in a clear scan as associated; return False if the filter refuses it."""
+    def update_clear(self, scan: ClearScan) -> bool:
+        """Update by a clear scan as associated; return False if the filter refuses."""
         assert self._clear is not None
-        if not self._clear.take(scan):
+        if not self._clear.update(scan):
             return False
         self.editor.expire()
         if scan.following is not self.tentative:
@@ -768,8 +773,8 @@ class Hypothesis:
         fed = self.recent.with_scan(plan)
         return fed, self.recent.feed(fed)
 
-    def follow(self, fed: FedScans, report: UpdateReport) -> UpdateReport:
-        """Do what follows :meth:`feed`, and prune the map; return the whole report."""
+    def follow(self, fed: FedScans, report: UpdateReport) -> None:
+        """Do what follows :meth:`feed`: note the scan, and prune the map."""
         plan = fed.plan
         self.recent.note_scan(fed, report)
         self.editor.expire()
@@ -789,7 +794,6 @@ class Hypothesis:
             tentative_rows=tuple(plan.tentative_rows),
             ambiguous_rows=tuple(plan.ambiguous_rows),
         )
-        return self.report
 
     def remove(self, ids: list[int]) -> None:
         """Marginalise mapped landmarks; all else stays."""
@@ -863,7 +867,7 @@ def differing(beliefs: Sequence[tuple[MapView, bytes]], most: int) -> list[int]:
             break
         overlapping = sum(_overlap(poses[n], poses[k]) for n in chosen)
         alike = (views[n] for n in chosen if beliefs[n][1] == labels)
-        if overlapping < PER_BASIN and not any(is_near(v, view) for v in alike):
+        if overlapping < MOST_OVERLAPPING and not any(is_near(v, view) for v in alike):
             chosen.append(k)
     return chosen
 

@@ -18,7 +18,7 @@ from slamgym.sim_configs import action_sequence, load_scenario
 @pytest.fixture
 def count(monkeypatch):
     """Return a list with a flag per scan of the first twin: whether it is clear."""
-    clear, take = [], ManagedSlam._take_clear
+    clear, take = [], ManagedSlam._update_clear
 
     def counted(slam, *args):
         report = take(slam, *args)
@@ -26,7 +26,7 @@ def count(monkeypatch):
             clear.append(report is not None)
         return report
 
-    monkeypatch.setattr(ManagedSlam, "_take_clear", counted)
+    monkeypatch.setattr(ManagedSlam, "_update_clear", counted)
     return clear
 
 

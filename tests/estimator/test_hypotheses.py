@@ -11,8 +11,8 @@ from slamgym.estimator import EkfSlam, UpdateReport, make_estimator
 from slamgym.estimator.association import scan_assignments
 from slamgym.estimator.interface import MapView
 from slamgym.estimator.map_management.managed_slam import (
+    MOST_OVERLAPPING,
     OVERLAP,
-    PER_BASIN,
     Hypothesis,
     ManagedSlam,
     distinct,
@@ -428,7 +428,7 @@ def test_an_error_after_one_hypothesis_has_taken_a_clear_scan_leaves_a_mark(
 ):
     world, scans = slippery_drive
     slam, _ = several_hypotheses(scans, world)
-    take, taken = Hypothesis.take_clear, []
+    take, taken = Hypothesis.update_clear, []
 
     def only_once(hypothesis, readings):
         if taken:
@@ -436,7 +436,7 @@ def test_an_error_after_one_hypothesis_has_taken_a_clear_scan_leaves_a_mark(
         taken.append(hypothesis)
         return take(hypothesis, readings)
 
-    monkeypatch.setattr(Hypothesis, "take_clear", only_once)
+    monkeypatch.setattr(Hypothesis, "update_clear", only_once)
     mapped = [{*h.map_view().mapped} for h in slam.hypotheses]
     with pytest.raises(MemoryError):
         slam.update([(0.0, 5.0)], [min(set.intersection(*mapped))])
@@ -558,9 +558,9 @@ def test_a_loop_is_not_closed_by_a_new_landmark_that_earlier_scans_would_have_sh
     ("gap", "ratio"), [(1.9, 1.0), (2.1, 1.0), (0.0, 5.1), (0.0, 5.7), (-1.5, 2.0)]
 )
 def test_variants_of_one_pose_leave_room_for_another(gap, ratio):
-    std, count = 0.2, PER_BASIN + 1
+    std, count = 0.2, MOST_OVERLAPPING + 1
     # They differ by what is not confirmed.
-    first = [standing(1e-3 * k, std, rows=k + 1) for k in range(PER_BASIN)]
+    first = [standing(1e-3 * k, std, rows=k + 1) for k in range(MOST_OVERLAPPING)]
     other = standing(gap * std, ratio * std)
     is_variant = bhattacharyya(0.0, std, gap * std, ratio * std) <= OVERLAP
     kept = distinct([*first, other], most=10)
@@ -570,10 +570,10 @@ def test_variants_of_one_pose_leave_room_for_another(gap, ratio):
 
 
 def test_hypotheses_are_compared_where_rounding_makes_a_variance_negative():
-    hypotheses = [standing(x, 0.2) for x in (*[0.0] * (PER_BASIN + 1), 1.0)]
+    hypotheses = [standing(x, 0.2) for x in (*[0.0] * (MOST_OVERLAPPING + 1), 1.0)]
     for hypothesis in hypotheses:
         hypothesis.map_view().covariance[0, 0] = -1e-9
-    kept = [*hypotheses[:PER_BASIN], hypotheses[-1]]
+    kept = [*hypotheses[:MOST_OVERLAPPING], hypotheses[-1]]
     assert distinct(hypotheses, most=10) == kept
 
 
