@@ -18,14 +18,16 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from ... import argument_checks
-from ...arrays import Array, IntArray
-from ...jit import jit, jit_in_place, njit_allocating
+from ...arrays import Array, BoolArray, IntArray
+from ...jit import jit, jit_in_place, njit_allocating, njit_internal
 from ..interface import MapView
 from ..kernels.assignment_search import (
     UNPAIRED,
     best_assignments,
+    cost_if_settled,
     fill_expected,
     largest_change,
+    only_partners,
 )
 from ..models.bearing_range import (
     reading_slopes_jit,
@@ -133,27 +135,25 @@ def assign_jointly(
     """
     (mean, P, landmarks), (readings, missing, limits) = belief, scan
     (new_gate, pair_gate, ceiling), (pairs_first, most, nodes) = gates, search
-    noise, rows = Noise(*of_sensor), len(readings)
+    rows = len(readings)
     squared = np.full((rows, landmarks), np.inf)
-    fill_distances(mean, P, readings, of_sensor, new_gate, (squared, squared.copy()))
-    is_near = [np.isfinite(squared[:, j]).any() for j in range(landmarks)]
-    explained = np.flatnonzero(np.array(is_near))
+    unused = np.empty_like(squared)
+    fill_distances(mean, P, readings, of_sensor, new_gate, (squared, unused))
+    explained, feasible = _near_pairs(squared, pair_gate)
     near = len(explained)
     expected, joint = np.empty((near, 2)), np.empty((2 * near, 2 * near))
     fill_expected(mean, P, explained, expected, joint)
     innovations, variances = np.empty((rows, near, 2)), np.empty((rows, near, 2))
-    feasible = np.empty((rows, near), np.bool_)
-    for i in range(rows):
-        for j in range(near):
-            bearing, distance = readings[i, 0] - expected[j, 0], expected[j, 1]
-            innovations[i, j, 0] = wrap_angle_jit(bearing)
-            innovations[i, j, 1] = readings[i, 1] - distance
-            spread = joint[2 * j + 1, 2 * j + 1]
-            q = likely_variances_jit(noise, readings[i, 1], distance, spread)
-            variances[i, j, 0], variances[i, j, 1] = max(q[0], TINY), max(q[1], TINY)
-            feasible[i, j] = squared[i, explained[j]] <= pair_gate
+    pairs, of_map = (feasible, innovations, variances), (expected, joint)
     of_scan = innovations, joint, variances, feasible, missing
     problem = *of_scan, pair_gate, limits, pairs_first
+    partners = only_partners(feasible)
+    if len(partners) == rows and not pairs_first:
+        _fill_pairs(pairs, readings, of_map, of_sensor, True)
+        cost = cost_if_settled(problem, partners, most, BRANCH_SPREAD, ceiling)
+        if cost < np.inf:
+            return np.full(1, cost), explained[partners].reshape((1, rows)), explained
+    _fill_pairs(pairs, readings, of_map, of_sensor, False)
     costs, marks, distances, _ = best_assignments(
         problem, most, BRANCH_SPREAD, ceiling, nodes
     )
@@ -167,6 +167,45 @@ def assign_jointly(
             costs[kept], marks[kept] = costs[s], marks[s]
             kept += 1
     return costs[:kept], slots[:kept], explained
+
+
+@njit_allocating
+def _near_pairs(squared: Array, pair_gate: float) -> tuple[IntArray, BoolArray]:
+    """Return the landmarks with a finite distance, (k,), and pairs to consider."""
+    (rows, landmarks), count = squared.shape, 0
+    explained = np.empty(landmarks, np.int64)
+    feasible = np.empty(squared.shape, np.bool_)
+    for j in range(landmarks):
+        is_near = False
+        for i in range(rows):
+            is_near |= squared[i, j] < np.inf
+            feasible[i, count] = squared[i, j] <= pair_gate
+        if is_near:
+            explained[count], count = j, count + 1
+    return explained[:count], feasible[:, :count].copy()
+
+
+@njit_internal
+def _fill_pairs(
+    pairs: tuple[BoolArray, Array, Array],
+    readings: Array,
+    of_map: tuple[Array, Array],
+    of_sensor: tuple[float, ...],
+    partners_only: bool,
+) -> None:
+    """Fill innovations and variances of all pairs, or of partners and landmark 0."""
+    (feasible, innovations, variances), (expected, joint) = pairs, of_map
+    noise = Noise(*of_sensor)
+    for i in range(feasible.shape[0]):
+        for j in range(feasible.shape[1]):
+            if partners_only and j > 0 and not feasible[i, j]:
+                continue
+            bearing, distance = readings[i, 0] - expected[j, 0], expected[j, 1]
+            innovations[i, j, 0] = wrap_angle_jit(bearing)
+            innovations[i, j, 1] = readings[i, 1] - distance
+            spread = joint[2 * j + 1, 2 * j + 1]
+            q = likely_variances_jit(noise, readings[i, 1], distance, spread)
+            variances[i, j, 0], variances[i, j, 1] = max(q[0], TINY), max(q[1], TINY)
 
 
 @njit_allocating

@@ -122,7 +122,7 @@ class GaussianMap:
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
         """Return to a :meth:`snapshot`, in place where the layout is the same."""
-        self._detach_report()
+        self.detach_report()
         memory, starts = snapshot["block"], slice(STARTS, NUMBERS)
         if memory[starts].tobytes() == self.block[starts].tobytes():
             self._slots, self._last, self.block[:] = {}, type(None), memory
@@ -251,7 +251,7 @@ class GaussianMap:
         report : UpdateReport, optional
             The report of the last of these steps; it has ``detach``, as a `ScanReport`.
         """
-        self._detach_report()
+        self.detach_report()
         if block is None:
             block = self.blank(max(FIRST_LANDMARKS, len(ids)))
         parts = parts_of(block)
@@ -272,7 +272,7 @@ class GaussianMap:
 
     def take_in(self, update: UpdateKernel, readings: Array, ids: IntArray) -> int:
         """Update the map with a scan, as `update_map`; return the status."""
-        if (last := self._last()) is not None:  # `_detach_report`, inlined
+        if (last := self._last()) is not None:  # `detach_report`, inlined
             last.detach()
         status = update(self.block, readings, ids)
         if status == NO_ROOM:
@@ -287,7 +287,7 @@ class GaussianMap:
         self._last = ref(report)
         return report
 
-    def _detach_report(self) -> None:
+    def detach_report(self) -> None:
         """Copy the results of the last report, if it is still in use."""
         if (last := self._last()) is not None:
             last.detach()

@@ -278,6 +278,111 @@ def best_assignments(
     return costs, marks, least_distances(problem, marks), visited < nodes
 
 
+@njit_allocating
+def only_partners(feasible: BoolArray) -> IntArray:
+    """Return the one landmark that each reading may belong to; nothing if not all do.
+
+    No two readings may belong to the same landmark.
+    """
+    partners = np.empty(len(feasible), np.int64)
+    is_taken = np.zeros(feasible.shape[1], np.bool_)
+    for i in range(feasible.shape[0]):
+        found = 0
+        for j in range(feasible.shape[1]):
+            if feasible[i, j]:
+                if is_taken[j]:
+                    return partners[:0]
+                partners[i], is_taken[j], found = j, True, found + 1
+        if found != 1:
+            return partners[:0]
+    return partners
+
+
+@njit_allocating
+def cost_if_settled(
+    of_scan: tuple[Any, ...],
+    partners: IntArray,
+    most: int,
+    spread: float,
+    ceiling: float,
+) -> float:
+    """Return the cost of pairing all readings, if the search returns this alone.
+
+    The search finds it first, to the bit, if every pair costs less than its reading
+    left out, given the pairs before it.  To leave out readings U costs in addition ::
+
+        Σ λ − ln det S_U − ρᵀ (Q − C⁺)⁻¹ ρ
+
+    where S_U is given all other pairs, and ρ and C⁺ are the innovations and C of U
+    after all pairs.  S_U is not larger than each S before any pair, and C⁺ ⪯ τ Q with
+    τ = Σ tr Q⁻¹ C⁺.  The last term is at most νᵀ S⁻¹ ν of all pairs.  So u readings
+    cost at least u times the least of these, or of the first two less νᵀ S⁻¹ ν::
+
+        λ − ln det S − ρᵀ Q⁻¹ ρ / (1 − τ)
+
+    Parameters
+    ----------
+    of_scan, most, spread, ceiling
+        As in :func:`best_assignments`, without ``pairs_first``.  Of innovations and
+        variances, those of partners and of the first landmark are read.
+    partners : ndarray of int64, shape (m,)
+        The landmark of each reading, from :func:`only_partners`.
+
+    Returns
+    -------
+    float
+        Infinite if other assignments may be of interest.
+    """
+    problem, rows = Problem(*of_scan), len(partners)
+    # The search decides the last of these first.
+    order = _decision_order(problem.feasible, problem.innovations)[::-1]
+    names, missing = partners[order], problem.missing[order]
+    nu, Q = np.empty((rows, rows, 2)), np.empty((rows, rows, 2))
+    h, C = np.zeros((2, rows, 2)), np.empty((2, 2 * rows, 2 * rows))
+    for a in range(rows):
+        for i in range(2):
+            nu[a, a, i] = problem.innovations[order[a], names[a], i]
+            Q[a, a, i] = problem.variances[order[a], names[a], i]
+            for b in range(a + 1):
+                for k in range(2):
+                    value = problem.joint[2 * names[a] + i, 2 * names[b] + k]
+                    C[0, 2 * a + i, 2 * b + k] = value
+    cost, squared, here, gains = 0.0, 0.0, 0, np.empty((4, 2 * rows))
+    saved = np.empty(rows)  # λ − ln det S
+    for a in range(rows):
+        c, d = 2 * a, 2 * a + 1
+        s00, s11 = C[0, c, c] + Q[a, a, 0], C[0, d, d] + Q[a, a, 1]
+        saved[a] = missing[a] - np.log(s00 * s11 - C[0, d, c] * C[0, d, c])
+    for a in range(rows - 1, -1, -1):
+        c, d = 2 * a, 2 * a + 1
+        n0, n1 = nu[a, a, 0] - h[here, a, 0], nu[a, a, 1] - h[here, a, 1]
+        s00, s11 = C[here, c, c] + Q[a, a, 0], C[here, d, d] + Q[a, a, 1]
+        x, determinant = fit(n0, n1, s00, C[here, d, c], s11)
+        own = x + np.log(determinant)
+        if not (x <= problem.gate and own < missing[a]):
+            return np.inf
+        cost, squared = cost + own, squared + x
+        condition(nu, Q, a, a, rows, h, C, here, 1 - here, gains)
+        here = 1 - here
+    limit = min(cost if most == 1 else np.inf, cost + spread, ceiling)
+    margin = max(limit - cost, 0.0) + ROUNDING
+    share = 0.0  # the largest tr Q⁻¹ C⁺
+    for a in range(rows):
+        own = C[here, 2 * a, 2 * a] / Q[a, a, 0]
+        share = max(share, own + C[here, 2 * a + 1, 2 * a + 1] / Q[a, a, 1])
+    for u in range(1, rows + 1):
+        if u * saved.min() - squared >= margin:
+            break
+        if not u * share < 1:
+            return np.inf
+        for a in range(rows):
+            n0, n1 = nu[a, a, 0] - h[here, a, 0], nu[a, a, 1] - h[here, a, 1]
+            x = n0 * n0 / Q[a, a, 0] + n1 * n1 / Q[a, a, 1]
+            if not u * (saved[a] - x / (1 - u * share)) >= margin:
+                return np.inf
+    return cost
+
+
 # --------------------------------------------------------------------------------------
 # Expected readings of several landmarks, conditioned on pairs of a scan, compiled.
 #
@@ -288,6 +393,9 @@ UNPAIRED = -1
 
 #: A landmark is sure to be where the map has it up to this det S / det Q.
 SURE = 9.0
+
+#: A difference of costs counts if it exceeds what rounding can cause.
+ROUNDING = 1e-6
 
 #: Cost that a pair saves where the number of pairs counts before all else.
 PAIR_BONUS = 1e6
@@ -340,18 +448,27 @@ def fill_expected(
             x, y = slopes[2 * i], slopes[2 * i + 1]
             row = H[2 * j + i]
             row[0], row[1], row[2], row[3], row[4] = -x, -y, i - 1.0, x, y
-    left = np.empty(5)
     for a in range(2 * len(slots)):
+        of_pose = _product(H, P, columns, a, 0), _product(H, P, columns, a, 1)
+        of_heading = _product(H, P, columns, a, 2)
         for j in range(a // 2 + 1):
-            for n in range(5):
-                left[n] = 0.0
-                for k in range(5):
-                    left[n] += H[a, k] * P[columns[a // 2, k], columns[j, n]]
+            x = _product(H, P, columns, a, columns[j, 3])
+            y = _product(H, P, columns, a, columns[j, 4])
             for b in (2 * j, 2 * j + 1):
-                value = 0.0
-                for n in range(5):
-                    value += left[n] * H[b, n]
+                value = of_pose[0] * H[b, 0] + of_pose[1] * H[b, 1]
+                value += of_heading * H[b, 2]
+                value += x * H[b, 3]
+                value += y * H[b, 4]
                 joint[a, b] = joint[b, a] = value
+
+
+@njit_internal
+def _product(H: Array, P: Array, columns: IntArray, a: int, column: int) -> float:
+    """Return an entry of H P."""
+    value = 0.0
+    for k in range(5):
+        value += H[a, k] * P[columns[a // 2, k], column]
+    return value
 
 
 # Numba counts the references to each view of an array, and to each array that it passes

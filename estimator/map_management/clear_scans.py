@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -56,6 +56,7 @@ from ..filters.gaussian_map import (
     LANDMARKS,
     GaussianMap,
     Parts,
+    find_slots,
     parts_jit,
     parts_of,
     update_map,
@@ -65,7 +66,7 @@ from ..kernels.scan_update import DONE, OUTCOME, SLOT, USED, usable
 from ..models.bearing_range import wrap_angle
 from ..models.relative_geometry import variance_from_robot
 from ..models.sensors import BEARING_RANGE
-from .loop_closing import ACCURATE, FEWEST_READINGS, LOCAL_STD
+from .loop_closing import ACCURATE, FEWEST_READINGS, LOCAL_STD, NEAR_STDS
 from .policy import LandmarkPolicy
 from .pruning import LandmarkRecords, add_sightings, noise_of_sightings
 from .recent_scans import RecentScans
@@ -75,6 +76,9 @@ from .recent_scans import RecentScans
 SPREAD = 40.0
 
 
+NO_SLOTS: IntArray = np.empty((1, 0), np.int64)
+
+
 class ClearScan(NamedTuple):
     """A scan as one hypothesis associates it."""
 
@@ -82,23 +86,26 @@ class ClearScan(NamedTuple):
     readings: Array
     #: Number of the scan.
     number: int
-    #: −2 ln of the likelihood of the associations to consider, the best first.
-    costs: Sequence[float]
-    #: Slot of the map of each reading, `NEW` or `AMBIGUOUS`, shape (M, m); None where
-    #: the landmarks were given.
-    slots: IntArray | None
-    #: Place of the tentative landmark of each reading, or below 0, shape (m,).
-    tentative_slots: IntArray
-    #: The readings that the filter uses, and their landmarks.
-    fed: tuple[Array, IntArray]
     #: The landmark of each reading, and the label of its tentative landmark.
     row_ids: tuple[int | None, ...]
     labels: tuple[int, ...]
-    #: Rows of tentative landmarks, and those that are ambiguous.
-    tentative_rows: tuple[int, ...]
-    ambiguous_rows: tuple[int, ...]
+    #: The readings that the filter uses, and their landmarks.
+    fed: tuple[Array, IntArray]
     #: The tentative landmarks after the scan.
     following: TentativeLandmarks
+    #: What `count_clear` returned, where the scan has been taken in at once.
+    counted: tuple[bool, bool] | None
+    #: −2 ln of the likelihood of the associations to consider, the best first.
+    costs: Sequence[float] = (0.0,)
+    #: Slot of the map of each reading, `NEW` or `AMBIGUOUS`, shape (M, m).
+    slots: IntArray = NO_SLOTS
+    #: Place of the tentative landmark of each reading, or below 0, shape (m,).
+    tentative_slots: IntArray = NO_SLOTS[0]
+    #: Rows of tentative landmarks, and those that are ambiguous.
+    tentative_rows: tuple[int, ...] = ()
+    ambiguous_rows: tuple[int, ...] = ()
+    #: Whether the landmarks were given.
+    is_given: bool = False
 
 
 class ClearScans:
@@ -159,6 +166,8 @@ class ClearScans:
         ceiling: float,
         candidates: Candidates,
         records: LandmarkRecords,
+        *,
+        alone: bool,
     ) -> ClearScan | None:
         """Associate a scan (m, 2); return None if it is not clear.
 
@@ -172,40 +181,70 @@ class ClearScans:
             Cost beyond which only the best association is of interest.
         candidates, records
             As last renewed, but for the tentative landmarks.
+        alone : bool
+            Whether there is no other hypothesis.  If nothing is left to decide, the
+            filter then takes in the scan at once.
         """
-        inside, count, known = self._filter.map, len(readings), candidates.tentative
-        if self._tally is None:
-            mapped = [*inside.slots]
-            is_full = len(mapped) > (self._policy.capacity or math.inf)
-            if is_full or not may_be_clear(candidates, records, mapped):
-                return None
-            self._tally = new_tally(candidates, records, self._settings)
-        number, none = candidates.scan + self._ahead, (NO_LABEL,) * count
-        if ids is not None:
-            row_ids = tuple(ids.tolist())
-            if not all(map(inside.slots.__contains__, row_ids)):
-                return None
-            kept, given = known.after_scan(self._policy.confirm[1]), (readings, ids)
-            tentative_slots = np.zeros(count, np.int64)
-            decided = given, row_ids, none, (), (), kept
-            return ClearScan(readings, number, (0.0,), None, tentative_slots, *decided)
-        tentative = known.mean, known.covariance, known.seen
-        found = associate_clear(inside.block, self._tally, tentative, readings, ceiling)
-        costs, slots, tentative_slots, chance, density = found
-        if not len(costs):
+        if self._tally is None and not self._begin(candidates, records):
             return None
-        marks, fed = slots[0].tolist(), (readings, inside.parts.ids[slots[0]])
-        row_ids, new, unclear = tuple(fed[1].tolist()), list[int](), list[int]()
+        gaussian, known = self._filter.map, candidates.tentative
+        is_given, count = ids is not None, len(readings)
+        at_once = alone and self._filter is self._slam and not len(known.seen)
+        if at_once:
+            gaussian.detach_report()
+        names = np.empty(count, np.int64) if ids is None else ids
+        tentative = known.mean, known.covariance, known.seen
+        blocks, flags = (gaussian.block, self._tally), (is_given, at_once)
+        is_taken, is_afar, is_used, found = associate_clear(
+            blocks, tentative, readings, names, ceiling, flags
+        )
+        if found is None and not is_taken:
+            return None
+        number, row_ids = candidates.scan + self._ahead, tuple(names.tolist())
+        labels, fed = (NO_LABEL,) * count, (readings, names)
+        counted = (is_afar, is_used) if is_taken else None
+        scan = ClearScan(readings, number, row_ids, labels, fed, known, counted)
+        if found is None:
+            return scan
+        if is_given:
+            following = known.after_scan(self._policy.confirm[1])
+            return scan._replace(slots=found[1], following=following, is_given=True)
+        return self._with_rows(scan, *found)
+
+    def _begin(self, candidates: Candidates, records: LandmarkRecords) -> bool:
+        """Make the memory of the kernels, if scans of this map may be clear."""
+        mapped = [*self._filter.map.slots]
+        is_full = len(mapped) > (self._policy.capacity or math.inf)
+        if is_full or not may_be_clear(candidates, records, mapped):
+            return False
+        self._tally = new_tally(candidates, records, self._settings)
+        return True
+
+    def _with_rows(
+        self,
+        scan: ClearScan,
+        costs: Array,
+        slots: IntArray,
+        tentative_slots: IntArray,
+        chance: Array,
+        density: Array,
+    ) -> ClearScan | None:
+        """Note what each row is of; return None if a tentative landmark is proven."""
+        scan = scan._replace(
+            costs=costs.tolist(), slots=slots, tentative_slots=tentative_slots
+        )
+        marks = slots[0].tolist()
         if min(marks, default=0) < 0:
-            rows = slots[0] >= 0
-            fed = readings[rows], fed[1][rows]
-            new = [k for k, slot in enumerate(marks) if slot == NEW]
-            unclear = [k for k, slot in enumerate(marks) if slot == AMBIGUOUS]
-            pairs = zip(row_ids, marks, strict=True)
-            row_ids = tuple([i if slot >= 0 else None for i, slot in pairs])
-        rest = tentative_slots, fed, row_ids, none, tuple(new), tuple(unclear), known
-        scan = ClearScan(readings, number, costs.tolist(), slots, *rest)
-        if not len(chance) and not new:
+            rows, (readings, names) = slots[0] >= 0, scan.fed
+            pairs = zip(scan.row_ids, marks, strict=True)
+            ambiguous = [k for k, slot in enumerate(marks) if slot == AMBIGUOUS]
+            scan = scan._replace(
+                row_ids=tuple([i if slot >= 0 else None for i, slot in pairs]),
+                fed=(readings[rows], names[rows]),
+                tentative_rows=tuple(np.flatnonzero(slots[0] == NEW).tolist()),
+                ambiguous_rows=tuple(ambiguous),
+            )
+        if not len(chance) and not scan.tentative_rows:
             return scan
         return self._with_tentative(scan, chance, density)
 
@@ -247,9 +286,8 @@ class ClearScans:
         The best one comes first.  Those that the filter refuses are left out.
         """
         gaussian, found = self._filter.map, []
-        assignments = () if scan.slots is None else scan.slots
         ids, names = gaussian.parts.ids, [*gaussian.slots]
-        for cost, slots in zip(scan.costs, assignments, strict=True):
+        for cost, slots in zip(scan.costs, scan.slots, strict=True):
             rows, copy = slots >= 0, aligned_copy(gaussian.block)
             if cost <= ceiling and (
                 update_map(copy, scan.readings[rows], ids[slots[rows]]) == DONE
@@ -260,30 +298,39 @@ class ClearScans:
 
     def update(self, scan: ClearScan) -> bool:
         """Update by a scan as associated; return False if the filter refuses it."""
-        gaussian, decided = self._filter.map, (scan.row_ids, scan.labels)
-        new = self._recent.new_scan(scan.number, scan.readings, *decided)
+        recent, before, unused = self._recent, None, tuple[int, ...]()
+        if scan.tentative_rows:
+            before = recent.state_before(scan.number, scan.labels)
+        counted = scan.counted or self._updated(scan)
+        if counted is None:
+            return False
+        is_afar, is_used = counted
+        self._ahead += 1
+        if is_afar:
+            parts = self._filter.map.parts
+            mean, P = parts.mean[:3], parts.covariance[:3, :3]
+            self._path.append([scan.number, *mean.tolist(), *P.ravel().tolist()])
+        if not is_used:
+            report = self._slam.report()
+            unused = *report.rejected_ids, *report.skipped_ids
+        decided = scan.row_ids, scan.labels
+        recent.note_clear(scan.number, scan.readings, decided, before, unused)
+        return True
+
+    def _updated(self, scan: ClearScan) -> tuple[bool, bool] | None:
+        """Update the filter by a scan, and count it; return None if it refuses."""
+        gaussian = self._filter.map
         if self._filter is self._slam:
             if gaussian.take_in(update_map, *scan.fed) != DONE:
-                return False
+                return None
         else:
             try:
                 self._slam.update(*scan.fed)
             except (ValueError, np.linalg.LinAlgError):
-                return False
-        parts, is_given = gaussian.parts, scan.slots is None
-        slots = scan.tentative_slots if scan.slots is None else scan.slots[0]
-        read = scan.readings, slots, scan.tentative_slots
-        is_afar, is_used = count_clear(gaussian.block, self._tally, *read, is_given)
-        self._ahead += 1
-        if is_afar:
-            mean, P = parts.mean[:3], parts.covariance[:3, :3]
-            self._path.append([scan.number, *mean.tolist(), *P.ravel().tolist()])
-        unused: set[int] = set()
-        if not is_used:
-            report = self._slam.report()
-            unused.update(report.rejected_ids, report.skipped_ids)
-        self._recent.note_clear(new, unused)
-        return True
+                return None
+        read = scan.readings, scan.slots[0], scan.tentative_slots
+        found: Any = count_clear(gaussian.block, self._tally, *read, scan.is_given)
+        return cast("tuple[bool, bool]", found)
 
     def renew(self, before: Candidates, records: LandmarkRecords) -> Candidates:
         """Return the candidates after the scans taken in; renew the records."""
@@ -376,6 +423,12 @@ class Tally(NamedTuple):
     information: Array
     next_detected: Array  # these (3 SECTORS RINGS,) and (n,) of a scan that waits
     next_miss_chances: Array
+
+
+#: −2 ln of the likelihood of associations, the best first, and their slots, as in
+#: `ClearScan`; the tentative landmarks, the probability of missing each of them, and
+#: the density of readings of no known landmark [1 / (rad m)].
+Associations = tuple[Array, IntArray, IntArray, Array, Array]
 
 
 class ClearRules(NamedTuple):
@@ -491,45 +544,90 @@ settings_jit = njit_inlined(settings_in)
 
 @jit
 def associate_clear(
-    block: Array,
-    tally_block: Array,
+    blocks: tuple[Array, Array],
     tentative: tuple[Array, Array, IntArray],
     readings: Array,
+    ids: IntArray,
     ceiling: float,
-) -> tuple[Array, IntArray, IntArray, Array, Array]:
-    """Associate a scan, and count what it shows; return the parts of `ClearScan`.
+    flags: tuple[bool, bool],
+) -> tuple[bool, bool, bool, Associations | None]:
+    """Associate a scan; take it in at once if nothing is left to decide.
 
     Parameters
     ----------
-    block : ndarray
-        The memory of the filter, which stays as it is.
-    tally_block : ndarray
-        That of its hypothesis (:class:`Tally`): the counts of the scan wait in it.
+    blocks : tuple of ndarray
+        The memory of the filter, and that of its hypothesis (:class:`Tally`), in which
+        the counts of the scan wait.
     tentative : tuple
         Mean, covariance and ``seen`` of the `TentativeLandmarks`.
     readings : ndarray, shape (m, 2)
         Rows (β, r) [rad, m].
+    ids : ndarray of int64, shape (m,)
+        The landmarks, if they are given, else filled with those of the best
+        association.
     ceiling : float
         Cost beyond which only the best association is of interest.
+    flags : tuple of bool
+        Whether the landmarks are given, and whether the filter may take in a scan with
+        a single association, of mapped landmarks alone.
 
     Returns
     -------
-    tuple of ndarray
-        Without any association, if the scan is not clear.
+    is_taken : bool
+        Whether the filter has taken in the scan; else its belief stays as it is.
+    is_afar, is_used : bool
+        As of `count_clear`, if so.
+    found : tuple or None
+        If the scan is clear, but not taken in: its associations.
     """
-    parts, tally, rows = parts_jit(block), tally_jit(tally_block), len(readings)
-    settings, seen = settings_jit(tally), tentative[2]
-    density, tentative_slots, chance = (
-        np.empty(rows),
-        np.full(rows, NEW),
-        np.ones(len(seen)),
-    )
-    none = np.empty(0), np.empty((0, rows), np.int64), tentative_slots, chance, density
-    is_known = tally.whole[COUNT] == parts.numbers[LANDMARKS]
-    if not (is_known and _is_usable(readings, settings.min_range)):
-        return none
-    if _may_be_lost(parts, settings):
-        return none
+    (block, tally_block), (is_given, at_once), count = blocks, flags, len(readings)
+    parts, tally = parts_jit(block), tally_jit(tally_block)
+    if count > len(parts.scan_ids) or tally.whole[COUNT] != parts.numbers[LANDMARKS]:
+        return False, False, False, None
+    if is_given:
+        found = _given(parts, ids, len(tentative[2]))
+    else:
+        found = _associate(parts, tally, tentative, readings, ceiling)
+    slots = found[1]
+    if len(slots) == 0:
+        return False, False, False, None
+    for k in range(count):
+        if slots[0, k] >= 0:
+            ids[k] = parts.ids[slots[0, k]]
+    is_single = at_once and len(slots) == 1 and (slots >= 0).all()
+    if is_single and update_map(block, readings, ids) == DONE:
+        read = readings, slots[0], slots[0]
+        is_afar, is_used = count_clear(block, tally_block, *read, is_given)
+        return True, is_afar, is_used, None
+    return False, False, False, found
+
+
+@njit_allocating
+def _given(parts: Parts, ids: IntArray, tentative: int) -> Associations:
+    """Return the association by given landmarks; none if one of them is new."""
+    is_new, count = find_slots(parts, ids) > 0, len(ids)
+    slots = parts.ledger[SLOT, : 0 if is_new else count].copy()
+    slots = slots.reshape((0 if is_new else 1, count))
+    unused = np.full(count, NEW), np.ones(tentative), np.ones(count)
+    return np.zeros(len(slots)), slots, *unused
+
+
+@njit_allocating
+def _associate(
+    parts: Parts,
+    tally: Tally,
+    tentative: tuple[Array, Array, IntArray],
+    readings: Array,
+    ceiling: float,
+) -> Associations:
+    """Associate a scan, and count what it shows; without associations if not clear."""
+    settings, seen, rows = settings_jit(tally), tentative[2], len(readings)
+    density, chance = np.empty(rows), np.ones(len(seen))
+    tentative_slots = np.full(rows, NEW)
+    rest = tentative_slots, chance, density
+    is_astray, compared = _compared(parts, settings, readings)
+    if is_astray or not _is_usable(readings, settings.min_range):
+        return np.empty(0), np.empty((0, rows), np.int64), *rest
     _, per_scan, longest = _of_density(tally)
     density[:] = settings.density
     if np.isnan(settings.density):
@@ -538,19 +636,29 @@ def associate_clear(
     if len(seen) > 0:
         share = min(tally.numbers[SHARE] / tally.numbers[SUMS], 1.0)
         add_tentative(tentative, readings, settings.noise, gate, share, in_all)
-    belief = parts.mean, parts.covariance, parts.numbers[LANDMARKS]
+    belief = _part_of(parts, compared)
     costs, slots, explained = _assign(
         belief, readings, in_all, settings, ceiling, int(settings.most)
     )
     scan = slots, explained, readings
-    best = _count_best(belief, parts.ids, tally, costs, scan)
+    best = _count_best(belief, compared, parts.ids, tally, costs, scan)
     costs, slots = _with_rivals(costs, slots, best, ceiling)
     if len(costs) > 0 and len(seen) > 0:
         of_new = slots[0] == NEW, density, settings, longest
         _associate_tentative(
             tentative, readings, of_new, tally, tentative_slots, chance
         )
-    return costs, slots, tentative_slots, chance, density
+    _name_in_map(slots, compared)
+    return costs, slots, *rest
+
+
+@njit_internal
+def _name_in_map(slots: IntArray, compared: IntArray) -> None:
+    """Turn places among the compared landmarks into slots of the map."""
+    for k in range(slots.shape[0]):
+        for i in range(slots.shape[1]):
+            if slots[k, i] >= 0:
+                slots[k, i] = compared[slots[k, i]]
 
 
 @njit_allocating
@@ -597,6 +705,7 @@ def _with_rivals(
 @njit_allocating
 def _count_best(
     belief: tuple[Array, Array, int],
+    compared: IntArray,
     ids: IntArray,
     tally: Tally,
     costs: Array,
@@ -614,10 +723,10 @@ def _count_best(
     others = 2 * per_scan if np.isnan(settings_jit(tally).density) else 0.0
     _copy(tally.miss_chances, tally.next_miss_chances)
     for k in range(len(slots)):
-        for j in range(len(is_telling)):
-            is_older = ids[j] < tally.whole[FIRST_NEW]
-            is_telling[j] = is_older and tally.shown[j] >= PROVEN
-        detected, missed = tally.detected.copy(), tally.miss_chances[:n].copy()
+        for j in range(n):
+            is_older = ids[compared[j]] < tally.whole[FIRST_NEW]
+            is_telling[j] = is_older and tally.shown[compared[j]] >= PROVEN
+        detected, missed = tally.detected.copy(), tally.miss_chances[compared]
         shown = slots[k], explained, readings
         cost, fewer = count_scan(
             (mean, P), shown, is_telling, longest, detected, missed
@@ -626,7 +735,8 @@ def _count_best(
         if k == 0 or costs[k] < costs[best]:
             best, tally.numbers[FEWER] = k, fewer
             _copy(detected.ravel(), tally.next_detected)
-            _copy(missed, tally.next_miss_chances)
+            for j in range(n):
+                tally.next_miss_chances[compared[j]] = missed[j]
     return best
 
 
@@ -641,21 +751,58 @@ def _is_usable(readings: Array, min_range: float) -> bool:
     return True
 
 
-@njit_internal
-def _may_be_lost(parts: Parts, settings: ClearRules) -> bool:
-    """Return whether the robot may be astray, or landmarks are `lost`."""
+@njit_allocating
+def _compared(
+    parts: Parts, settings: ClearRules, readings: Array
+) -> tuple[bool, IntArray]:
+    """Return whether the robot may be astray, and the landmarks to compare.
+
+    These are all, or those that `without_lost` leaves, in the order of the map.
+    """
     mean, P, n = parts.mean, parts.covariance, parts.numbers[LANDMARKS]
     is_astray, lost, local = n >= FEWEST_READINGS, 0, 0
+    is_lost, every = np.empty(n, np.bool_), np.arange(n)
     for j in range(n):
         c = 3 + 2 * j
         P[c, c + 1] = P[c + 1, c]  # of a large P, this part alone may be out of date
         dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
         std = np.sqrt(max(variance_from_robot(P, c, dx, dy), 0.0))
         is_astray &= std > settings.accurate
-        lost += std > settings.lost
+        is_lost[j] = std > settings.lost
+        lost += is_lost[j]
         local += std <= LOCAL_STD * settings.lost
     can_match = local >= settings.least and lost >= 2 * settings.least
-    return is_astray or (lost > 0 and can_match)
+    if is_astray or lost == 0 or not can_match:
+        return is_astray, every
+    within, count = NEAR_STDS * settings.lost, 0
+    if len(readings) > 0:
+        within += readings[:, 1].max()
+    for j in range(n):
+        c = 3 + 2 * j
+        away = np.hypot(mean[c] - mean[0], mean[c + 1] - mean[1])
+        if not is_lost[j] and away <= within:
+            every[count], count = j, count + 1
+    return False, every[:count]
+
+
+@njit_allocating
+def _part_of(parts: Parts, chosen: IntArray) -> tuple[Array, Array, int]:
+    """Return mean and covariance of the pose and some landmarks, and their number.
+
+    Of a large P, only the lower half and the rows of the pose are up to date.
+    """
+    n = len(chosen)
+    if n == parts.numbers[LANDMARKS]:
+        return parts.mean, parts.covariance, n
+    size = 3 + 2 * n
+    columns, mean, P = np.arange(size), np.empty(size), np.empty((size, size))
+    for j in range(n):
+        columns[3 + 2 * j], columns[4 + 2 * j] = 3 + 2 * chosen[j], 4 + 2 * chosen[j]
+    for a in range(size):
+        mean[a] = parts.mean[columns[a]]
+        for b in range(size if a < 3 else min(a + 2, size)):
+            P[a, b] = parts.covariance[columns[a], columns[b]]
+    return mean, P, n
 
 
 @njit_allocating

@@ -217,9 +217,8 @@ class ManagedSlam(FilterWrapper):
         reading = argument_checks.pair("odometry", odometry)
         if type(dt) is not float or dt != 1.0:
             argument_checks.duration(dt)
-        displacement = self._settings.motion_noise.motion.moved(reading)
         with changing(self, "predict"):
-            self._step(lambda h: h.predict(reading, dt, displacement))
+            self._step(lambda h: h.predict(reading, dt))
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -382,21 +381,23 @@ class ManagedSlam(FilterWrapper):
         self, readings: Array, ids: IntArray | None
     ) -> Sequence[ClearBranch]:
         """Return the best association in each hypothesis; none if it is not clear."""
-        ceiling, ranked = np.inf, list[ClearBranch]()
-        for h in self._hypotheses:
-            scan = h.associate_clear(readings, ids, ceiling - h.cost)
-            if scan is None:
+        every, ceiling, others = self._hypotheses, np.inf, 0
+        ranked: list[ClearBranch] = []
+        for h in every:
+            how = ceiling - h.cost, len(every) == 1
+            if (scan := h.associate_clear(readings, ids, *how)) is None:
                 return ()
             ranked.append((h.cost + scan.costs[0], h, scan))
             ceiling = min(ceiling, ranked[-1][0] + SPREAD)
-        if len(ranked) > 1:
+            others += len(scan.costs) - 1
+        if len(every) > 1:
             ranked = sorted([r for r in ranked if r[0] <= ceiling], key=itemgetter(0))
-        return () if self._is_split(ranked, ceiling) else ranked
+        return () if others and self._is_split(ranked, ceiling) else ranked
 
     def _is_split(self, ranked: Sequence[ClearBranch], ceiling: float) -> bool:
         """Return whether a scan that seemed clear splits one of these hypotheses."""
-        others = ((h, cost) for _, h, scan in ranked for cost in scan.costs[1:])
-        if not any(cost <= ceiling - h.cost for h, cost in others):
+        others = [(h, cost) for _, h, scan in ranked for cost in scan.costs[1:]]
+        if not [cost for h, cost in others if cost <= ceiling - h.cost]:
             return False
         tried = [
             (h.cost + cost, k, (view, scan.following.labels.tobytes()))
@@ -638,13 +639,13 @@ class Hypothesis:
         self._candidates = self._candidates._replace(tentative=changed)
 
     def associate_clear(
-        self, readings: Array, ids: IntArray | None, ceiling: float
+        self, readings: Array, ids: IntArray | None, ceiling: float, alone: bool
     ) -> ClearScan | None:
         """Associate a scan (m, 2), by its identities if given; None if not clear."""
         if self._clear is None:
             return None
         known = self._candidates, self.pruner.records
-        return self._clear.associate(readings, ids, ceiling, *known)
+        return self._clear.associate(readings, ids, ceiling, *known, alone=alone)
 
     def tried(self, scan: ClearScan, ceiling: float) -> list[tuple[float, MapView]]:
         """Return the costs and the beliefs after all associations of a clear scan."""
@@ -657,7 +658,7 @@ class Hypothesis:
         if not self._clear.update(scan):
             return False
         self.editor.expire()
-        if scan.following is not self.tentative:
+        if scan.following is not self._candidates.tentative:
             self.tentative = scan.following
         self._report = scan
         return True
@@ -678,16 +679,12 @@ class Hypothesis:
         self.candidates, self.report = Candidates(), UpdateReport()
         self.recent.forget()
 
-    def predict(
-        self,
-        reading: tuple[float, float],
-        dt: float,
-        displacement: tuple[float, float, float],
-    ) -> None:
-        """Move by odometry (d, α), which is a displacement in the robot's frame."""
+    def predict(self, reading: tuple[float, float], dt: float) -> None:
+        """Move by odometry (d, α)."""
         self.filter.predict(reading, dt)
         self.editor.expire()
         if len(self._candidates.tentative.seen):
+            displacement = self.motion_noise.motion.moved(reading)
             variance = self.motion_noise.over(displacement, dt)
             self.tentative = self.tentative.moved(displacement, variance)
         self.recent.note_motions((*reading, dt))

@@ -89,26 +89,21 @@ class RecentScans(Restorable):
 
     def with_scan(self, plan: ScanAssociation) -> FedScans:
         """Return what to feed to the filter: a new scan, and earlier ones to repeat."""
-        decided = tuple(plan.row_ids), tuple(plan.labels)
-        scan = self.new_scan(plan.scan, plan.readings, *decided)
-        scans = [*self.scans, scan][-self._window - 1 :]
+        row_ids, labels = tuple(plan.row_ids), tuple(plan.labels)
+        before = self.state_before(plan.scan, labels)
+        # The caller may reuse the array of readings.
+        parts = self.motions, plan.readings.copy(), row_ids, labels, before
+        scans = [*self.scans, RecentScan(plan.scan, *parts)][-self._window - 1 :]
         first = _relabel(scans, plan.confirmed) if plan.confirmed else None
         return FedScans(plan, scans, first)
 
-    def new_scan(
-        self,
-        number: int,
-        readings: Array,
-        row_ids: tuple[int | None, ...],
-        labels: tuple[int, ...],
-    ) -> RecentScan:
-        """Return the next scan, before the filter takes it in."""
-        before = None
+    def state_before(
+        self, number: int, labels: Sequence[int]
+    ) -> Mapping[str, Any] | None:
+        """Return the state of the filter, if a tentative landmark begins in a scan."""
         if self._window and max(labels, default=NO_LABEL) >= number << LABEL_BITS:
-            before = self._slam.state_dict()  # a tentative landmark begins in it
-        # The caller may reuse the array of readings.
-        parts = self.motions, readings.copy(), row_ids, labels, before
-        return RecentScan(number, *parts)
+            return self._slam.state_dict()
+        return None
 
     def feed(self, fed: FedScans) -> UpdateReport:
         """Update the filter with the last scan, and with earlier sightings if any.
@@ -140,11 +135,24 @@ class RecentScans(Restorable):
                 ids = tuple(new if label != NO_LABEL else i for i, new, label in pairs)
                 self.decisions[place] = made._replace(row_ids=ids)
 
-    def note_clear(self, scan: RecentScan, unused: Collection[int]) -> None:
-        """Remember a clear scan without the landmarks whose readings were not used."""
+    def note_clear(
+        self,
+        number: int,
+        readings: Array,
+        decided: tuple[tuple[int | None, ...], tuple[int, ...]],
+        before: Mapping[str, Any] | None,
+        unused: Collection[int],
+    ) -> None:
+        """Remember a clear scan that the filter has taken in.
+
+        ``decided`` are the landmark and the label of each row, ``before`` is what
+        :meth:`state_before` returned, and ``unused`` the landmarks whose readings the
+        filter did not use.
+        """
         if self._window:
+            scan = RecentScan(number, self.motions, readings.copy(), *decided, before)
             self.scans, self.motions = [*self.scans[-self._window :], scan], ()
-        self.decisions.append(ScanDecisions(_without(unused, scan.row_ids)))
+        self.decisions.append(ScanDecisions(_without(unused, decided[0])))
 
     def _repeat(self, scans: list[RecentScan], first: int) -> list[UpdateReport]:
         """Repeat the scans since one, and renew the states kept before them."""

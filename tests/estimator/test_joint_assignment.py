@@ -193,6 +193,41 @@ def test_a_scan_is_assigned_as_step_by_step_in_numpy(method):
     assert ambiguous > 10 or method == "compatibility"  # it pairs nearly all
 
 
+@pytest.mark.parametrize("method", ["joint", "hypotheses"])
+@pytest.mark.parametrize("ceiling", [np.inf, 10.0])
+def test_a_scan_with_one_landmark_for_each_reading_is_assigned_as_by_the_search(
+    method, ceiling
+):
+    """It is settled without the search where no other assignment is of interest."""
+    rng = np.random.default_rng(8)
+    policy, noise = LandmarkPolicy(association=method), Noise(0.03, 0.1, 0.02, 0.01)
+    most = policy.branches if method == "hypotheses" else 1
+    single, others = 0, 0
+    for _ in range(150):
+        count = rng.integers(1, 9)
+        mean = rng.normal(scale=6.0, size=3 + 2 * count)
+        root = rng.normal(scale=rng.choice([0.01, 0.05]), size=(len(mean), len(mean)))
+        view = MapView(mean, root @ root.T, tuple(range(count)))
+        expected = predict_measurement(mean[:3], view.landmarks).measurement
+        scale = rng.choice([1.0, 3.5]) * np.array([0.03, 0.1])
+        seen = rng.permutation(count)[: rng.integers(1, count + 1)]
+        readings = expected[seen] + rng.normal(size=(len(seen), 2)) * scale
+        density = np.exp(rng.uniform(-12, 0, len(seen)))
+        limits = np.full(len(seen) + 1, np.inf)
+        scan = policy, view, readings, noise, density
+        found = assign_scan(*scan, ceiling=ceiling)
+        costs, slots, explained = assign_plainly(
+            *scan, limits=limits, most=most, ceiling=ceiling
+        )
+        np.testing.assert_array_equal(found.explained, explained)
+        np.testing.assert_array_equal(found.costs, costs)
+        np.testing.assert_array_equal(found.slots, slots)
+        is_single = len(slots) == 1 and slots[0].tolist() == seen.tolist()
+        single, others = single + is_single, others + (not is_single)
+    assert single > 30
+    assert others > 30
+
+
 def test_unpaired_readings_are_compared_with_free_landmarks_given_the_pairs():
     rng = np.random.default_rng(3)
     for _ in range(50):

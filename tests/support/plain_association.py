@@ -53,7 +53,9 @@ def innovations_of(readings, expected):
     return innovations
 
 
-def assign_plainly(policy, view, readings, noise, density, *, limits, most):
+def assign_plainly(
+    policy, view, readings, noise, density, *, limits, most, ceiling=np.inf
+):
     """Return costs, slots and explained landmarks, as `assign_scan` does jointly."""
     fit = innovation_distances(view, readings, noise, policy.new_gate)
     explained = np.flatnonzero(np.isfinite(fit.squared).any(axis=0))
@@ -75,7 +77,7 @@ def assign_plainly(policy, view, readings, noise, density, *, limits, most):
         limits,
         pairs_first,
     )
-    found = solve(problem, most, BRANCH_SPREAD)
+    found = solve(problem, most, BRANCH_SPREAD, ceiling)
     kept, chosen = [], []
     for cost, marks, distances in zip(*found[:3], strict=True):
         slots = np.where(distances <= policy.pair_gate, AMBIGUOUS, NEW)
