@@ -447,7 +447,7 @@ class SmoothedDrive:
                 for other in [i for i, pose in enumerate(poses) if pose == k]:
                     blocks[other, :, at] = moved
                     blocks[at, :, other] = moved.T
-        return blocks.reshape(3 * len(poses), -1)
+        return blocks.reshape((3 * len(poses),) * 2)
 
     def _columns(self, ids: Sequence[int]) -> Array:
         firsts = np.array([2 * self._slots[i] for i in ids], dtype=np.int64)
