@@ -14,7 +14,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from types import FunctionType
 from typing import Any, TypeVar, cast
@@ -22,7 +22,7 @@ from typing import Any, TypeVar, cast
 import numba
 import numpy as np
 from numba import config, njit, types
-from numba.core import caching, codegen, compiler, event
+from numba.core import caching, codegen, compiler, event, registry
 from numba.core.cpu import CPUTargetOptions
 from numba.core.runtime.nrt import rtsys
 from numba.extending import intrinsic
@@ -101,42 +101,74 @@ class InternalCode(codegen.JITCodeLibrary):
     def _optimize_final_module(self) -> None:
         pass
 
-    def _finalize_final_module(self: Any) -> None:
-        self._finalize_dynamic_globals()
-        self._verify_declare_only_symbols()
-        self._finalized = True
+    def _finalize_specific(self) -> None:
+        pass
 
-    def serialize_using_object_code(self: Any) -> tuple[str, str, bytes]:
-        """Return what the cache keeps, and :meth:`_Results.rebuild` reads."""
-        return self.name, _INTERNAL, self._get_module_for_linking().as_bitcode()
+    def serialize_using_object_code(self) -> Any:
+        """Return what the cache keeps."""
+        return cast("Any", self).serialize_using_bitcode()
 
-    def load(self: Any, bitcode: bytes) -> None:
-        """Take the code that the cache has kept."""
-        self._final_module = cast("Any", codegen).ll.parse_bitcode(bitcode)
-        self.finalize()
 
-    def get_pointer_to_function(self, _name: str) -> int:
-        """Return the null pointer: Python cannot call the function."""
-        return 0
+class InternalCodegen(codegen.JITCPUCodegen):
+    """Numba's code generator, of functions that only kernels call."""
 
-    @property
-    def codegen(self) -> "InternalCode":
-        """The object whose `set_env` numba calls."""
-        return self
+    _library_class = InternalCode
+
+    def _add_module(self, _module: Any) -> None:
+        pass
 
     def set_env(self, _name: str, _environment: Any) -> None:
         """Do nothing: a `KernelCache` sets those of all functions below a kernel."""
 
 
-class Internal(compiler.Compiler):
-    """Numba's compiler, of a function that only kernels call."""
+@cache
+def _internal_target() -> Any:
+    """Return numba's target, with another code generator."""
+    generator: Any = InternalCodegen
+    target = registry.cpu_target.target_context
+    return target.subtarget(_internal_codegen=generator("internal"))
 
-    def __init__(self, typing: Any, target: Any, _library: Any, *others: Any) -> None:
-        code = cast("Any", InternalCode)(target.codegen(), _INTERNAL)
-        cast("Any", super()).__init__(typing, target, code, *others)
+
+class Checked(compiler.Compiler):
+    """Numba's compiler, which refuses a kernel that loses count of references."""
+
+    def compile_extra(self, function: FunctionType) -> Any:
+        """Compile a function.
+
+        Raises
+        ------
+        TypeError
+            If the kernel does not count references, but returns an array, whose memory
+            a caller would free, or receives one from a kernel that counts them, whose
+            memory would never be freed.
+        """
+        compiled: Any = super()
+        result = compiled.compile_extra(function)
+        uncounted = not cast("Any", self).state.flags.nrt
+        if uncounted and any("array" in str(each) for each in _handed_on(result)):
+            name = function.__qualname__
+            raise TypeError(f"{name} hands on arrays: use njit_allocating")
+        return result
 
 
-_INTERNAL = "internal"
+class Internal(Checked):
+    """The compiler of a function that only kernels call."""
+
+    def __init__(self, typing: Any, _target: Any, *others: Any) -> None:
+        cast("Any", super()).__init__(typing, _internal_target(), *others)
+
+
+def _handed_on(result: Any) -> Iterator[Any]:
+    """Return the types of what a kernel returns, and of what others return to it."""
+    yield result.signature.return_type
+    types_of = result.type_annotation
+    for call, signature in types_of.calltypes.items():
+        if getattr(call, "op", None) != "call":
+            continue
+        if isinstance(types_of.typemap[call.func.name], types.Dispatcher):
+            yield signature.return_type
+
+
 _TARGET: Any = CPUTargetOptions  # numba has this flag, and no option that sets it
 _TARGET.noalias = _TARGET.Mapping("noalias")
 
@@ -165,7 +197,7 @@ def compiler_for(options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the option of numba for its compiler, by those of a function."""
     # The order of sums is chosen once, in the function's own code.
     is_internal = options.get("no_cpython_wrapper") and not options.get("fastmath")
-    return {"pipeline_class": Internal} if is_internal else {}
+    return {"pipeline_class": Internal if is_internal else Checked}
 
 
 def kept(kernel: Any) -> Any:
@@ -415,30 +447,10 @@ class _Locator:
 class _Results(caching.CompileResultCacheImpl):
     _locator_classes: Any = (_Locator,)
 
-    def rebuild(self, target_context: Any, payload: Any) -> Any:
-        (name, kind, code), *others = payload
-        if kind != _INTERNAL:
-            return cast("Any", super()).rebuild(target_context, payload)
-        library = cast("Any", InternalCode)(target_context.codegen(), name)
-        library.load(code)
-        parts = dict(zip(_PARTS, others, strict=True))
-        for initialise in parts["reload_init"]:
-            initialise()
-        make: Any = target_context.get_executable
-        return cast("Any", compiler).compile_result(
-            target_context=target_context,
-            typing_context=target_context.typing_context,
-            library=library,
-            entry_point=make(library, parts["fndesc"], parts["environment"]),
-            **parts,
-        )
-
-
-#: What numba keeps of the result of a compilation, beside the code.
-_PARTS = (
-    *("fndesc", "environment", "signature", "objectmode", "lifted"),
-    *("type_annotation", "reload_init", "referenced_envs"),
-)
+    def rebuild(self, target: Any, payload: Any) -> Any:
+        (_, kind, _), *_ = payload
+        target = _internal_target() if kind == "bitcode" else target
+        return cast("Any", super()).rebuild(target, payload)
 
 
 class _Files(caching.FunctionCache):
@@ -475,14 +487,14 @@ class KernelCache:
     def flush(self) -> None:
         """Do nothing: no file can be out of date."""
 
-    def load_overload(self, signature: Any, target_context: Any) -> Any:
+    def load_overload(self, signature: Any, target: Any) -> Any:
         """Return the compiled code for the types of a call, or None."""
         if self._files is None:
             return None
         try:
-            # What numba's own function does, but for loading its compiler.
-            rtsys.initialize(target_context)
-            found = self._files._load_overload(signature, target_context)
+            # Without loading numba's compiler, as `refresh` would do.
+            quick = target.subtarget(refresh=partial(rtsys.initialize, target))
+            found = self._files.load_overload(signature, quick)
         except Exception:  # a damaged file can raise any error
             found = None
             with contextlib.suppress(OSError):
@@ -491,21 +503,9 @@ class KernelCache:
         return found if found and found.signature.args == signature else None
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """Keep the compiled code for the types of a call.
-
-        Raises
-        ------
-        TypeError
-            If the kernel does not count references, but returns an array, whose memory
-            a caller would free, or receives one from a kernel that counts them, whose
-            memory would never be freed.
-        """
+        """Keep the compiled code for the types of a call."""
         for each in result._find_referenced_environments():
             result.library.codegen.set_env(each.env_name, each)
-        uncounted = not self._kernel.targetoptions["_nrt"]
-        if uncounted and any("array" in str(each) for each in _handed_on(result)):
-            self._kernel._reset_overloads()  # another call is refused, too
-            raise TypeError(f"{self._kernel} hands on arrays: use njit_allocating")
         if self._files is None or result.library.has_dynamic_globals or result.lifted:
             return  # these hold addresses in the memory of this process
         # The folder may be read only, its files damaged, and the sources edited since
@@ -513,14 +513,3 @@ class KernelCache:
         with contextlib.suppress(Exception):
             if all(_stamp(file) == stamp for file, stamp in _STAMPS.items()):
                 self._files.save_overload(signature, result)
-
-
-def _handed_on(result: Any) -> Iterator[Any]:
-    """Return the types of what a kernel returns, and of what others return to it."""
-    yield result.signature.return_type
-    types_of = result.type_annotation
-    for call, signature in types_of.calltypes.items():
-        if getattr(call, "op", None) != "call":
-            continue
-        if isinstance(types_of.typemap[call.func.name], types.Dispatcher):
-            yield signature.return_type
