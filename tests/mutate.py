@@ -55,7 +55,9 @@ STUDY = "experiments/monte_carlo_study"
 #: The first tests notice most; those of the longest beginning of a path count.
 TESTS = {
     "agents/": "active_slam information_reward belief_observation",
-    "agents/active_slam": "active_slam active_slam_pass active_slam_hidden",
+    "agents/active_slam": (
+        "active_slam active_slam_pass active_slam_hidden active_slam_honesty"
+    ),
     "agents/active_slam_scores": "active_slam active_slam_honesty active_slam_hidden",
     "agents/belief_": "belief_observation information_reward state_and_restore",
     "agents/belief_space_planner": "wall_routes active_slam",
@@ -75,7 +77,7 @@ TESTS = {
     "estimator/": "ekf_slam filter_family errors_change_nothing",
     "estimator/models/bearing_range": "motions bearing_range ekf_slam",
     "estimator/models/relative_geometry": "relative_geometry",
-    "estimator/models/rigid_motion": "error_frames submaps joining ekf_slam",
+    "estimator/models/rigid_motion": "error_frames nees submaps joining ekf_slam",
     "estimator/models/motions": "motions ekf_slam",
     "estimator/models/model_checks": "sensors motions",
     "estimator/models/sensor": "sensors",
@@ -93,7 +95,7 @@ TESTS = {
     "estimator/filters/delayed_landmarks": "sensors saved_states",
     "estimator/filters/drive_likelihood": "drive_likelihood",
     "estimator/filters/imagine": "imagine",
-    "estimator/filters/pose_readings": "pose_readings map_editor",
+    "estimator/filters/pose_readings": "pose_readings map_editor loop_closing",
     "estimator/filters/gaussian_map": (
         "ekf_slam filter_family filter_memory map_management"
     ),

@@ -250,6 +250,12 @@ def test_the_belief_is_that_of_a_filter_fed_by_hand():
         slam.predict(observation["odometry"])
 
 
+def test_an_episode_ends_as_without_the_wrapper():
+    env = BeliefObservation(world(steps=2), "ekf")
+    env.reset(seed=0)
+    assert [env.step(SPIN)[2:4] for _ in range(2)] == [(False, False), (False, True)]
+
+
 def test_the_noise_of_the_world_is_told_to_the_filter():
     env = BeliefObservation(world("coarse_loop"), "ekf")
     scenario = env.scenario

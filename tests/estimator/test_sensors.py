@@ -262,6 +262,12 @@ def test_the_void_number_changes_nothing(sensor):
         assert_same_bits(belief, beliefs[0])
 
 
+def test_the_deviations_of_a_reading_depend_on_the_range():
+    sensor = BEARING_RANGE.with_noise(range_std_per_metre=0.05, bearing_std_metres=0.2)
+    expected = [(0.07, 0.3), (0.045, 0.5)]
+    np.testing.assert_allclose(sensor.stds((0.02, 0.1), np.array([4.0, 8.0])), expected)
+
+
 def test_bearings_are_wrapped_behind_the_robot():
     start = made("ekf", (0.03, 0.1))
     start.update([(np.pi - 0.001, 4.0)], [0])

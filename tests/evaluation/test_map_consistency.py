@@ -9,7 +9,10 @@ HONEST = np.random.default_rng(4).standard_normal((100, 20, 2))
 
 
 def test_an_honest_map_is_shown_to_be_consistent():
-    assert map_test(HONEST).shown
+    found = map_test(HONEST)
+    assert found.shown
+    every = np.stack([found.p_values, found.map_p_values, found.mean_p_values])
+    assert ((every >= 0) & (every <= 1)).all()
 
 
 @pytest.mark.parametrize("factor", [0.3, 3.0])
@@ -146,6 +149,7 @@ def test_runs_without_a_map_or_its_nees_add_no_evidence_and_the_latter_are_count
     found, ratios = watched.update(*parts)
     assert found[0] == found[1] == found[2] < found[3]
     assert np.isnan(ratios).tolist() == [False, True, True, False]
+    assert ratios[0] == parts[1][0] / 40
     assert watched.undefined == 1
 
 

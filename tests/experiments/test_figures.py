@@ -336,6 +336,7 @@ def test_landmarks_stand_in_the_order_of_their_ids():
     assert names[0] == names[1] == [f"l{i}" for i in sorted(trace.landmark_ids)]
     distances = [axes.lines[0].get_xdata() for axes in (shown, other)]
     np.testing.assert_array_equal(distances[0], distances[1][order])
+    assert shown.get_xlim()[1] > distances[0].max()
 
 
 def test_distances_are_euclidean_and_mahalanobis():

@@ -333,6 +333,17 @@ def test_scoring_finds_the_spread_of_normal_numbers_and_its_interval():
     assert bent[0, 0] == pytest.approx(2 * len(x), rel=0.01)
 
 
+def test_curvature_is_the_second_derivative_along_all_pairs_of_parameters():
+    A = np.array([[4.0, 1.0, -0.5], [1.0, 2.0, 0.3], [-0.5, 0.3, 1.0]])
+
+    def likelihoods(parameters):
+        theta = np.log(parameters) - (0.1, 0.2, 0.3)
+        return -0.5 * np.einsum("ki,ij,kj->k", theta, A, theta)[:, None]
+
+    found = curvature(likelihoods, np.zeros(3), np.array([0.01, 0.03, 0.1]))
+    np.testing.assert_allclose(found, A, rtol=1e-9)
+
+
 def two_spreads(parameters):
     """Return log likelihoods of 120 numbers of variance a², 120 of variance a² + b²."""
     x = np.random.default_rng(5).standard_normal(240)

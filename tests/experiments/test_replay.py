@@ -709,6 +709,10 @@ def test_without_a_true_start_the_distances_are_aligned_ones():
         ({}, True),
         ({"start": (0.2, 0.0, 0.0)}, False),
         ({"start": (0.0, 0.0, 0.2)}, False),
+        (
+            {"start": (0, 0, -3.14), "ground_truth": [(0, 0, 0, 3.14), (1, 1, 0, 3)]},
+            True,
+        ),
         ({"start": (0.2, 0.0, 0.1), "header": {"start_sigma": "0.1,0.1,0.1"}}, True),
         ({"header": {"start_from": "origin (no truth then)"}}, False),
         ({"start": (9.0, 0.0, 0.0), "ground_truth": np.empty((0, 4))}, True),
