@@ -1,6 +1,7 @@
 """The batch smoother against dense least squares, RTS, GTSAM, and its own promises."""
 
 from dataclasses import replace
+from inspect import signature
 from itertools import permutations
 
 import numpy as np
@@ -10,7 +11,7 @@ from drives import MEASUREMENT_STD, MOTION_STD, NOISE, SIX, drive
 from far_origins import far_origins, rounding, shifted
 from own_noise import OWN_NOISE, SHIPPED_NOISE
 
-from slamgym.estimator import make_estimator
+from slamgym.estimator import EkfSlam, make_estimator
 from slamgym.estimator.map_management import ManagedSlam
 from slamgym.estimator.models.bearing_range import wrap_angle
 from slamgym.estimator.models.sensors import (
@@ -564,6 +565,19 @@ def test_readings_below_the_minimum_range_are_skipped():
     made = Drive(MOTION_STD, MEASUREMENT_STD, min_range=1.0)
     made.update([(0.0, 0.5), (0.1, 2.0)], [0, 1])
     assert made.landmark_ids == (1,)
+
+
+def test_a_drive_assumes_by_default_what_filters_assume():
+    kinds = Drive, SmoothingSlam, EkfSlam
+    defaults = [
+        {name: each.default for name, each in signature(kind).parameters.items()}
+        for kind in kinds
+    ]
+    shared = set.intersection(*map(set, defaults))
+    assert {"min_range", "noise_at_rest", "motion", "initial_pose_std"} <= shared
+    for name in shared:
+        ours, smoothers, theirs = (each[name] for each in defaults)
+        assert ours == smoothers == theirs, name
 
 
 def test_readings_that_a_filter_skips_are_not_in_its_drive():

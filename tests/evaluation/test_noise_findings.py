@@ -8,6 +8,7 @@ from scipy import stats
 from slamgym.evaluation.noise_findings import (
     CHANNELS,
     HEAVY_TAILS,
+    _growth,
     noise_findings,
     noise_sums,
     significant_findings,
@@ -232,6 +233,20 @@ def test_noise_of_another_size_far_away_is_no_heavy_tail(factor, size):
     assert f"σr is {factor:.1f}"[:7] in first.text
     assert "times at 2.7 m" in first.text
     assert others == []
+
+
+@pytest.mark.parametrize("growth", [0.12, -0.04])
+def test_the_impact_of_a_growth_is_that_of_a_line_through_the_squares(growth):
+    rng = np.random.default_rng(6)
+    r, w = rng.uniform(1, 9, 5000), rng.standard_normal(5000)
+    squares = (w * (0.6 + growth * r)) ** 2
+    powers = {"distance": r, "distance²": r**2, "second": squares,
+              "fourth": squares**2, "distance w²": r * squares}  # fmt: skip
+    found = {"count": 5000.0} | {name: each.sum() for name, each in powers.items()}
+    ends = r.mean() + r.std() * np.array([-1, 1])
+    along = np.polyval(np.polyfit(r, squares, 1), ends)
+    expected = np.abs(np.log([*along, squares.mean()])).max()
+    assert _growth("range", found, squares.mean()).impact == pytest.approx(expected)
 
 
 def test_heavy_tails_are_named_even_if_the_noise_grows_with_the_distance():

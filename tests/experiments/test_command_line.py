@@ -291,6 +291,19 @@ def test_every_map_is_kept_where_every_step_is_drawn(log, flag, monkeypatch):
     assert (len(distinct) == 602) == (flag == "--every-step")
 
 
+@pytest.mark.parametrize(("steps", "are_drawn"), [(60, True), (61, False)])
+def test_each_of_few_steps_is_drawn_by_default(log, steps, are_drawn, monkeypatch):
+    told = []
+    monkeypatch.setattr(
+        run_files, "write_figures", lambda *_, every_step, **__: told.append(every_step)
+    )
+    log.write_text(
+        LOG + "".join(f"odometry,{t},0.1,0,1\n" for t in range(2, steps + 1))
+    )
+    answered("replay", log)
+    assert told == [are_drawn]
+
+
 def test_a_random_controller_wanders_the_same_way_for_the_same_seed(without_pictures):
     options = ("run", "loop", "--steps", 5, "--controller", "random")
     assert answered(*options)["pose"] == answered(*options)["pose"]
