@@ -15,7 +15,7 @@ import numpy as np
 
 from ..arrays import AnyArray, Array, BoolArray, IntArray
 from .logs.importers.any_format import read_true_path
-from .logs.log_lines import LogLine, plain_rows, read_lines
+from .logs.log_lines import LogLine, plain_rows, read_lines, read_text, to_lines
 from .logs.slamlog import LogError
 from .trajectories.manifest import MANIFEST, load_trajectories
 from .trajectories.trajectory import BELIEFS, Trajectory, array_of
@@ -300,14 +300,15 @@ def _of_npz(file: Path) -> Iterator[tuple[Any, DriveEstimate]]:
 
 def content_lines(path: Path) -> list[LogLine]:
     """Read the lines of a file that are not comments."""
-    return [line for line in read_lines(path) if not line.text.startswith("#")]
+    return _without_comments(read_lines(path))
+
+
+def _without_comments(lines: list[LogLine]) -> list[LogLine]:
+    return [line for line in lines if not line.text.startswith("#")]
 
 
 def _of_csv(path: Path) -> DriveEstimate:
-    lines = content_lines(path)
-    table = _plain_poses(lines)
-    if table is not None:
-        lines = [line for line in lines if not line.text.startswith(_POSE)]
+    table, lines = _plain_poses(path)
     poses: list[list[float]] = []
     places: dict[int, list[float]] = {}
     for line in lines:
@@ -337,13 +338,22 @@ def _of_csv(path: Path) -> DriveEstimate:
     )
 
 
-def _plain_poses(lines: Sequence[LogLine]) -> Array | None:
-    """Return the rows of all poses of a csv; None if each has to be read by itself."""
-    of_poses = [line.text for line in lines if line.text.startswith(_POSE[:-1])]
-    if not (of_poses and all(text.startswith(_POSE) for text in of_poses)):
-        return None
-    table = plain_rows([text[len(_POSE) :] for text in of_poses], ",")
-    return table if table is not None and table.shape[1] in (10, 13) else None
+def _plain_poses(path: Path) -> tuple[Array | None, list[LogLine]]:
+    """Read all poses of a csv at once; return them and the other lines.
+
+    None, and all lines, if each pose has to be read by itself.
+    """
+    text = read_text(path)
+    rows = text.split("\n")
+    of_poses = [row[len(_POSE) :] for row in rows if row.startswith(_POSE)]
+    table = plain_rows(of_poses, ",") if of_poses else None
+    if table is not None and table.shape[1] in (10, 13):
+        # Blank lines are no lines, but count.
+        rest = "\n".join(["" if row.startswith(_POSE) else row for row in rows])
+        lines = _without_comments(to_lines(rest, str(path))) if rest.strip() else []
+        if not any(line.text.startswith(_POSE[:-1]) for line in lines):
+            return table, lines
+    return None, _without_comments(to_lines(text, str(path)))
 
 
 def tum_row(line: LogLine) -> list[float]:

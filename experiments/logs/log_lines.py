@@ -233,23 +233,33 @@ class ReadFile(PathLike[str]):
 
 
 def read_lines(path: str | PathLike[str]) -> list[LogLine]:
-    """Read the lines of a text file in UTF-8, or marked UTF-16, that are not blank.
+    """Read the lines of a text file that are not blank, see :func:`read_text`.
 
     Raises
     ------
     LogError
-        If the file is no such text, empty, or a device.
+        Also if the file is empty.
+    """
+    return to_lines(read_text(path), str(path))
+
+
+def read_text(path: str | PathLike[str]) -> str:
+    """Read a text file in UTF-8, or marked UTF-16.
+
+    Raises
+    ------
+    LogError
+        If the file is no such text, or a device.
     OSError
         If the file cannot be opened.
     """
     data = (path if isinstance(path, ReadFile) else ReadFile(path)).content
     try:
-        text = data.decode("utf-16" if data.startswith(_UTF_16) else "utf-8-sig")
+        return data.decode("utf-16" if data.startswith(_UTF_16) else "utf-8-sig")
     except UnicodeDecodeError as error:
         line = LogLine(str(path), data.count(b"\n", 0, error.start) + 1, "")
         byte = f"byte 0x{data[error.start]:02x}: save the file as UTF-8"
         raise line.error("UTF-8 text", byte) from None
-    return to_lines(text, str(path))
 
 
 def texts(values: Array) -> list[str]:
