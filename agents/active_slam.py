@@ -248,10 +248,9 @@ class ActiveSlamEnv(LandmarkWorldEnv):
     def _output(
         self, info: dict[str, Any], ended: BoolArray
     ) -> tuple[Observation, dict[str, Any]]:
-        rows = self.task.observations()
         infos = self._explorers.infos(self._landmarks, ended)
         more = {key: values.item() for key, values in infos.items()}
-        return {key: row[0] for key, row in rows.items()}, {**info, **more}
+        return self.task.observation(), {**info, **more}
 
 
 Observations = dict[str, AnyArray]

@@ -146,7 +146,7 @@ class ActiveSlamTask(Restorable):
             self._forms["landmarks"] = (count, rows, len(FEATURES)), np.dtype(float)
             self._forms["mask"] = (count, rows), np.dtype(np.bool_)
         self._all = np.ones(count, dtype=np.bool_)
-        self._rows: dict[str, AnyArray] = {}
+        self._rows: tuple[AnyArray, ...] = ()
         self.episodes = Episodes(
             np.zeros((count, cells), dtype=np.bool_),
             np.zeros(count, dtype=np.int64),
@@ -164,7 +164,7 @@ class ActiveSlamTask(Restorable):
     def begin(self, beliefs: BatchStorage, worlds: BoolArray) -> None:
         """Begin episodes in some worlds, (B,), after their first scan."""
         rows = self._rows or self._empty_rows()
-        self._rows = {key: row.copy() for key, row in rows.items()}
+        self._rows = tuple([row.copy() for row in rows])
         self.outcome = self.outcome._replace(success=self.outcome.success & ~worlds)
         self.mapped, self.known = self.mapped.copy(), self.known.copy()
         self._advance(beliefs, worlds, ~worlds)
@@ -191,9 +191,17 @@ class ActiveSlamTask(Restorable):
         count = self._shape[0]
         flat = {
             key: row if row.ndim == 2 or key == "landmarks" else row.reshape(count, -1)
-            for key, row in self._rows.items()
+            for key, row in zip(self._forms, self._rows, strict=True)
         }
         return self._form.cast(flat)
+
+    def observation(self) -> dict[str, AnyArray]:
+        """Return the observation of a single world, which no later step changes."""
+        first = {
+            key: row[0] if row.ndim == 2 or key == "landmarks" else row.reshape(-1)
+            for key, row in zip(self._forms, self._rows, strict=True)
+        }
+        return self._form.cast(first)
 
     def _advance(
         self,
@@ -203,7 +211,7 @@ class ActiveSlamTask(Restorable):
         actions: ArrayLike = ((0.0, 0.0),),
         collisions: BoolArray | None = None,
     ) -> None:
-        rows = tuple(self._rows.values())
+        rows = self._rows
         last = len(rows) - 2 * bool(self._form.rows)
         first = last - len(_SIZES)
         worlds_now: tuple[Any, ...] = (  # a `Worlds`
@@ -222,8 +230,8 @@ class ActiveSlamTask(Restorable):
             known = self.episodes.known
             write_landmark_sets(worlds, worlds_now[0], known, landmarks, mask)
 
-    def _empty_rows(self) -> dict[str, AnyArray]:
-        return {key: np.empty(*form) for key, form in self._forms.items()}
+    def _empty_rows(self) -> tuple[AnyArray, ...]:
+        return tuple([np.empty(*form) for form in self._forms.values()])
 
 
 def split_settings(

@@ -372,6 +372,7 @@ class SeparateFilters(Restorable):
         self._steps = [0] * len(filters)
         self._beliefs: list[BeliefOfMap | None] = [None] * len(filters)
         self._stored: list[Any] = [None] * len(filters)  # `BatchStorage`, B = 1
+        self._slots: list[Any] = [None] * len(filters)  # that it shows, if it is live
 
     def state(self) -> State:
         """Return the states of the filters, for `restore`."""
@@ -423,10 +424,18 @@ class SeparateFilters(Restorable):
             ids = seen.tolist() if self._by_id else None
             slam.update(landmarks[run, seen], ids)
             if self._live[run]:
-                self._stored[run] = live_storage(cast("EkfSlam", slam), self._rows)
+                self._show(run, cast("EkfSlam", slam))
                 continue
             self._beliefs[run] = belief = checked_belief(slam, self._steps[run])
             self._stored[run] = belief_storage(belief, self._rows, by_id=self._by_id)
+
+    def _show(self, run: int, slam: EkfSlam) -> None:
+        """Show the arrays of a filter; a map with other slots has another dict."""
+        if self._slots[run] is slam.map.slots:
+            _ = slam.map.covariance  # completes it
+            return
+        self._slots[run] = slam.map.slots
+        self._stored[run] = live_storage(slam, self._rows)
 
     def storage(self) -> BatchStorage:
         """Return the arrays of the beliefs; they change with the next update."""
