@@ -1,12 +1,14 @@
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from far_origins import far_origins, rounding, shifted
 from recordings import recorded
 from rich.console import Console
+from scipy.stats import chi2
 
 from slamgym import smooth
 from slamgym.estimator import Belief, Drive, EkfSlam, UpdateReport, make_estimator
@@ -34,7 +36,12 @@ from slamgym.experiments.run_and_replay.filter_settings import (
 )
 from slamgym.experiments.run_and_replay.log_replay import MapHistory, replay
 from slamgym.experiments.run_and_replay.log_smoothing import smooth_log
-from slamgym.experiments.run_and_replay.summary import LOST, pose_nees, summarise
+from slamgym.experiments.run_and_replay.summary import (
+    LOST,
+    nis_summary,
+    pose_nees,
+    summarise,
+)
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.02, 0.1)}
 
@@ -459,6 +466,17 @@ def test_the_nis_of_a_summary_is_that_of_the_reports():
     assert summary["total"] == pytest.approx(sum(nis))
     assert summary["mean"] == pytest.approx(sum(nis) / 2)
     assert summary["per_degree"] == pytest.approx(sum(nis) / 4)
+
+
+def test_the_interval_of_the_nis_covers_95_percent_of_honest_scans():
+    rng = np.random.default_rng(3)
+    dof = 2 * rng.integers(0, 4, 9000)  # 0 where nothing was corrected
+    nis = rng.chisquare(np.maximum(dof, 1))
+    found = nis_summary(SimpleNamespace(nis=nis, nis_dof=dof))
+    limits = chi2.ppf([[0.025], [0.975]], dof[dof > 0])
+    inside = (nis[dof > 0] > limits[0]) & (nis[dof > 0] < limits[1])
+    assert found["inside_95"] == inside.mean() == pytest.approx(0.95, abs=0.01)
+    assert found["scans"] == np.count_nonzero(dof)
 
 
 def test_settings_come_from_the_caller_then_the_log():
