@@ -118,14 +118,17 @@ class GaussianMap:
 
     def snapshot(self) -> dict[str, Any]:
         """Return a copy of the memory and all else by name, for :meth:`resume`."""
-        return with_copies(self.__getstate__())
+        block = aligned_zeros(len(self.block))
+        copy_memory(self.block, block)
+        return {**with_copies(_without_block(self.__getstate__())), "block": block}
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
         """Return to a :meth:`snapshot`, in place where the layout is the same."""
         self.detach_report()
         memory, starts = snapshot["block"], slice(STARTS, NUMBERS)
         if memory[starts].tobytes() == self.block[starts].tobytes():
-            self._slots, self._last, self.block[:] = {}, type(None), memory
+            self._slots, self._last = {}, type(None)
+            copy_memory(memory, self.block)
             vars(self).update(_without_block(snapshot))
         else:
             self.__setstate__(dict(snapshot))
@@ -429,6 +432,14 @@ def parts_of(block: Array) -> Parts:
 parts_jit = njit_inlined(parts_of)
 
 
+def copy_memory(block: Array, to: Array) -> None:
+    """Copy all to a block of the same layout, but for room that is not in use."""
+    parts = parts_of(block)
+    begin, _, end = parts.numbers[STARTS + 4 : STARTS + 7].tolist()
+    begin += parts.rows[: scan.FIRST + 2 * parts.numbers[IN_USE]].size
+    to[:begin], to[end:] = block[:begin], block[end:]
+
+
 @jit_in_place
 def update_map(block: Array, readings: Array, ids: IntArray) -> int:
     """Update the belief of a filter with one scan, in place.
@@ -458,7 +469,7 @@ def update_map(block: Array, readings: Array, ids: IntArray) -> int:
     mapped = numbers[LANDMARKS]
     if count > len(parts.scan_ids):
         return NO_ROOM
-    if mapped + find_slots(parts, ids) > (numbers[CAPACITY] - 4) // 2:
+    if mapped + find_slots(parts, ids, slots) > (numbers[CAPACITY] - 4) // 2:
         return NO_ROOM
     complete_rows(parts, count)
     size = 3 + 2 * mapped
@@ -500,8 +511,8 @@ def complete_rows(parts: Parts, count: int) -> None:
 
 
 @njit_internal
-def find_slots(parts: Parts, ids: IntArray) -> int:
-    """Write the slots of landmarks to the ledger, -1 for new ones; count these.
+def find_slots(parts: Parts, ids: IntArray, slots: IntArray) -> int:
+    """Fill the slots of landmarks, -1 for new ones; count these.
 
     The table holds slots + 1 and is at most half full.  A search begins at the hash of
     an identity and ends at its slot or at an empty entry.
@@ -517,7 +528,7 @@ def find_slots(parts: Parts, ids: IntArray) -> int:
         at = hash_of(ids[k]) & mask
         while table[at] > 0 and parts.ids[table[at] - 1] != ids[k]:
             at = (at + 1) & mask
-        parts.ledger[scan.SLOT, k] = table[at] - 1
+        slots[k] = table[at] - 1
         new += table[at] == 0
     return new
 

@@ -56,6 +56,7 @@ from ..filters.gaussian_map import (
     LANDMARKS,
     GaussianMap,
     Parts,
+    copy_memory,
     find_slots,
     parts_jit,
     parts_of,
@@ -89,8 +90,8 @@ class ClearScan(NamedTuple):
     #: The landmark of each reading, and the label of its tentative landmark.
     row_ids: tuple[int | None, ...]
     labels: tuple[int, ...]
-    #: The readings that the filter uses, and their landmarks.
-    fed: tuple[Array, IntArray]
+    #: The landmark of each reading that the filter uses, shape (m,).
+    names: IntArray
     #: The tentative landmarks after the scan.
     following: TentativeLandmarks
     #: What `count_clear` returned, where the scan has been taken in at once.
@@ -119,6 +120,8 @@ class ClearScans:
     sensor : AssociationSensor
     recent : RecentScans
         Of the hypothesis: it notes the scans.
+    rooms : dict of int to ndarray
+        Room for trials by its size, which all hypotheses share.
     """
 
     def __init__(
@@ -127,8 +130,9 @@ class ClearScans:
         policy: LandmarkPolicy,
         sensor: AssociationSensor,
         recent: RecentScans,
+        rooms: dict[int, Array],
     ) -> None:
-        self._slam, self._recent = slam, recent
+        self._slam, self._recent, self._rooms = slam, recent, rooms
         self._filter = filter_inside(slam)
         self._policy, self._noise = policy, sensor.noise
         self._settings = settings_of(policy, sensor)
@@ -201,9 +205,8 @@ class ClearScans:
         if found is None and not is_taken:
             return None
         number, row_ids = candidates.scan + self._ahead, tuple(names.tolist())
-        labels, fed = (NO_LABEL,) * count, (readings, names)
-        counted = (is_afar, is_used) if is_taken else None
-        scan = ClearScan(readings, number, row_ids, labels, fed, known, counted)
+        labels, counted = (NO_LABEL,) * count, (is_afar, is_used) if is_taken else None
+        scan = ClearScan(readings, number, row_ids, labels, names, known, counted)
         if found is None:
             return scan
         if is_given:
@@ -235,14 +238,11 @@ class ClearScans:
         )
         marks = slots[0].tolist()
         if min(marks, default=0) < 0:
-            rows, (readings, names) = slots[0] >= 0, scan.fed
             pairs = zip(scan.row_ids, marks, strict=True)
-            ambiguous = [k for k, slot in enumerate(marks) if slot == AMBIGUOUS]
             scan = scan._replace(
                 row_ids=tuple([i if slot >= 0 else None for i, slot in pairs]),
-                fed=(readings[rows], names[rows]),
                 tentative_rows=tuple(np.flatnonzero(slots[0] == NEW).tolist()),
-                ambiguous_rows=tuple(ambiguous),
+                ambiguous_rows=tuple(np.flatnonzero(slots[0] == AMBIGUOUS).tolist()),
             )
         if not len(chance) and not scan.tentative_rows:
             return scan
@@ -260,13 +260,8 @@ class ClearScans:
         numbers, known = tally_of(self._tally).numbers, scan.following
         rows = np.flatnonzero(tentative_slots >= 0)
         if len(rows):
-            shown = (
-                tentative_slots[rows],
-                scan.readings[rows],
-                self._noise,
-                density[rows],
-            )
-            known = known.with_sightings(*shown)
+            shown = scan.readings[rows], self._noise, density[rows]
+            known = known.with_sightings(tentative_slots[rows], *shown)
         known = known.with_misses(chance)
         fresh = [row for row in scan.tentative_rows if tentative_slots[row] < 0]
         if (len(rows) and known.proven(needed).any()) or (fresh and needed == 1):
@@ -280,21 +275,32 @@ class ClearScans:
         following = known.after_scan(scans)
         return scan._replace(labels=tuple(labels.tolist()), following=following)
 
-    def tried(self, scan: ClearScan, ceiling: float) -> list[tuple[float, MapView]]:
+    def tried(self, scan: ClearScan, ceiling: float) -> list[tuple[float, Marginals]]:
         """Return the costs of associations up to a ceiling, and the beliefs after them.
 
         The best one comes first.  Those that the filter refuses are left out.
         """
-        gaussian, found = self._filter.map, []
-        ids, names = gaussian.parts.ids, [*gaussian.slots]
+        gaussian, found = self._filter.map, list[tuple[float, Marginals]]()
+        block, names = gaussian.block, [*gaussian.slots]
+        if block.size not in self._rooms:
+            self._rooms.clear()
+            self._rooms[block.size] = aligned_copy(block)
+        trial, ids = self._rooms[block.size], gaussian.parts.ids
         for cost, slots in zip(scan.costs, scan.slots, strict=True):
-            rows, copy = slots >= 0, aligned_copy(gaussian.block)
+            rows = slots >= 0
+            copy_memory(block, trial)
             if cost <= ceiling and (
-                update_map(copy, scan.readings[rows], ids[slots[rows]]) == DONE
+                update_map(trial, scan.readings[rows], ids[slots[rows]]) == DONE
             ):
-                after = parts_of(copy)
-                found.append((cost, MapView(after.mean, after.covariance, names)))
+                after = marginals_of(parts_of(trial), names)
+                copies = after.mean.copy(), after.variances.copy()
+                found.append((cost, Marginals(*copies, names)))
         return found
+
+    def marginals(self) -> Marginals:
+        """Return the belief of the filter, valid until its next step."""
+        gaussian = self._filter.map
+        return marginals_of(gaussian.parts, [*gaussian.slots])
 
     def update(self, scan: ClearScan) -> bool:
         """Update by a scan as associated; return False if the filter refuses it."""
@@ -319,13 +325,14 @@ class ClearScans:
 
     def _updated(self, scan: ClearScan) -> tuple[bool, bool] | None:
         """Update the filter by a scan, and count it; return None if it refuses."""
-        gaussian = self._filter.map
+        gaussian, rows = self._filter.map, scan.slots[0] >= 0
+        fed = scan.readings[rows], scan.names[rows]
         if self._filter is self._slam:
-            if gaussian.take_in(update_map, *scan.fed) != DONE:
+            if gaussian.take_in(update_map, *fed) != DONE:
                 return None
         else:
             try:
-                self._slam.update(*scan.fed)
+                self._slam.update(*fed)
             except (ValueError, np.linalg.LinAlgError):
                 return None
         read = scan.readings, scan.slots[0], scan.tentative_slots
@@ -381,7 +388,24 @@ def _renewed(
     return {i: value for i, value in now.items() if value != usual}
 
 
-def is_near(one: MapView, other: MapView) -> bool:
+class Marginals(NamedTuple):
+    """A belief without its correlations, to compare it with others."""
+
+    #: In the order of the state, shape (3 + 2n,).
+    mean: Array
+    #: Of the additive error, shape (3 + 2n,).
+    variances: Array
+    #: Landmarks in the order of the state.
+    ids: Sequence[int]
+
+
+def marginals_of(belief: MapView | Parts, ids: Sequence[int]) -> Marginals:
+    """Return the part of a belief that counts, without a copy."""
+    size, variances = 3 + 2 * len(ids), belief.covariance.diagonal()
+    return Marginals(belief.mean[:size], variances[:size], ids)
+
+
+def is_near(one: Marginals, other: Marginals) -> bool:
     """Return whether two maps of the same landmarks have nearly the same belief.
 
     In every coordinate with means μ₁, μ₂ and deviations σ₁, σ₂, the second belief must
@@ -391,11 +415,9 @@ def is_near(one: MapView, other: MapView) -> bool:
     """
     if one.ids != other.ids:
         return False
-    size = 3 + 2 * len(one.ids)
-    gap = other.mean[:size] - one.mean[:size]
+    gap = other.mean - one.mean
     gap[2] = wrap_angle(float(gap[2]))
-    variances, others = (m.covariance.diagonal()[:size] for m in (one, other))
-    return bool((gap**2 + others <= (1 + SAME**2) * variances).all())
+    return bool((gap**2 + other.variances <= (1 + SAME**2) * one.variances).all())
 
 
 # --------------------------------------------------------------------------------------
@@ -582,7 +604,7 @@ def associate_clear(
     """
     (block, tally_block), (is_given, at_once), count = blocks, flags, len(readings)
     parts, tally = parts_jit(block), tally_jit(tally_block)
-    if count > len(parts.scan_ids) or tally.whole[COUNT] != parts.numbers[LANDMARKS]:
+    if tally.whole[COUNT] != parts.numbers[LANDMARKS]:
         return False, False, False, None
     if is_given:
         found = _given(parts, ids, len(tentative[2]))
@@ -605,11 +627,11 @@ def associate_clear(
 @njit_allocating
 def _given(parts: Parts, ids: IntArray, tentative: int) -> Associations:
     """Return the association by given landmarks; none if one of them is new."""
-    is_new, count = find_slots(parts, ids) > 0, len(ids)
-    slots = parts.ledger[SLOT, : 0 if is_new else count].copy()
-    slots = slots.reshape((0 if is_new else 1, count))
-    unused = np.full(count, NEW), np.ones(tentative), np.ones(count)
-    return np.zeros(len(slots)), slots, *unused
+    slots, count = np.empty((1, len(ids)), np.int64), 1
+    if find_slots(parts, ids, slots[0]) > 0:
+        count = 0
+    unused = np.full(len(ids), NEW), np.ones(tentative), np.ones(len(ids))
+    return np.zeros(count), slots[:count], *unused
 
 
 @njit_allocating

@@ -50,7 +50,7 @@ from ..interface import (
 from ..models.bearing_range import wrap_angle
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.rigid_motion import rotation
-from .clear_scans import SPREAD, ClearScan, ClearScans, is_near
+from .clear_scans import SPREAD, ClearScan, ClearScans, Marginals, is_near, marginals_of
 from .loop_closing import AROUND, FEWEST_READINGS, is_astray, places_of_scan
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy
@@ -147,7 +147,7 @@ class ManagedSlam(FilterWrapper):
         motion = options.get("motion", UNICYCLE)
         at_rest = options.get("noise_at_rest", True)
         noise_of_motion = MotionNoise.checked(motion_std, at_rest, motion)
-        self._settings = SharedSettings(policy, sensor, noise_of_motion)
+        self._settings = SharedSettings(policy, sensor, noise_of_motion, {})
         self._hypotheses = [Hypothesis(first, self._settings)]
         #: All hypotheses made so far, and those of them that are not in use.
         self._made = self._hypotheses
@@ -400,9 +400,9 @@ class ManagedSlam(FilterWrapper):
         if not [cost for h, cost in others if cost <= ceiling - h.cost]:
             return False
         tried = [
-            (h.cost + cost, k, (view, scan.following.labels.tobytes()))
+            (h.cost + cost, k, (belief, scan.following.labels.tobytes()))
             for _, h, scan in ranked
-            for k, (cost, view) in enumerate(h.tried(scan, ceiling - h.cost))
+            for k, (cost, belief) in enumerate(h.tried(scan, ceiling - h.cost))
         ]
         tried.sort(key=itemgetter(0))
         kept = differing([belief for *_, belief in tried], self.policy.hypotheses)
@@ -546,6 +546,8 @@ class SharedSettings(NamedTuple):
     policy: LandmarkPolicy
     sensor: AssociationSensor
     motion_noise: MotionNoise
+    #: Room for trials of clear scans, by its size.
+    rooms: dict[int, Array]
 
 
 class Branch(NamedTuple):
@@ -585,16 +587,17 @@ class Hypothesis:
     """
 
     def __init__(self, slam: SlamEstimator, settings: SharedSettings) -> None:
-        policy, sensor, _ = self.policy, self.sensor, self.motion_noise = settings
+        policy, sensor, self.motion_noise, rooms = settings
+        self.policy, self.sensor = policy, sensor
         self.filter = slam
         #: −2 ln of its probability, relative to the best hypothesis.
         self.cost = 0.0
         self.editor = MapEditor(slam, merging=policy.merge_within is not None)
         self.pruner = MapPruner(policy, self.editor, sensor.noise)
         self.recent = RecentScans(slam, self.editor, policy)
-        serves = ClearScans.serve(slam, policy)
-        clear = ClearScans(slam, policy, sensor, self.recent) if serves else None
-        self._clear = clear
+        self._clear: ClearScans | None = None
+        if ClearScans.serve(slam, policy):
+            self._clear = ClearScans(slam, policy, sensor, self.recent, rooms)
         self._candidates = Candidates()
         #: After a clear scan this scan: the filter can return the report once more.
         self._report: UpdateReport | ClearScan = UpdateReport()
@@ -647,7 +650,7 @@ class Hypothesis:
         known = self._candidates, self.pruner.records
         return self._clear.associate(readings, ids, ceiling, *known, alone=alone)
 
-    def tried(self, scan: ClearScan, ceiling: float) -> list[tuple[float, MapView]]:
+    def tried(self, scan: ClearScan, ceiling: float) -> list[tuple[float, Marginals]]:
         """Return the costs and the beliefs after all associations of a clear scan."""
         assert self._clear is not None
         return self._clear.tried(scan, ceiling)
@@ -670,6 +673,13 @@ class Hypothesis:
     def map_view(self) -> MapView:
         """Return pose and map, without a copy where possible, until the next step."""
         return view_map(self.filter)
+
+    def marginals(self) -> Marginals:
+        """Return the belief without its correlations, until the next step."""
+        if self._clear is not None:
+            return self._clear.marginals()
+        view = self.map_view()
+        return marginals_of(view, view.ids)
 
     def reset(self, pose: ArrayLike, pose_std: ArrayLike) -> None:
         """Start a new run, without a map."""
@@ -844,27 +854,28 @@ def distinct(hypotheses: Sequence[Hypothesis], most: int) -> list[Hypothesis]:
     """Return the hypotheses that differ from all that are more probable."""
     if len(hypotheses) == 1:
         return [*hypotheses]
-    beliefs = [(h.map_view(), h.tentative.labels.tobytes()) for h in hypotheses]
+    beliefs = [(h.marginals(), h.tentative.labels.tobytes()) for h in hypotheses]
     return [hypotheses[k] for k in differing(beliefs, most)]
 
 
-def differing(beliefs: Sequence[tuple[MapView, bytes]], most: int) -> list[int]:
+def differing(beliefs: Sequence[tuple[Marginals, bytes]], most: int) -> list[int]:
     """Return which beliefs differ from all before in the map or the labels.
 
     The effect of readings that were left out fades with time.  Of hypotheses with
     overlapping poses, which are variants of one decision, the most probable are
     returned only, so that they leave room for another decision.
     """
-    views = [view for view, _ in beliefs]
-    variances = np.maximum([v.covariance.diagonal()[:3] for v in views], 0.0) + NIL
-    poses = np.hstack([[v.mean[:3] for v in views], variances]).tolist()
+    maps = [belief for belief, _ in beliefs]
+    variances = np.maximum([each.variances[:3] for each in maps], 0.0) + NIL
+    poses = np.hstack([[each.mean[:3] for each in maps], variances]).tolist()
     chosen: list[int] = []
-    for k, (view, labels) in enumerate(beliefs):
+    for k, (belief, labels) in enumerate(beliefs):
         if len(chosen) == most:
             break
         overlapping = sum(_overlap(poses[n], poses[k]) for n in chosen)
-        alike = (views[n] for n in chosen if beliefs[n][1] == labels)
-        if overlapping < MOST_OVERLAPPING and not any(is_near(v, view) for v in alike):
+        alike = (maps[n] for n in chosen if beliefs[n][1] == labels)
+        is_variant = any(is_near(better, belief) for better in alike)
+        if overlapping < MOST_OVERLAPPING and not is_variant:
             chosen.append(k)
     return chosen
 

@@ -226,3 +226,18 @@ def test_reading_the_report_later_changes_nothing():
         kept = report
     slam.predict((0.1, 0.0))
     assert slam.report() == kept
+
+
+def test_a_view_does_not_outlive_a_clear_scan_that_moves_the_map(count):
+    slam, places = make(), np.linspace(-2.0, 2.0, 60)
+    scan = np.stack([places, np.full(60, 9.0)], axis=1)
+    for first in (0, 20, 40):
+        for _ in range(2):
+            slam.update(scan[first : first + 20], range(first, first + 20))
+    (one,) = slam.hypotheses
+    before = one.editor.map_view()
+    slam.update(scan, range(60))  # more readings than any scan before
+    assert count[-1]
+    view = one.editor.map_view()
+    np.testing.assert_array_equal(view.covariance, one.map_view().covariance)
+    assert (view.covariance.diagonal()[:123] < before.covariance.diagonal()[:123]).any()

@@ -9,14 +9,13 @@ from interrupts import found_after_interrupts
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.estimator import EkfSlam, UpdateReport, make_estimator
 from slamgym.estimator.association import scan_assignments
-from slamgym.estimator.interface import MapView
+from slamgym.estimator.map_management.clear_scans import Marginals, is_near
 from slamgym.estimator.map_management.managed_slam import (
     MOST_OVERLAPPING,
     OVERLAP,
     Hypothesis,
     ManagedSlam,
     distinct,
-    is_near,
 )
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.evaluation import score_association
@@ -491,15 +490,15 @@ def test_the_distance_of_a_reading_given_the_others_is_that_of_the_conditional()
         report.squared_given_others(5)
 
 
-def view(mean, std):
-    return MapView(np.array(mean, dtype=float), np.diag(np.square(std)), ())
+def marginals(mean, std):
+    return Marginals(np.array(mean, dtype=float), np.square(std), ())
 
 
 def test_a_belief_that_is_much_less_certain_is_another_one():
-    sure = view([1.0, 2.0, 3.1], [0.1, 0.1, 0.05])
-    unsure = view([1.0, 2.0, 3.1], [0.1, 0.3, 0.05])
-    turned = view([1.0, 2.0, -3.14], [0.1, 0.1, 0.05])
-    shifted = view([1.0, 2.11, 3.1], [0.1, 0.1, 0.05])
+    sure = marginals([1.0, 2.0, 3.1], [0.1, 0.1, 0.05])
+    unsure = marginals([1.0, 2.0, 3.1], [0.1, 0.3, 0.05])
+    turned = marginals([1.0, 2.0, -3.14], [0.1, 0.1, 0.05])
+    shifted = marginals([1.0, 2.11, 3.1], [0.1, 0.1, 0.05])
     assert is_near(sure, sure)
     assert is_near(sure, turned)  # by .04 rad, across π
     assert is_near(unsure, sure)
