@@ -289,6 +289,23 @@ def test_a_local_map_lies_ahead_by_half_the_way_of_the_phase_before(monkeypatch)
     np.testing.assert_allclose(ahead[1:], places[1:] + steps / 2, atol=1e-9)
 
 
+@pytest.mark.usefixtures("_small_maps_are_whole")
+def test_a_small_map_that_is_local_as_a_whole_stays_so(monkeypatch):
+    slam, changes = CompressedEkfSlam(*NOISE), []
+    change = active_set.CompressedMap.change_local_map
+    monkeypatch.setattr(
+        active_set.CompressedMap,
+        "change_local_map",
+        lambda *args, **options: changes.append(1) or change(*args, **options),
+    )
+    scan = np.stack([np.linspace(-2.0, 2.0, 60), np.full(60, 9.0)], axis=1)
+    slam.update(scan, range(60))
+    for first in range(0, 40, 4):
+        slam.update(scan[first : first + 4], range(first, first + 4))
+    assert len(slam.local_ids) == 60
+    assert not changes
+
+
 def test_a_local_map_grows_by_half_before_it_changes():
     slam, sizes = CompressedEkfSlam(*NOISE, local_size=4), []
     for k in range(12):  # 6 landmarks are not too many, and one more joins them
