@@ -9,6 +9,7 @@ Every case takes the same step: predict, then all readings. "kernels" are the co
 functions alone; "public" are ``predict`` and ``update`` with all checks and the report.
 """
 
+import math
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -225,13 +226,17 @@ HIDDEN = {
 def compare_hidden(seen: int, mapped: int) -> None:
     """Print the time of a scan without identities, beside one with identities.
 
-    Landmarks have one on 25 m² each; the robot sees those that are nearest.  All scans
-    are taken once before: the first ones learn how many readings belong to none.
+    Each landmark stands in a square of 5 m, at least 3 m from all others, so that no
+    reading is ambiguous.  The robot, at a corner of four squares, sees those that are
+    nearest.  All scans are taken once before: the first ones learn how many readings
+    belong to none.
     """
-    rng, side = np.random.default_rng(1), 5 * mapped**0.5
-    x, y = rng.uniform(-side / 2, side / 2, (2, mapped))
+    rng, half = np.random.default_rng(1), math.ceil(mapped**0.5 / 2)
+    corners = np.indices((2 * half, 2 * half)).reshape(2, -1) - half
+    x, y = 5 * (corners + rng.uniform(0.3, 0.7, corners.shape))
     readings = np.stack([np.arctan2(y, x), np.hypot(x, y)], axis=1)
-    ids = np.argsort(readings[:, 1])[:seen]
+    readings = readings[np.argsort(readings[:, 1])[:mapped]]
+    ids = np.arange(seen)
     near, goals = readings[ids], HIDDEN[seen, mapped]
     scans = [
         near + rng.standard_normal(near.shape) * MEASUREMENT_STD for _ in range(97)
