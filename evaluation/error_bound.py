@@ -282,13 +282,16 @@ def _displacements(poses: Array) -> Array:
 
 def _readings(drives: _Drives, sensor: Sensor) -> Array:
     """Return the exact readings, shape (B, T, L, 2), zeros where not visible."""
-    poses, places, visible, *_ = drives
-    run, scan, row = np.nonzero(visible)
-    dx, dy = (places[run, row] - poses[run, scan, :2]).T
-    cos, sin = np.cos(poses[..., 2])[run, scan], np.sin(poses[..., 2])[run, scan]
-    z = np.zeros((*visible.shape, 2))
-    z[visible] = sensor.read(cos * dx + sin * dy, cos * dy - sin * dx)
-    return z
+    visible, (x, y, heading) = drives.visible, drives.poses.reshape(-1, 3).T
+    at = np.flatnonzero(visible)  # a third of the time of three numbers for each
+    scan, row = np.divmod(at, visible.shape[2])
+    landmark = scan // visible.shape[1] * visible.shape[2] + row
+    lx, ly = drives.places.reshape(-1, 2).T
+    dx, dy = lx[landmark] - x[scan], ly[landmark] - y[scan]
+    cos, sin = np.cos(heading)[scan], np.sin(heading)[scan]
+    z = np.zeros((visible.size, 2))
+    z[at] = sensor.read(cos * dx + sin * dy, cos * dy - sin * dx)
+    return z.reshape(*visible.shape, 2)
 
 
 def _about_centre(covariances: Array, known: IntArray) -> Array:

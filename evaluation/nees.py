@@ -325,7 +325,14 @@ def in_frame(
     The origin of the invariant frame is the estimated position, so that the NEES has
     the same digits wherever the world's origin lies.
     """
-    covariances = _without_rounding(covariances)
+    cleared = without_rounding(covariances)
+    return of_cleared(true_states, means, cleared, frame)
+
+
+def of_cleared(
+    true_states: Array, means: Array, covariances: Array, frame: ErrorFrame
+) -> tuple[Array, Array]:
+    """Return the same for covariances from `without_rounding`."""
     if one_of("frame", frame, ERROR_FRAMES) == "invariant":
         origins = means[..., :2]
         truth, means = seen_from(origins, true_states), seen_from(origins, means)
@@ -333,7 +340,7 @@ def in_frame(
     return additive_error(true_states, means), covariances
 
 
-def _without_rounding(covariances: Array) -> Array:
+def without_rounding(covariances: Array) -> Array:
     """Return covariances in which variances of the position that are rounding are 0.
 
     At first, a robot without sideways noise is certain of its y, given its heading.  A

@@ -191,8 +191,13 @@ def distances(estimate: Array, truth: Array) -> tuple[Array, Array]:
         [m]
     """
     *_, moved = _aligned(estimate, truth)
-    raw, aligned = estimate - truth, moved - truth
-    return np.linalg.norm(raw, axis=-1), np.linalg.norm(aligned, axis=-1)
+    return lengths(estimate - truth), lengths(moved - truth)
+
+
+def lengths(vectors: Array) -> Array:
+    """Return the lengths (...) of vectors (..., 2), as `numpy.linalg.norm` does."""
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.asarray(np.sqrt(x * x + y * y))
 
 
 def exchanged_positions(estimate: ArrayLike, truth: ArrayLike) -> Exchange:

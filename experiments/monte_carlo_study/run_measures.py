@@ -26,7 +26,7 @@ from ...evaluation.association_scores import (
 )
 from ...evaluation.error_bound import PosteriorBound, map_error_squared
 from ...evaluation.noise_findings import CHANNELS, MOMENTS
-from ...evaluation.trajectory_error import distances, ellipse_areas
+from ...evaluation.trajectory_error import distances, ellipse_areas, lengths
 from ...sim_configs import Scenario
 from ..logs.ground_truth import TrueLandmarks
 from ..logs.slamlog import NO_LANDMARK
@@ -398,9 +398,7 @@ def _measure_paths(
         "nis": filtered.trace.nis[some],
         "nis_dof": filtered.trace.degrees_of_freedom[some],
         "position_error": np.hypot(errors[..., 0], errors[..., 1]),
-        "position_error_invariant": np.linalg.norm(
-            invariant_error(*about)[..., :2], axis=-1
-        ),
+        "position_error_invariant": lengths(invariant_error(*about)),
         "heading_error": wrap_angle(errors[..., 2]),
         "heading_std": np.sqrt(variances[..., 2]),
         "position_std": np.sqrt(variances[..., 0] + variances[..., 1]),
@@ -409,11 +407,12 @@ def _measure_paths(
         "ate_aligned": _rms(aligned),
         "pose_area": ellipse_areas(covariances[:, -1, :2, :2]),
     }
+    cleared = nees.without_rounding(covariances)
     for frame in ERROR_FRAMES:
-        claimed = nees.in_frame(truth, poses, covariances, frame)
-        squares = nees.whitened(*claimed) ** 2
-        measured[f"pose_nees_{frame}"] = squares.sum(axis=-1)
-        measured[f"position_nees_{frame}"] = squares[..., :2].sum(axis=-1)
+        claimed = nees.of_cleared(truth, poses, cleared, frame)
+        x, y, turn = np.moveaxis(nees.whitened(*claimed) ** 2, -1, 0)
+        measured[f"pose_nees_{frame}"] = x + y + turn
+        measured[f"position_nees_{frame}"] = x + y
     return measured
 
 
