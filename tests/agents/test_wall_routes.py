@@ -81,6 +81,14 @@ def test_no_route_is_longer_than_on_a_lattice(grid):
     assert routes.mean() > 0.85 * lengths.mean()  # and none goes through a wall
 
 
+def test_only_goals_too_near_to_walls_are_moved(grid):
+    goals = points(200, seed=3)
+    moved = grid.routes.kept_clear(goals)
+    stays = (moved == goals).all(axis=1)
+    assert 20 < np.count_nonzero(~stays) < 150
+    assert grid.clearance(goals[~stays]).max() < grid.clearance(moved).min() + 1e-9
+
+
 def test_ways_on_a_floor_without_inner_walls_are_straight():
     grid = CoverageGrid(load_scenario("active_easy"))
     start, goal = np.array([-3.0, 2.0]), np.array([[4.0, -1.0], [5.9, 6.0]])

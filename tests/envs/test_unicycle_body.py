@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
-from slamgym.envs.robot import UnicycleBody
+from slamgym.envs.robot import UnicycleBody, wall_distances
 
 SKIN = 1e-6
 RADIUS = 0.3
@@ -27,6 +27,14 @@ def distance_to_wall(point, wall):
     a, b = complex(*wall[:2]), complex(*wall[2:])
     share = ((point - a) * (b - a).conjugate()).real / abs(b - a) ** 2
     return abs(point - (a + min(max(share, 0.0), 1.0) * (b - a)))
+
+
+def test_distances_from_walls_are_those_of_a_projection():
+    rng = np.random.default_rng(7)
+    points = rng.uniform(-6, 6, 200) + 1j * rng.uniform(-6, 6, 200)
+    a, b = np.array(ARENA).view(np.complex128).T
+    expected = [[distance_to_wall(point, wall) for wall in ARENA] for point in points]
+    np.testing.assert_allclose(wall_distances(points, a, b - a), expected, atol=1e-12)
 
 
 def clearance(body, walls):

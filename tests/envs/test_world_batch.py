@@ -224,7 +224,9 @@ def test_bodies_move_like_single_ones_near_and_far_from_walls(drive):
     starts = np.column_stack([rng.uniform(-8, 10, (count, 2)), rng.normal(size=count)])
     scale = rng.choice([0.0, 0.01, 0.3, 3.0], count)[:, None]
     commands, slip = (scale * rng.normal(size=(count, n)) for n in (2, 3))
+    before = bodies.frame
     bodies.place(np.arange(count), starts)
+    assert not before[:3].any()  # a place replaces the frame
     shares = bodies.drive(commands, slip).tolist()
     for k, pose in enumerate(starts.tolist()):
         body.place(pose)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from slamgym.estimator import Belief, list_estimators, make_batch, make_estimator
+from slamgym.estimator.interface import MapView
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.02, 0.1)}
 
@@ -33,6 +34,20 @@ def test_the_error_of_a_marginal_is_additive_by_default():
     assert part.frame == "additive"
     np.testing.assert_array_equal(part.landmarks, [(5.0, 6.0)])
     np.testing.assert_array_equal(part.covariance.diagonal(), [1, 2, 3, 6, 7])
+
+
+def test_an_error_is_the_truth_minus_the_estimate():
+    belief = Belief(np.array([1.0, 2.0, 3.1, 4.0, 5.0]), np.eye(5), (7,))
+    error = belief.error((1.5, 2.0, -3.1), [(4.0, 6.0)])
+    expected = [0.5, 0.0, 2 * np.pi - 6.2, 0.0, 1.0]
+    np.testing.assert_allclose(error, expected, atol=1e-12)
+
+
+def test_a_part_of_a_view_knows_the_whole_map():
+    view = MapView(np.arange(7.0), np.eye(7), (3, 5))
+    part = view.part([1])
+    assert (part.ids, part.mapped) == ([5], (3, 5))
+    assert view._replace(whole=(9, 3, 5)).part([0]).mapped == (9, 3, 5)
 
 
 def test_a_batch_shows_its_runs():
