@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slamgym.experiments.estimate_files import near_truth, read_estimates, true_path
+from slamgym.experiments.logs import LogError
 
 RNG = np.random.default_rng(0)
 TIMES = np.array([0.5, 1.5, 2.0])
@@ -58,6 +59,25 @@ def test_a_csv_is_read_number_by_number(count, of_map, tmp_path):
     few = found.at(np.array([2, 0]))
     for name in ("poses", "covariances", "times"):
         assert (getattr(few, name) == getattr(found, name)[[2, 0]]).all(), name
+
+
+def test_lines_of_a_csv_are_read_alike_at_once_and_one_by_one(tmp_path):
+    """A blank before a comma makes the reader look at each line by itself."""
+    rows = np.hstack([TIMES[:, None], POSES, entries(PLANAR, 6)]).tolist()
+    lines = [f"pose,{','.join(map(repr, row))}" for row in rows]
+    lines.insert(2, "landmark,3,1,2,1,0,1")
+    plain, spaced, wrong = (tmp_path / f"{name}.csv" for name in ("a", "b", "c"))
+    plain.write_text("\n".join(lines))
+    spaced.write_text("\n".join([*lines[:-1], lines[-1].replace(",", " ,")]))
+    wrong.write_text("\n".join([*lines, "landmark,3,1,2,1,0,1"]))
+    one, other = (read_estimates([path])[path.stem] for path in (plain, spaced))
+    for found, expected in zip(one[1:], other[1:], strict=True):
+        np.testing.assert_array_equal(found, expected)
+    with pytest.raises(LogError, match="line 5: expected each landmark once"):
+        read_estimates([wrong])
+    wrong.write_text("\n".join([*lines[:3], f"{lines[3]}x"]))
+    with pytest.raises(LogError, match="line 4: expected a finite number"):
+        read_estimates([wrong])
 
 
 @pytest.mark.parametrize("count", [6, 9, 21, 36])
