@@ -216,9 +216,13 @@ class ClearScans:
 
     def _begin(self, candidates: Candidates, records: LandmarkRecords) -> bool:
         """Make the memory of the kernels, if scans of this map may be clear."""
-        mapped = [*self._filter.map.slots]
-        is_full = len(mapped) > (self._policy.capacity or math.inf)
-        if is_full or not may_be_clear(candidates, records, mapped):
+        mapped, capacity = [*self._filter.map.slots], self._policy.capacity or math.inf
+        if (
+            [*records.ids] != mapped
+            or records.doubtful
+            or candidates.next_id <= max(mapped, default=-1)
+            or len(mapped) > capacity
+        ):
             return False
         self._tally = new_tally(candidates, records, self._settings)
         return True
@@ -367,17 +371,6 @@ class ClearScans:
 def filter_inside(slam: Any) -> Any:
     """Return the filter inside a recorder, or any other filter itself."""
     return getattr(slam, "inside", slam)
-
-
-def may_be_clear(
-    candidates: Candidates, records: LandmarkRecords, mapped: Sequence[int]
-) -> bool:
-    """Return whether scans of a map of these landmarks may be clear."""
-    return (
-        [*records.ids] == mapped
-        and not records.doubtful
-        and candidates.next_id > max(mapped, default=-1)
-    )
 
 
 def _renewed(

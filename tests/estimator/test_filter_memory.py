@@ -321,3 +321,22 @@ def test_a_snapshot_holds_copies_of_what_a_filter_of_your_own_changes_in_place()
         assert slam.counts.tolist() == [0, 0, 0, 2, 1, 0, 0, 0, 0]
         assert slam.sizes == [1, 2]
     assert one.counts.tolist() == other.counts.tolist()
+
+
+@pytest.mark.parametrize("name", ["ekf", "iterated"])
+def test_a_resumed_filter_reports_its_last_scan_once_more(name):
+    slam, larger = make_estimator(name, **NOISE), make_estimator(name, **NOISE)
+    scan, ids = np.array([(0.1, 3.0), (1.0, 4.0), (-1.0, 5.0)]), [4, 7, 9]
+    slam.update(scan, ids)
+    expected, kept = slam.update(scan + 0.02, ids).replace(), slam.snapshot()
+    slam.update(scan[:1], ids[:1])
+    larger.update(np.tile(scan, (8, 1)), range(24))
+    for each in (slam, larger):
+        each.resume(kept)
+        found = each.report()
+        assert found.associated_ids == expected.associated_ids
+        assert found.nis == expected.nis
+        np.testing.assert_array_equal(found.innovation, expected.innovation)
+        np.testing.assert_array_equal(
+            found.innovation_factor, expected.innovation_factor
+        )

@@ -228,6 +228,21 @@ def test_a_scan_with_one_landmark_for_each_reading_is_assigned_as_by_the_search(
     assert others > 30
 
 
+def test_readings_that_contradict_each_other_are_not_settled():
+    """Each fits its landmark if the heading is wrong, by .25 rad to one side."""
+    policy, noise = LandmarkPolicy(association="joint"), Noise(0.03, 0.1)
+    mean, spread = np.array([0, 0, 0, 5, 0, 0, 5.0]), np.full(7, 1e-4)
+    spread[2] = 0.04
+    view = MapView(mean, np.diag(spread), (0, 1))
+    readings = np.array([(0.25, 5.0), (np.pi / 2 - 0.25, 5.0)])
+    scan = policy, view, readings, noise, np.full(2, 1e-30)
+    found = assign_scan(*scan)
+    costs, slots, _ = assign_plainly(*scan, limits=np.full(3, np.inf), most=1)
+    np.testing.assert_array_equal(found.costs, costs)
+    np.testing.assert_array_equal(found.slots, slots)
+    assert (found.slots < 0).any()
+
+
 def test_unpaired_readings_are_compared_with_free_landmarks_given_the_pairs():
     rng = np.random.default_rng(3)
     for _ in range(50):

@@ -27,6 +27,7 @@ from slamgym.estimator.association.missed_landmarks import (
     WIDEST,
     Detections,
     LostEvidence,
+    whole_times,
 )
 from slamgym.estimator.association.scan_assignments import missing_costs
 from slamgym.estimator.association.scan_association import Candidates
@@ -37,6 +38,7 @@ from slamgym.estimator.association.tentative_landmarks import (
     UnexplainedDensity,
 )
 from slamgym.estimator.interface import MapView
+from slamgym.jit import jit
 
 LONGEST = 6.0
 NONE = np.empty(0, np.int64)
@@ -702,3 +704,21 @@ def test_a_saved_state_whose_evidence_exceeds_its_largest_is_refused(place):
         Candidates.from_state_dict(state)
     state["lost"][2] = 4.0
     assert Candidates.from_state_dict(state).detections.lost[place] == 4.0
+
+
+@jit
+def fill_whole_times(values, part, found):
+    for k in range(len(values)):
+        found[k] = whole_times(values[k], part)
+
+
+@pytest.mark.parametrize("part", [2 * np.pi / 16, 8.3 / 8, 0.1])
+def test_a_cell_is_found_by_exact_division(part):
+    """The quotient of what is just below an edge may be rounded up to the edge."""
+    edges = part * np.arange(-40, 41)
+    values = np.concatenate([np.nextafter(edges, s) for s in (-np.inf, np.inf)])
+    values = np.concatenate([values, edges])
+    found = np.empty(len(values), np.int64)
+    fill_whole_times(values, part, found)
+    np.testing.assert_array_equal(found, values // part)
+    assert (found != np.floor(values / part)).any()
