@@ -58,6 +58,7 @@ TESTS = {
     "agents/active_slam": (
         "active_slam active_slam_pass active_slam_hidden active_slam_honesty"
     ),
+    "agents/active_slam_baselines": "wall_routes active_slam",
     "agents/active_slam_scores": "active_slam active_slam_honesty active_slam_hidden",
     "agents/belief_": "belief_observation information_reward state_and_restore",
     "agents/belief_space_planner": "wall_routes active_slam",

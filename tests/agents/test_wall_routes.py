@@ -7,12 +7,12 @@ import pytest
 from scipy.sparse.csgraph import dijkstra
 
 from slamgym.agents import ActiveSlamEnv
-from slamgym.agents.active_slam_baselines import BASELINES, make_baseline
+from slamgym.agents.active_slam_baselines import BASELINES, make_baseline, steer
 from slamgym.agents.active_slam_scores import VALIDATION, baseline_policy, run_episode
 from slamgym.agents.belief_space_planner import MPC, _arcs, drive_routes
 from slamgym.agents.wall_routes import CoverageGrid
 from slamgym.envs.robot import wrap_angle
-from slamgym.sim_configs import load_scenario
+from slamgym.sim_configs import Robot, load_scenario
 
 ROOMS = load_scenario("active_rooms")
 MARGIN = 0.7
@@ -180,3 +180,11 @@ def test_plans_that_turn_do_so_to_both_sides_alike_and_within_the_limit():
     assert turns.max() == 1.0
     assert np.count_nonzero(np.diff(turns) > 1e-9) == 6
     assert 0.0 in turns
+
+
+@pytest.mark.parametrize(("dt", "turn"), [(0.5, 0.4), (2.0, 0.1), (0.1, 1.0)])
+def test_steering_turns_to_the_goal_within_a_step_and_the_limit(dt, turn):
+    robot = Robot(max_speed=9.0, max_turn_rate=1.0)
+    goal = np.array([1.0 + 3 * np.cos(0.5), 2.0 + 3 * np.sin(0.5)])
+    found = steer(np.array([1.0, 2.0, 0.3]), goal, robot, dt)
+    np.testing.assert_allclose(found, [min(3 / dt, 9.0), turn])

@@ -1,6 +1,7 @@
 """The native vector world, held against Gymnasium's own vector of single worlds."""
 
 import copy
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +14,7 @@ from worlds import WALLS
 import slamgym  # noqa: F401 (registers the environments)
 from slamgym.envs.vector import FlattenBatch
 from slamgym.envs.vector.landmark_world_vector import LandmarkWorldVectorEnv
+from slamgym.envs.vector.wrappers import _Adapter
 from slamgym.sim_configs import load_scenario
 
 ID = "slamgym/LandmarkWorld-v0"
@@ -385,3 +387,14 @@ def test_flat_observations_are_gymnasiums(mode, changes):
 def test_only_one_level_of_arrays_can_be_flattened():
     with pytest.raises(ValueError, match="Dict observation"):
         FlattenBatch(gym.make_vec("CartPole-v1", 2, vectorization_mode="sync"))
+
+
+def test_an_episode_that_ends_by_itself_is_not_truncated_for_stable_baselines():
+    ends = np.array([[True, True, False], [True, False, True]])  # terminated, truncated
+    step = np.zeros(3), np.zeros(3), *ends, {}
+    adapter = SimpleNamespace(
+        worlds=SimpleNamespace(step=lambda _: step), _actions=None, _end=lambda *_: None
+    )
+    *_, dones, infos = _Adapter.step_wait(adapter)
+    assert dones.all()
+    assert [info["TimeLimit.truncated"] for info in infos] == [False, False, True]

@@ -26,7 +26,13 @@ from slamgym.estimator.large_maps.submaps.factor import (
     retract,
 )
 from slamgym.estimator.large_maps.submaps.graph import fuse
-from slamgym.estimator.large_maps.submaps.store import CACHE_SIZE, MARKER
+from slamgym.estimator.large_maps.submaps.store import (
+    CACHE_SIZE,
+    MARKER,
+    FolderStore,
+    LostSubmapError,
+    Submap,
+)
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
 from slamgym.estimator.models.motions import predict_pose
@@ -809,3 +815,22 @@ def test_rounding_makes_no_variance_negative():
 )
 def test_the_common_ancestor_of_two_nodes_is_the_deepest_one(one, other, both):
     assert common_ancestor(one, other) == common_ancestor(other, one) == both
+
+
+def test_a_folder_keeps_the_submaps_of_last_use_in_memory(tmp_path):
+    store, most = FolderStore(tmp_path / "run"), CACHE_SIZE + 2
+    store.claim()
+    submaps = [Submap(np.arange(1), np.full(5, k), np.eye(5)) for k in range(most)]
+    for submap in submaps:
+        store.append(submap)
+    for file in tmp_path.glob("run/submap_*"):
+        file.unlink()
+    assert store.load(most - 1).mean[0] == most - 1
+    with pytest.raises(LostSubmapError):
+        store.load(0)
+    size = store.nbytes
+    store.truncate(most - 1)
+    assert (len(store), store.nbytes) == (
+        most - 1,
+        size * (CACHE_SIZE - 1) // CACHE_SIZE,
+    )

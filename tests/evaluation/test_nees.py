@@ -5,6 +5,8 @@ import pytest
 
 from slamgym.evaluation.hypothesis_tests import autocorrelation
 from slamgym.evaluation.nees import (
+    heading_nees,
+    is_indefinite,
     landmark_nees,
     normalised_squared_error,
     pose_nees,
@@ -151,3 +153,17 @@ def test_an_unknown_frame_is_not_taken_for_the_additive_one(function):
         states, P = states[:, :3], P[:, :3, :3]
     with pytest.raises(ValueError, match="frame must be 'additive' or 'invariant'"):
         function(states, states, P, frame="right")
+
+
+def test_heading_nees_is_the_square_of_the_wrapped_error_by_its_variance():
+    truth, pose = np.array([0.0, 0.0, 3.1]), np.array([0.0, 0.0, -3.1])
+    found = heading_nees(truth, pose, np.diag([1.0, 1.0, 0.04]))
+    assert found == pytest.approx((2 * np.pi - 6.2) ** 2 / 0.04)
+
+
+def test_a_singular_covariance_is_not_indefinite_by_rounding():
+    rows = np.random.default_rng(8).standard_normal((40, 3))
+    for scale in (1e-6, 1.0, 1e6):
+        P = scale * rows @ rows.T
+        assert not is_indefinite(P)
+        assert is_indefinite(P - 1e-3 * scale * np.eye(40))

@@ -649,6 +649,15 @@ def test_utias_barcodes_become_subjects_and_bearings_are_wrapped(utias):
     )
 
 
+def test_utias_readings_at_the_first_odometry_are_kept(utias):
+    file = utias / "Robot3_Measurement.dat"
+    comment, before, *rows = file.read_text().splitlines()
+    rows = [comment, before, f"{EPOCH:.3f} 63 2.5 0.1", *rows]
+    file.write_text("\n".join(rows))
+    first, _ = scans(read_log(utias))
+    assert (first.t, first.measurements.tolist()) == (0.0, [[0.1, 2.5]])
+
+
 def test_utias_counts_what_it_leaves_out(utias):
     assert read_log(utias).header["left_out"] == (
         "1 readings of robots, 1 of unknown barcodes, "
