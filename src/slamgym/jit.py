@@ -22,7 +22,7 @@ from typing import Any, TypeVar, cast
 import numba
 import numpy as np
 from numba import config, njit, types
-from numba.core import caching, codegen, compiler, event, registry
+from numba.core import caching, codegen, compiler, event, registry, sigutils
 from numba.core.cpu import CPUTargetOptions
 from numba.core.runtime.nrt import rtsys
 from numba.extending import intrinsic
@@ -201,10 +201,9 @@ def compiler_for(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def kept(kernel: Any) -> Any:
-    """Keep a kernel in the cache, and compile it once for constants and variables."""
+    """Keep a kernel in the cache, and compile it once for types that `plain` unites."""
 
     def of_variables(args: Any, kws: Any) -> Any:
-        plain: Any = types.unliteral
         named = {name: plain(value) for name, value in kws.items()}
         return type(kernel).get_call_template(kernel, tuple(map(plain, args)), named)
 
@@ -212,6 +211,20 @@ def kept(kernel: Any) -> Any:
         kernel._cache = KernelCache(kernel)
         kernel.get_call_template = of_variables
     return kernel
+
+
+def plain(kind: Any) -> Any:
+    """Return the type for which a kernel is compiled.
+
+    Constants count as variables, and read-only arrays as others: no kernel writes into
+    an array that a caller passes as read-only.  Plain Python refuses that.
+    """
+    known: Any = types
+    if isinstance(kind, types.BaseAnonymousTuple):
+        return known.BaseTuple.from_types([*map(plain, cast("Any", kind))])
+    if isinstance(kind, types.Array) and not kind.mutable:
+        return kind.copy(readonly=False)
+    return known.unliteral(kind)
 
 
 @cache
@@ -489,6 +502,13 @@ class KernelCache:
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """Return the compiled code for the types of a call, or None."""
+        arguments, _ = sigutils.normalize_signature(signature)
+        usual = tuple(map(plain, arguments))
+        if usual != arguments:
+            self._kernel.compile(usual)
+            result = self._kernel.overloads[usual]
+            own = result.signature.replace(args=arguments)
+            return result._replace(signature=own, metadata=None)
         if self._files is None:
             return None
         try:

@@ -16,7 +16,7 @@ from types import FunctionType, ModuleType, SimpleNamespace
 import forked
 import numpy as np
 import pytest
-from numba import _dispatcher
+from numba import _dispatcher, float64, int64
 from numba.core.runtime import _nrt_python
 from numba.core.runtime.nrt import rtsys
 from own_noise import OWN_NOISE
@@ -86,6 +86,9 @@ def python(room, code=ASK, **environment):
     return output.split(), errors
 
 
+TWO = np.ones(2)  # numba takes it for read-only
+
+
 def answer(room, code=ASK):
     (value, hits), _ = python(room, code)
     return float(value), int(hits)
@@ -139,6 +142,52 @@ def test_a_kernel_that_is_called_with_constants_is_compiled_once():
 
     assert powers(2.0, 1) == 14
     assert len(power.nopython_signatures) == 1
+
+
+def test_read_only_arrays_need_no_code_of_their_own():
+    @njit_internal
+    def sum_of(values):
+        return values.sum()
+
+    @jit
+    def both(pair, more):
+        return sum_of(pair[0]) + sum_of(pair[1]) + sum_of(TWO) + more[0]
+
+    free, fixed = np.ones(2), np.ones(2)
+    fixed.flags.writeable = False
+    calls = [((free, free), free), ((fixed, free), free), ((fixed, fixed), fixed)]
+    assert [both(*arguments) for arguments in calls] == [7.0] * 3
+    assert sum(both.stats.cache_misses.values()) == 1
+    assert len(sum_of.nopython_signatures) == 1
+
+
+@pytest.mark.slow
+def test_no_kernel_writes_into_a_read_only_array():
+    """A compiled kernel would not notice, but plain Python refuses it."""
+    code = """
+        import gymnasium as gym, numpy as np
+        from slamgym import load_scenario, make_estimator
+        from slamgym.estimator import make_batch
+        from slamgym.estimator.filters.imagine import imagine
+        world = load_scenario("hidden_identities")
+        noise = {"motion_std": world.motion.std, "measurement_std": world.sensor.std}
+        env = gym.make("slamgym:slamgym/LandmarkWorld-v0", scenario=world).unwrapped
+        for name in ("submaps", "compressed", "sparse_information"):
+            slam = make_estimator(name, management=True, **noise)
+            seen, _ = env.reset(seed=1)
+            for _ in range(12):
+                slam.update(seen["landmarks"][np.flatnonzero(seen["mask"])])
+                seen, *_ = env.step(np.array([0.2, 0.1]))
+                slam.predict(seen["odometry"])
+        batch = make_batch("ekf", runs=2, landmarks=3, **noise)
+        imagine(batch, np.zeros((1, 2, 2)), world.sensor)
+        env = gym.make("slamgym:slamgym/ActiveSlam-v0").unwrapped
+        env.reset(seed=1)
+        for action in (env.action_space.sample() for _ in range(3)):
+            env.step(action)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    subprocess.run(command, env={**os.environ, "NUMBA_DISABLE_JIT": "1"}, check=True)
 
 
 PAIR = """
@@ -327,8 +376,8 @@ def code_for(*types):
 @pytest.mark.parametrize(
     ("found", "is_loaded", "flushes"),
     [
-        (code_for("float64"), True, 0),
-        (code_for("int64"), False, 0),
+        (code_for(float64), True, 0),
+        (code_for(int64), False, 0),
         (None, False, 0),
         (ValueError("damaged"), False, 1),
     ],
@@ -339,11 +388,11 @@ def test_only_whole_code_for_the_same_types_is_loaded(
     files = Files(found)
     monkeypatch.setattr(kernel_cache.KernelCache, "_files", files)
     cache = kernel_cache.KernelCache(unchanged)
-    loaded = cache.load_overload(("float64",), unchanged.targetctx)
+    loaded = cache.load_overload((float64,), unchanged.targetctx)
     assert loaded is (found if is_loaded else None)
     assert files.flushes == flushes
     monkeypatch.setattr(kernel_cache.KernelCache, "_files", None)
-    assert cache.load_overload(("float64",), unchanged.targetctx) is None
+    assert cache.load_overload((float64,), unchanged.targetctx) is None
 
 
 def test_the_states_used_last_are_kept_and_nothing_of_others_is_deleted(
