@@ -29,6 +29,7 @@ from ..kernels.assignment_search import (
     largest_change,
     only_partners,
 )
+from ..kernels.scan_update import copy_covariance
 from ..models.bearing_range import (
     reading_slopes_jit,
     reading_variances_jit,
@@ -164,7 +165,9 @@ def assign_jointly(
             if marks[s, i] != UNPAIRED:
                 slots[kept, i] = explained[marks[s, i]]
         if not _is_superfluous(problem, marks[:kept], marks[s], slots[kept]):
-            costs[kept], marks[kept] = costs[s], marks[s]
+            costs[kept] = costs[s]
+            for i in range(rows):
+                marks[kept, i] = marks[s, i]
             kept += 1
     return costs[:kept], slots[:kept], explained
 
@@ -355,14 +358,17 @@ def extended(
     """Return mean and covariance of a map with a new landmark for each reading."""
     noise, n, size = Noise(*of_sensor), len(mean), len(mean) + 2 * len(readings)
     places, C, turned = np.empty(size), np.empty((size, size)), np.empty(size)
-    places[:n], C[:n, :n] = mean, P
+    copy_covariance(P, C, n)
+    for j in range(n):
+        places[j] = mean[j]
     for i in range(len(readings)):
         direction, distance = mean[2] + readings[i, 0], readings[i, 1]
         cos, sin, a = np.cos(direction), np.sin(direction), n + 2 * i
         places[a], places[a + 1] = mean[0] + distance * cos, mean[1] + distance * sin
         turned[a], turned[a + 1] = -distance * sin, distance * cos
         for k in range(2):  # J P, then J (J P)ᵀ
-            C[a + k, :n] = C[:n, a + k] = P[k] + turned[a + k] * P[2]
+            for j in range(n):
+                C[a + k, j] = C[j, a + k] = P[k, j] + turned[a + k] * P[2, j]
         for b in range(n, a + 2):
             for k in range(2):
                 own = C[b, k] + C[b, 2] * turned[a + k]

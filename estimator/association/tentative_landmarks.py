@@ -34,7 +34,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
-from ...jit import jit, njit_inlined, njit_internal
+from ...jit import jit, njit_allocating, njit_inlined, njit_internal
 from ..guards import saved_states
 from ..interface import MapView
 from ..models.bearing_range import predict_measurement, wrap_angle
@@ -197,8 +197,7 @@ def _after_scan(
     n, rest = len(kept), (shifted[kept], labels[kept], odds[kept])
     if n == 0:
         return np.zeros(3), np.zeros((3, 3)), *rest
-    columns = np.arange(3 + 2 * n)
-    columns[3::2], columns[4::2] = 3 + 2 * kept, 4 + 2 * kept
+    columns = _columns_of(kept)
     mean, P = mean[columns], P[columns][:, columns].copy()
     if P[2, 2] <= STRAIGHT**2:
         return mean, P, *rest
@@ -209,15 +208,25 @@ def _after_scan(
     mean[:3] = 0.0
     for _ in range(2):  # T P, then T (T P)ᵀ
         for j in range(3, 3 + 2 * n, 2):
-            dx, dy = P[j] - P[0], P[j + 1] - P[1]
-            P[j] = cos * dx + sin * dy + mean[j + 1] * P[2]
-            P[j + 1] = cos * dy - sin * dx - mean[j] * P[2]
+            for i in range(len(P)):
+                dx, dy = P[j, i] - P[0, i], P[j + 1, i] - P[1, i]
+                P[j, i] = cos * dx + sin * dy + mean[j + 1] * P[2, i]
+                P[j + 1, i] = cos * dy - sin * dx - mean[j] * P[2, i]
         P[:3] = 0.0
         P = P.T.copy()
     P = (P + P.T) / 2
     for k in range(len(P)):
         P[k, k] = max(P[k, k], 0.0)
     return mean, P, *rest
+
+
+@njit_allocating
+def _columns_of(slots: IntArray) -> IntArray:
+    """Return the columns of the pose and of some landmarks, shape (3 + 2n,)."""
+    columns = np.arange(3 + 2 * len(slots))
+    for i in range(len(slots)):
+        columns[3 + 2 * i], columns[4 + 2 * i] = 3 + 2 * slots[i], 4 + 2 * slots[i]
+    return columns
 
 
 @jit
@@ -368,7 +377,12 @@ def fill_density(
 ) -> None:
     """Fill the mean density times the shares of the sector and ring of each reading."""
     mean = per_scan / (2 * np.pi * longest)
-    sectors, rings = cells.sum(axis=1) + 0.5, cells.sum(axis=0) + 0.5
+    sectors, rings = np.zeros(len(cells)), np.zeros(cells.shape[1])
+    for i in range(len(sectors)):  # numba compiles sums along an axis for a second
+        for j in range(len(rings)):
+            sectors[i] += cells[i, j]
+            rings[j] += cells[i, j]
+    sectors, rings = sectors + 0.5, rings + 0.5
     usual, usual_ring = sectors.sum() / SECTORS, rings.sum() / RINGS
     for k in range(len(readings)):
         sector, ring = _cell(readings[k, 0], readings[k, 1], longest)

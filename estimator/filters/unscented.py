@@ -54,8 +54,9 @@ def predict_through_points(
     points = size + 3  # and as many opposite ones
     root = symmetric_root(covariance, size, points)
     deviations = np.zeros((6, points))  # of the pose, and of its motion
-    deviations[:3, :size] = root[:3]
     for i in range(3):
+        for j in range(size):
+            deviations[i, j] = root[i, j]
         deviations[3 + i, size + i] = np.sqrt(points * motion_variance[i])
     poses = np.empty((3, 2 * points))
     for k in range(2 * points):
@@ -212,7 +213,8 @@ def record(L: Array, system: Array, columns: IntArray) -> None:
         system[i, scan.ROOT + 1] = L[i, i] * (i % 2)
         system[i, scan.JACOBIAN : scan.JACOBIAN + 5] = 0.0
         system[i, scan.LANDMARK_X + i % 2] = 1.0
-        system[: len(L), c] = L[i]
+        for j in range(len(L)):
+            system[j, c] = L[i, j]
 
 
 INSTEAD: dict[Callable[..., Any], Callable[..., Any]] = {

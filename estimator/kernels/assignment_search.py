@@ -37,6 +37,7 @@ from ..models.bearing_range import (
     reading_slopes_jit,
     wrap_angle_jit,
 )
+from .scan_update import copy_covariance
 
 
 @njit_allocating
@@ -436,9 +437,9 @@ def fill_expected(
         Places of the landmarks in the map.
     """
     H, columns = np.empty((2 * len(slots), 5)), np.empty((len(slots), 5), np.int64)
-    columns[:, :3] = np.arange(3)
     for j in range(len(slots)):
         c = 3 + 2 * slots[j]
+        columns[j, 0], columns[j, 1], columns[j, 2] = 0, 1, 2
         columns[j, 3], columns[j, 4] = c, c + 1
         dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
         bearing, expected[j, 1] = expected_reading_jit(dx, dy, mean[2])
@@ -553,7 +554,7 @@ def condition_on_all(
     nu, Q = problem.innovations, problem.variances
     here, landmarks = 0, problem.feasible.shape[1]
     shifts[0] = 0.0
-    joints[0] = problem.joint
+    copy_covariance(problem.joint, joints[0], 2 * landmarks)
     gains = np.empty((4, 2 * landmarks))
     for i in range(len(marks)):
         if marks[i] != UNPAIRED:
@@ -777,7 +778,8 @@ def search_clique(
         chosen[depth] = pair
         if depth + 1 > best:
             best = size = depth + 1
-            clique[:size] = chosen[:size]
+            for i in range(size):
+                clique[i] = chosen[i]
         if depth + 1 < depths:
             found = 0
             for later in range(k + 1, counts[depth]):

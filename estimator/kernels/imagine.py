@@ -16,7 +16,14 @@ from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_internal
 from ..models.bearing_range import expected_reading_jit
 from ..models.rigid_motion import predict
-from .scan_update import DONE, LEDGER_HEIGHT, SLOT, as_rules, update_belief
+from .scan_update import (
+    DONE,
+    LEDGER_HEIGHT,
+    SLOT,
+    as_rules,
+    copy_covariance,
+    update_belief,
+)
 from .sizes_of_covariances import half_log_det, largest_variance
 
 
@@ -106,13 +113,14 @@ def imagine_plans(
     points, weights = density
     missed, in_view = np.empty(len(weights[0])), np.empty(len(weights[0]), np.bool_)
     for b in range(len(means)):
-        size = 3 + 2 * np.sum(slots[b] >= 0)
+        mapped = 0
+        for slot in slots[b]:
+            mapped += slot >= 0
+        size = 3 + 2 * mapped
         for k in range(plans.shape[1]):
-            room.mean[:size], room.reference[:size] = (
-                means[b, :size],
-                references[b, :size],
-            )
-            room.covariance[:size, :size] = covariances[b, :size, :size]
+            copy_covariance(covariances[b], room.covariance, size)
+            for j in range(size):
+                room.mean[j], room.reference[j] = means[b, j], references[b, j]
             missed[:], found, judged = 1.0, 0.0, 0
             for t in range(plans.shape[2]):
                 d, turn = plans[b, k, t, 0], plans[b, k, t, 1]

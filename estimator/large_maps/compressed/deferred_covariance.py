@@ -369,7 +369,8 @@ def read_rows(
         for j in range(start):
             rows[j, first + i] = block[i, columns[j]]
     for j in range(start, len(columns)):
-        rows[j, : first + len(block)] = block[columns[j] - first]
+        for i in range(first + len(block)):
+            rows[j, i] = block[columns[j] - first, i]
 
 
 @jit
