@@ -502,7 +502,7 @@ class KernelCache:
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """Return the compiled code for the types of a call, or None."""
-        arguments, _ = sigutils.normalize_signature(signature)
+        arguments, _ = cast("Any", sigutils).normalize_signature(signature)
         usual = tuple(map(plain, arguments))
         if usual != arguments:
             self._kernel.compile(usual)
