@@ -11,13 +11,14 @@ from scipy.optimize import least_squares
 from scipy.sparse import csc_array
 from town_drives import run
 
-from slamgym.estimator import EkfSlam, InvariantEkfSlam, check_estimator
+from slamgym.estimator import Belief, EkfSlam, InvariantEkfSlam, check_estimator
 from slamgym.estimator.large_maps.elimination import (
     SubmapElimination,
     common_ancestor,
     dissect,
 )
 from slamgym.estimator.large_maps.submaps import joining as gauss_newton
+from slamgym.estimator.large_maps.submaps.closed_submaps import Neighbourhood, Region
 from slamgym.estimator.large_maps.submaps.factor import (
     Gaussian,
     factor_error,
@@ -834,3 +835,20 @@ def test_a_folder_keeps_the_submaps_of_last_use_in_memory(tmp_path):
         most - 1,
         size * (CACHE_SIZE - 1) // CACHE_SIZE,
     )
+
+
+def test_a_neighbourhood_is_renewed_for_the_farthest_of_recent_distances():
+    asked, pose = [], Belief(np.zeros(3), 0.01 * np.eye(3), (), "invariant")
+
+    def joined_region(reach):
+        asked.append(reach)
+        return pose, Region(np.full(2, 99.0), reach, 0.0)  # the robot has left it
+
+    near = Neighbourhood(
+        lambda: InvariantEkfSlam(MOTION_STD, MEASUREMENT_STD), joined_region
+    )
+    for within in (5.0, 1.0):
+        near.view(within)
+    near.forget()
+    near.view(1.0)
+    assert asked == [5.0, 5.0, 1.0]
