@@ -309,23 +309,28 @@ def cost_if_settled(
 ) -> float:
     """Return the cost of pairing all readings, if the search returns this alone.
 
-    The search finds it first, to the bit, if every pair costs less than its reading
-    left out, given the pairs before it.  To leave out readings U costs in addition ::
+    The search finds this assignment first, with the same cost to the bit, if every pair
+    costs less than its reading left out, given the pairs before it.  To leave out
+    readings U costs in addition ::
 
         Σ λ − ln det S_U − ρᵀ (Q − C⁺)⁻¹ ρ
 
     where S_U is given all other pairs, and ρ and C⁺ are the innovations and C of U
-    after all pairs.  S_U is not larger than each S before any pair, and C⁺ ⪯ τ Q with
-    τ = Σ tr Q⁻¹ C⁺.  The last term is at most νᵀ S⁻¹ ν of all pairs.  So u readings
-    cost at least u times the least of these, or of the first two less νᵀ S⁻¹ ν::
+    after all pairs.  det S_U is at most the product of det S before any pair, and
+    C⁺ ⪯ τ Q with τ = Σ tr Q⁻¹ C⁺.  The last term is at most νᵀ S⁻¹ ν of all pairs.  So
+    u readings cost at least the larger one of ::
 
-        λ − ln det S − ρᵀ Q⁻¹ ρ / (1 − τ)
+        u min (λ − ln det S) − νᵀ S⁻¹ ν
+        u min (λ − ln det S − ρᵀ Q⁻¹ ρ / (1 − τ))
+
+    Where C is larger than 10⁶ Q, rounding in ρ and C⁺ could hide another assignment.
 
     Parameters
     ----------
     of_scan, most, spread, ceiling
         As in :func:`best_assignments`, without ``pairs_first``.  Of innovations and
-        variances, those of partners and of the first landmark are read.
+        variances, those of partners are read, and the innovations of the first
+        landmark.  ``limits`` are not read, and must be infinite.
     partners : ndarray of int64, shape (m,)
         The landmark of each reading, from :func:`only_partners`.
 
@@ -352,6 +357,8 @@ def cost_if_settled(
     saved = np.empty(rows)  # λ − ln det S
     for a in range(rows):
         c, d = 2 * a, 2 * a + 1
+        if not (C[0, c, c] < WIDE * Q[a, a, 0] and C[0, d, d] < WIDE * Q[a, a, 1]):
+            return np.inf
         s00, s11 = C[0, c, c] + Q[a, a, 0], C[0, d, d] + Q[a, a, 1]
         saved[a] = missing[a] - np.log(s00 * s11 - C[0, d, c] * C[0, d, c])
     for a in range(rows - 1, -1, -1):
@@ -395,8 +402,10 @@ UNPAIRED = -1
 #: A landmark is sure to be where the map has it up to this det S / det Q.
 SURE = 9.0
 
-#: A difference of costs counts if it exceeds what rounding can cause.
+#: A difference of costs counts if it exceeds what rounding can cause, for variances of
+#: expected readings up to `WIDE` times those of the noise.
 ROUNDING = 1e-6
+WIDE = 1e6
 
 #: Cost that a pair saves where the number of pairs counts before all else.
 PAIR_BONUS = 1e6

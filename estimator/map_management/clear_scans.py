@@ -3,7 +3,8 @@
 A scan is clear if every other association that a hypothesis would follow leaves nearly
 the same belief and the same tentative landmarks as the best one, and if the best one
 confirms no landmark.  `associate_clear` associates it, and `count_clear` counts what it
-has shown and missed, as `associate` and the pruner do for any scan.  These process all
+has shown and missed, as `associate` and the pruner do for any scan.  If nothing is left
+to decide, `associate_clear` updates the filter and counts, too.  These process all
 other scans: those that split a hypothesis or confirm a landmark, and those of a robot
 that may be lost.
 
@@ -75,9 +76,14 @@ from .recent_scans import RecentScans
 #: Difference of −2 ln of probabilities: hypotheses e²⁰ = 5e8 times less probable than
 #: the best one are discarded.
 SPREAD = 40.0
+_NO_SLOTS: IntArray = np.empty((1, 0), np.int64)  # where nothing is left to decide
 
 
-NO_SLOTS: IntArray = np.empty((1, 0), np.int64)
+class Rooms(dict[int, Array]):
+    """Room for trials of clear scans by its size; copies and pickles are empty."""
+
+    def __reduce__(self) -> tuple[type[Rooms], tuple[()]]:
+        return Rooms, ()
 
 
 class ClearScan(NamedTuple):
@@ -90,7 +96,8 @@ class ClearScan(NamedTuple):
     #: The landmark of each reading, and the label of its tentative landmark.
     row_ids: tuple[int | None, ...]
     labels: tuple[int, ...]
-    #: The landmark of each reading that the filter uses, shape (m,).
+    #: The landmark of each reading that the filter uses, shape (m,); without a meaning
+    #: where it uses none.
     names: IntArray
     #: The tentative landmarks after the scan.
     following: TentativeLandmarks
@@ -99,9 +106,9 @@ class ClearScan(NamedTuple):
     #: −2 ln of the likelihood of the associations to consider, the best first.
     costs: Sequence[float] = (0.0,)
     #: Slot of the map of each reading, `NEW` or `AMBIGUOUS`, shape (M, m).
-    slots: IntArray = NO_SLOTS
+    slots: IntArray = _NO_SLOTS
     #: Place of the tentative landmark of each reading, or below 0, shape (m,).
-    tentative_slots: IntArray = NO_SLOTS[0]
+    tentative_slots: IntArray = _NO_SLOTS[0]
     #: Rows of tentative landmarks, and those that are ambiguous.
     tentative_rows: tuple[int, ...] = ()
     ambiguous_rows: tuple[int, ...] = ()
@@ -120,8 +127,8 @@ class ClearScans:
     sensor : AssociationSensor
     recent : RecentScans
         Of the hypothesis: it notes the scans.
-    rooms : dict of int to ndarray
-        Room for trials by its size, which all hypotheses share.
+    rooms : Rooms
+        Those of all hypotheses.
     """
 
     def __init__(
@@ -130,7 +137,7 @@ class ClearScans:
         policy: LandmarkPolicy,
         sensor: AssociationSensor,
         recent: RecentScans,
-        rooms: dict[int, Array],
+        rooms: Rooms,
     ) -> None:
         self._slam, self._recent, self._rooms = slam, recent, rooms
         self._filter = filter_inside(slam)
@@ -291,11 +298,11 @@ class ClearScans:
             self._rooms[block.size] = aligned_copy(block)
         trial, ids = self._rooms[block.size], gaussian.parts.ids
         for cost, slots in zip(scan.costs, scan.slots, strict=True):
+            if cost > ceiling:
+                continue
             rows = slots >= 0
             copy_memory(block, trial)
-            if cost <= ceiling and (
-                update_map(trial, scan.readings[rows], ids[slots[rows]]) == DONE
-            ):
+            if update_map(trial, scan.readings[rows], ids[slots[rows]]) == DONE:
                 after = marginals_of(parts_of(trial), names)
                 copies = after.mean.copy(), after.variances.copy()
                 found.append((cost, Marginals(*copies, names)))

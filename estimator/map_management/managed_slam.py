@@ -50,7 +50,15 @@ from ..interface import (
 from ..models.bearing_range import wrap_angle
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.rigid_motion import rotation
-from .clear_scans import SPREAD, ClearScan, ClearScans, Marginals, is_near, marginals_of
+from .clear_scans import (
+    SPREAD,
+    ClearScan,
+    ClearScans,
+    Marginals,
+    Rooms,
+    is_near,
+    marginals_of,
+)
 from .loop_closing import AROUND, FEWEST_READINGS, is_astray, places_of_scan
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy
@@ -147,7 +155,7 @@ class ManagedSlam(FilterWrapper):
         motion = options.get("motion", UNICYCLE)
         at_rest = options.get("noise_at_rest", True)
         noise_of_motion = MotionNoise.checked(motion_std, at_rest, motion)
-        self._settings = SharedSettings(policy, sensor, noise_of_motion, {})
+        self._settings = SharedSettings(policy, sensor, noise_of_motion, Rooms())
         self._hypotheses = [Hypothesis(first, self._settings)]
         #: All hypotheses made so far, and those of them that are not in use.
         self._made = self._hypotheses
@@ -368,7 +376,8 @@ class ManagedSlam(FilterWrapper):
         taken: list[tuple[float, Hypothesis]] = []
         for cost, h, scan in self._clear_branches(readings, ids):
             if h.update_clear(scan):
-                self.steps += not taken  # so that a later error leaves the mark
+                # So that a later error leaves the mark.
+                self.steps += not taken and scan.counted is None
                 taken.append((cost, h))
         if not taken:
             return None
@@ -380,13 +389,17 @@ class ManagedSlam(FilterWrapper):
     def _clear_branches(
         self, readings: Array, ids: IntArray | None
     ) -> Sequence[ClearBranch]:
-        """Return the best association in each hypothesis; none if it is not clear."""
+        """Return the best association in each hypothesis; none if it is not clear.
+
+        A single hypothesis may have taken in the scan then: see `ClearScan.counted`.
+        """
         every, ceiling, others = self._hypotheses, np.inf, 0
         ranked: list[ClearBranch] = []
         for h in every:
             how = ceiling - h.cost, len(every) == 1
             if (scan := h.associate_clear(readings, ids, *how)) is None:
                 return ()
+            self.steps += scan.counted is not None
             ranked.append((h.cost + scan.costs[0], h, scan))
             ceiling = min(ceiling, ranked[-1][0] + SPREAD)
             others += len(scan.costs) - 1
@@ -546,8 +559,8 @@ class SharedSettings(NamedTuple):
     policy: LandmarkPolicy
     sensor: AssociationSensor
     motion_noise: MotionNoise
-    #: Room for trials of clear scans, by its size.
-    rooms: dict[int, Array]
+    #: For trials of clear scans.
+    rooms: Rooms
 
 
 class Branch(NamedTuple):

@@ -1,5 +1,7 @@
 """Scans that compiled calls take in, beside the same scans taken in by the search."""
 
+import copy
+import pickle
 from dataclasses import fields
 
 import numpy as np
@@ -241,3 +243,37 @@ def test_a_view_does_not_outlive_a_clear_scan_that_moves_the_map(count):
     view = one.editor.map_view()
     np.testing.assert_array_equal(view.covariance, one.map_view().covariance)
     assert (view.covariance.diagonal()[:123] < before.covariance.diagonal()[:123]).any()
+
+
+def standing(**management):
+    """Return a filter that has mapped four landmarks, and their readings."""
+    readings = np.array([(0.1, 4.0), (1.5, 5.0), (-1.2, 6.0), (3.0, 3.0)])
+    slam = make(**management)
+    slam.update(readings, range(4))
+    return slam, readings
+
+
+def test_an_error_after_a_scan_has_been_taken_in_at_once_leaves_a_mark(monkeypatch):
+    slam, readings = standing()
+    slam.update(readings)
+
+    def failing(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(ClearScans, "update", failing)
+    inside = slam.filter
+    before = inside.belief().covariance
+    with pytest.raises(MemoryError):
+        slam.update(readings)
+    monkeypatch.undo()
+    assert (inside.belief().covariance != before).any()
+    with pytest.raises(RuntimeError, match="interrupted in update"):
+        slam.predict((0.1, 0.0))
+
+
+def test_room_for_trials_is_neither_copied_nor_pickled():
+    slam, _ = standing()
+    before = len(pickle.dumps(slam))
+    slam._settings.rooms[10**6] = np.zeros(10**6)
+    assert len(pickle.dumps(slam)) == before
+    assert not copy.deepcopy(slam)._settings.rooms

@@ -228,6 +228,27 @@ def test_a_scan_with_one_landmark_for_each_reading_is_assigned_as_by_the_search(
     assert others > 30
 
 
+@pytest.mark.parametrize("std", [(0.02, 0.0), (0.0, 0.05), (0.02, 1e-6)])
+def test_an_exact_reading_of_an_uncertain_landmark_is_settled_by_the_search(std):
+    """Its innovation and covariance after the pair are rounding errors."""
+    rng, policy = np.random.default_rng(2), LandmarkPolicy(association="hypotheses")
+    most, limits, several = policy.branches, np.full(2, np.inf), 0
+    for _ in range(40):
+        mean = np.append(np.zeros(3), rng.uniform(2, 8, 2) * rng.choice([-1, 1], 2))
+        root = rng.normal(size=(5, 5)) * np.array([[0.3, 0.3, 0.1, 0.3, 0.3]]).T
+        view = MapView(mean, root @ root.T, (0,))
+        expected = predict_measurement(mean[:3], view.landmarks).measurement
+        readings = expected + rng.normal(size=(1, 2)) * (0.1, 0.5)
+        for density in 10 ** np.arange(-4.0, 1.0, 0.25):
+            scan = policy, view, readings, Noise(*std), np.array([density])
+            found = assign_scan(*scan)
+            costs, slots, _ = assign_plainly(*scan, limits=limits, most=most)
+            np.testing.assert_array_equal(found.costs, costs)
+            np.testing.assert_array_equal(found.slots, slots)
+            several += len(slots) > 1
+    assert several > 20
+
+
 def test_readings_that_contradict_each_other_are_not_settled():
     """Each fits its landmark if the heading is wrong, by .25 rad to one side."""
     policy, noise = LandmarkPolicy(association="joint"), Noise(0.03, 0.1)
