@@ -372,7 +372,9 @@ class SeparateFilters(Restorable):
         self._steps = [0] * len(filters)
         self._beliefs: list[BeliefOfMap | None] = [None] * len(filters)
         self._stored: list[Any] = [None] * len(filters)  # `BatchStorage`, B = 1
-        self._slots: list[Any] = [None] * len(filters)  # that it shows, if it is live
+        self._slots: list[Any] = [None] * len(
+            filters
+        )  # the slots that are shown of each live filter
 
     def state(self) -> State:
         """Return the states of the filters, for `restore`."""
@@ -430,7 +432,7 @@ class SeparateFilters(Restorable):
             self._stored[run] = belief_storage(belief, self._rows, by_id=self._by_id)
 
     def _show(self, run: int, slam: EkfSlam) -> None:
-        """Show the arrays of a filter; a map with other slots has another dict."""
+        """Show the arrays of a filter; a map whose slots changed has a new dict."""
         if self._slots[run] is slam.map.slots:
             _ = slam.map.covariance  # completes it
             return

@@ -332,7 +332,7 @@ def in_frame(
 def of_cleared(
     true_states: Array, means: Array, covariances: Array, frame: ErrorFrame
 ) -> tuple[Array, Array]:
-    """Return the same for covariances from `without_rounding`."""
+    """Return what `in_frame` returns, of covariances from `without_rounding`."""
     if one_of("frame", frame, ERROR_FRAMES) == "invariant":
         origins = means[..., :2]
         truth, means = seen_from(origins, true_states), seen_from(origins, means)

@@ -195,7 +195,7 @@ def distances(estimate: Array, truth: Array) -> tuple[Array, Array]:
 
 
 def lengths(vectors: Array) -> Array:
-    """Return the lengths (...) of vectors (..., 2), as `numpy.linalg.norm` does."""
+    """Return the lengths (...) of the first two components of vectors (..., n)."""
     x, y = vectors[..., 0], vectors[..., 1]
     return np.asarray(np.sqrt(x * x + y * y))
 

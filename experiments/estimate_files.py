@@ -348,7 +348,7 @@ def _plain_poses(path: Path) -> tuple[Array | None, list[LogLine]]:
     of_poses = [row[len(_POSE) :] for row in rows if row.startswith(_POSE)]
     table = plain_rows(of_poses, ",") if of_poses else None
     if table is not None and table.shape[1] in (10, 13):
-        # Blank lines are no lines, but count.
+        # Blank lines hold nothing, but count in line numbers.
         rest = "\n".join(["" if row.startswith(_POSE) else row for row in rows])
         lines = _without_comments(to_lines(rest, str(path))) if rest.strip() else []
         if not any(line.text.startswith(_POSE[:-1]) for line in lines):

@@ -588,7 +588,7 @@ def _invalid(
     deviations = np.sqrt(np.where(variances > 0, variances, np.inf))
     correlations = np.nan_to_num(additive / deviations[..., None])
     correlations = correlations / deviations[:, :, None]
-    # One that whitens errors is definite, and needs no eigenvalues.
+    # A matrix that whitens errors is positive definite: no eigenvalues are needed.
     unsure = ~np.isfinite(whitened(np.zeros(variances.shape), additive)).all(axis=2)
     indefinite = np.zeros_like(unsure)
     indefinite[unsure] = np.linalg.eigvalsh(correlations[unsure])[..., 0] < _INDEFINITE

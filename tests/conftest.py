@@ -42,8 +42,8 @@ def pytest_runtestloop():
     gc.enable()
 
 
-# Where little is compiled.  Each worker begins with its share of the list: the first
-# go on there while the last one compiles the filters, else all of them would.
+# Where little is compiled.  Each worker begins with its share of the list.  The last
+# one compiles the filters while the others run these tests; otherwise all do.
 _FIRST = ("tests/envs/", "tests/sim_configs/", "src/", "tests/experiments/")
 
 
@@ -76,7 +76,10 @@ _PASSED = "slamgym/passed"
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers():
     """Take one worker more than cores: tests wait for the processes that they start."""
-    return (os.cpu_count() or 1) + 1
+    if "PYTEST_XDIST_AUTO_NUM_WORKERS" in os.environ:
+        return None  # pytest-xdist reads it
+    is_limited = hasattr(os, "sched_getaffinity")
+    return 1 + (len(os.sched_getaffinity(0)) if is_limited else os.cpu_count() or 1)
 
 
 def pytest_configure(config):

@@ -191,6 +191,8 @@ def plain_rows(texts: Sequence[str], separator: str | None = None) -> Array | No
     (array([[1.e+00, 2.e+00],
            [3.e+00, 4.e+05]]), None)
     """
+    if not texts or not all(map(str.strip, texts)):
+        return None  # numpy leaves out blank rows
     try:
         rows = np.loadtxt(texts, delimiter=separator, comments=None, ndmin=2)
     except ValueError:
@@ -233,7 +235,7 @@ class ReadFile(PathLike[str]):
 
 
 def read_lines(path: str | PathLike[str]) -> list[LogLine]:
-    """Read the lines of a text file that are not blank, see :func:`read_text`.
+    """Read the lines of a text file that are not blank; see :func:`read_text`.
 
     Raises
     ------

@@ -192,14 +192,16 @@ def profile_crossing(
         slope = float(g[at] - information[at, o] @ inverse @ g[o] * moves)
         step = _newton_step(level - found.value - rise, slope, up=up)
         change = inverse @ (g[o] - information[o, at] * step)
-        tried = np.tile(theta, (len(OF_OTHERS), 1))
-        tried[:, o] += np.outer(OF_OTHERS, np.clip(change, -FARTHEST, FARTHEST))
+        change /= max(1.0, abs(change).max(initial=0.0) / FARTHEST)  # still uphill
+        shares = OF_OTHERS if len(o) else OF_OTHERS[:1]
+        tried = np.tile(theta, (len(shares), 1))
+        tried[:, o] += np.outer(shares, change)
         tried[:, at] += step
         if not np.log(LEAST) < tried[0, at] < np.log(GREATEST):
             return np.inf if up else 0.0
         by_step = along(np.exp(tried))
         best = int(np.argmax(totals(by_step)))
-        theta, known, moves = tried[best], by_step[best], OF_OTHERS[best] > 0
+        theta, known, moves = tried[best], by_step[best], shares[best] > 0
         if abs(step) < CLOSE and rise < CLOSE:
             break
     end = float(np.exp(theta[at]))

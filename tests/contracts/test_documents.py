@@ -318,5 +318,5 @@ def test_references_in_docstrings_lead_to_names_that_exist():
     named = re.compile(r":(?:func|class|meth|data|attr):`~?\.?(?:\w+\.)*?(\w+)\.(\w+)`")
     for place, name in named.findall("".join(places.values())):
         if place not in ("slamgym", "linalg", *PACKAGES):  # another library
-            found = rf"(def|class) {name}\b|\b{name}\b *[:=]"
+            found = rf"(?m)^\s*(?:def|class) {name}\b|^\s*{name}\b(?:: | = )"
             assert re.search(found, places.get(place, "")), f"{place}.{name}"

@@ -355,7 +355,7 @@ def unchanged(x):
 
 
 class Files:
-    """Files of a kernel that hold this, or are damaged."""
+    """Cache files of a kernel: they hold this code, or are damaged."""
 
     def __init__(self, found):
         self.found, self.flushes = found, 0

@@ -210,7 +210,7 @@ def test_no_interval_of_a_ratio_holds_negative_numbers(averages):
 
 @pytest.mark.parametrize("freedom", [1, 3])
 def test_the_interval_of_few_skewed_averages_covers_their_mean(freedom):
-    """In 90 %; that of Student lies below the mean in 12 % of cases, not in 5 %."""
+    """It does in 90 %. Student's interval lies below the mean in 12 %, not in 5 %."""
     rows = np.random.default_rng(10).chisquare(freedom, (3000, 20))
     low, high = np.array([equivalence_test(row, freedom).interval for row in rows]).T
     assert 0.88 < np.mean((low < 1) & (high > 1)) < 0.92

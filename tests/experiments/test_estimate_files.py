@@ -78,6 +78,13 @@ def test_lines_of_a_csv_are_read_alike_at_once_and_one_by_one(tmp_path):
     wrong.write_text("\n".join([*lines[:3], f"{lines[3]}x"]))
     with pytest.raises(LogError, match="line 4: expected a finite number"):
         read_estimates([wrong])
+    for place in (0, 2, 4):
+        wrong.write_text("\r\n".join([*lines[:place], "pose,", *lines[place:]]))
+        with pytest.raises(LogError, match=f"line {place + 1}: expected pose,t,x"):
+            read_estimates([wrong])
+    wrong.write_text("pose,\n")
+    with pytest.raises(LogError, match="line 1: expected pose,t,x"):
+        read_estimates([wrong])
 
 
 @pytest.mark.parametrize("count", [6, 9, 21, 36])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from commands import slamgym
 from recordings import recorded
-from scipy.optimize import brentq, minimize_scalar
+from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
@@ -375,6 +375,29 @@ def test_the_profile_is_that_of_fitting_the_other_parameter_anew(start):
     expected = brentq(profile, *((1e-3, top) if start < top else (top, 5.0)))
     found = profile_crossing(two_spreads, best.parameters, 1, start, level)
     assert found == pytest.approx(expected, rel=0.01)
+
+
+def test_the_end_is_found_where_other_parameters_must_move_far_together():
+    rng = np.random.default_rng(83)
+    size = int(rng.integers(1, 4))
+    shares = (rng.random((6, size)) < 0.6) + 0.05 * rng.random((6, size))
+    true = np.exp(rng.normal(0, 1, size))
+    numbers = rng.standard_normal((6, 8)) * np.sqrt(shares @ true**2)[:, None]
+
+    def mixed(parameters):
+        variances = (np.atleast_2d(parameters) ** 2 @ shares.T)[..., None]
+        terms = -0.5 * np.log(variances) - 0.5 * numbers**2 / variances
+        return terms.reshape(len(variances), -1)
+
+    best = maximise(mixed, true[None])
+    level, start = best.log_likelihood - 1.92, 1.3 * best.parameters[2]
+    end = profile_crossing(mixed, best.parameters, 2, start, level)
+
+    def cost(others):
+        return -mixed(np.array([[*np.exp(others), end]])).sum()
+
+    found = minimize(cost, np.log(best.parameters[:2]), method="Nelder-Mead")
+    assert -found.fun == pytest.approx(level, abs=0.02)
 
 
 def test_the_end_beside_a_jump_of_the_likelihood_is_found_in_few_steps():
