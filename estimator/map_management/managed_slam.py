@@ -225,8 +225,10 @@ class ManagedSlam(FilterWrapper):
         reading = argument_checks.pair("odometry", odometry)
         if type(dt) is not float or dt != 1.0:
             argument_checks.duration(dt)
+        # Refused here if it is not finite, before a filter that checks less has moved.
+        displacement = self._settings.motion_noise.motion.moved(reading)
         with changing(self, "predict"):
-            self._step(lambda h: h.predict(reading, dt))
+            self._step(lambda h: h.predict(reading, dt, displacement))
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -702,12 +704,16 @@ class Hypothesis:
         self.candidates, self.report = Candidates(), UpdateReport()
         self.recent.forget()
 
-    def predict(self, reading: tuple[float, float], dt: float) -> None:
-        """Move by odometry (d, α)."""
+    def predict(
+        self,
+        reading: tuple[float, float],
+        dt: float,
+        displacement: tuple[float, float, float],
+    ) -> None:
+        """Move by odometry (d, α), which is a displacement in the robot's frame."""
         self.filter.predict(reading, dt)
         self.editor.expire()
         if len(self._candidates.tentative.seen):
-            displacement = self.motion_noise.motion.moved(reading)
             variance = self.motion_noise.over(displacement, dt)
             self.tentative = self.tentative.moved(displacement, variance)
         self.recent.note_motions((*reading, dt))
