@@ -67,6 +67,7 @@ _OUTSIDE += ("VectorWrapper", "Wrapper", "tuple")
 autodoc_default_options = {
     "members": True,
     "inherited-members": ",".join(_OUTSIDE),  # but not those of these
+    "exclude-members": "move_kernel, update_kernel",  # for those who write a filter
 }
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = False
