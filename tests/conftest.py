@@ -73,15 +73,6 @@ class Passed:
 _PASSED = "slamgym/passed"
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers():
-    """Take one worker more than cores: tests wait for the processes that they start."""
-    if "PYTEST_XDIST_AUTO_NUM_WORKERS" in os.environ:
-        return None  # pytest-xdist reads it
-    is_limited = hasattr(os, "sched_getaffinity")
-    return 1 + (len(os.sched_getaffinity(0)) if is_limited else os.cpu_count() or 1)
-
-
 def pytest_configure(config):
     """Note in the main process what passes, unless only the remaining tests run."""
     is_worker, has_cache = hasattr(config, "workerinput"), hasattr(config, "cache")
