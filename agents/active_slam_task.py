@@ -1,8 +1,7 @@
 """The rules of active SLAM, for one world or for many: weights, end and scores.
 
 `ActiveSlamTask` advances the episodes, with the reward that `active_slam_kernels`
-computes; `AssociationRecord` scores the association of
-filters without identities.
+computes; `AssociationRecord` scores the association of filters without identities.
 """
 
 from collections.abc import Mapping, Sequence

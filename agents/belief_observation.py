@@ -372,9 +372,8 @@ class SeparateFilters(Restorable):
         self._steps = [0] * len(filters)
         self._beliefs: list[BeliefOfMap | None] = [None] * len(filters)
         self._stored: list[Any] = [None] * len(filters)  # `BatchStorage`, B = 1
-        self._slots: list[Any] = [None] * len(
-            filters
-        )  # the slots that are shown of each live filter
+        # The slots that are shown of each live filter.
+        self._slots: list[Any] = [None] * len(filters)
 
     def state(self) -> State:
         """Return the states of the filters, for `restore`."""

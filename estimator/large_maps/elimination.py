@@ -516,7 +516,7 @@ def _join(
     row: IntArray,
     found: IntArray,
 ) -> tuple[int, int]:
-    """Write the union of unknowns, those first that are touched inside alone.
+    """Write the union of unknowns, those first that no submap outside touches.
 
     Parameters
     ----------

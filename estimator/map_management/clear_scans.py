@@ -4,9 +4,9 @@ A scan is clear if every other association that a hypothesis would follow leaves
 the same belief and the same tentative landmarks as the best one, and if the best one
 confirms no landmark.  `associate_clear` associates it, and `count_clear` counts what it
 has shown and missed, as `associate` and the pruner do for any scan.  If nothing is left
-to decide, `associate_clear` updates the filter and counts, too.  These process all
-other scans: those that split a hypothesis or confirm a landmark, and those of a robot
-that may be lost.
+to decide, `associate_clear` updates the filter and counts, too.  `associate` and the
+pruner process all other scans: those that split a hypothesis or confirm a landmark, and
+those of a robot that may be lost.
 
 `ClearScans` keeps what the kernels count in a block of memory.  The records that all
 other steps use, `Candidates` and `LandmarkRecords`, are renewed from it when needed.
@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from ...argument_checks import aligned_copy
+from ...argument_checks import aligned_zeros
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_allocating, njit_inlined, njit_internal
 from ..association.missed_landmarks import (
@@ -295,7 +295,7 @@ class ClearScans:
         block, names = gaussian.block, [*gaussian.slots]
         if block.size not in self._rooms:
             self._rooms.clear()
-            self._rooms[block.size] = aligned_copy(block)
+            self._rooms[block.size] = aligned_zeros(block.size)
         trial, ids = self._rooms[block.size], gaussian.parts.ids
         for cost, slots in zip(scan.costs, scan.slots, strict=True):
             if cost > ceiling:

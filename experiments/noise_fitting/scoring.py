@@ -176,7 +176,7 @@ def scores(
     here: Array | None = None,
     beside_jumps: bool = False,
 ) -> Scores:
-    """Return ℓ, its gradient and I at one θ, of 2p + 1 passes.
+    """Return ℓ, its gradient and I at one θ, of 2p + 1 passes, or 2p with ``here``.
 
     Parameters
     ----------
@@ -185,8 +185,8 @@ def scores(
     here : ndarray, shape (S,), optional
         The log likelihoods there, if they are known.
     beside_jumps : bool
-        A filter that linearises a reading once more from some θ on makes ℓ_s jump.
-        Whether the slope is then that of the side without the jump.
+        Whether the slope beside a jump is that of the side without it.  ℓ_s jumps where
+        a filter begins to linearise a reading once more.
     """
     offsets, p = NARROW * np.eye(len(theta)), len(theta)
     points = [] if here is not None else [theta[None]]

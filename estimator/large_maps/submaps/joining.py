@@ -163,7 +163,7 @@ class JoinedMap:
     def _large_covariance(
         self, size: int, rows: IntArray, columns: IntArray, owned: Sequence[Owned]
     ) -> tuple[Array, IntArray]:
-        """Return that of a large part and its order, from that of all unknowns."""
+        """Return the covariance of all unknowns, and the order of a large part."""
         P, places = self._factors.inverse(size - len(rows))
         done, order = len(places), np.empty(size, dtype=np.int64)
         order[rows] = places[columns]
