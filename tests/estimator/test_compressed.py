@@ -314,6 +314,37 @@ def test_a_local_map_grows_by_half_before_it_changes():
     assert sizes == [1, 2, 3, 4, 5, 6, 7, 5, 6, 7, 5, 6]
 
 
+def test_a_local_map_holds_what_is_required_and_the_nearest_others():
+    rng = np.random.default_rng(1)
+    points, ids = rng.uniform(-9, 9, (30, 2)), rng.permutation(100)[:30].tolist()
+    slots = dict(zip(ids, rng.permutation(30).tolist(), strict=True))
+    for required, size in (((), 7), (ids[3:8], 9), (ids[:6], 6), (ids[:6], 2)):
+        centre = rng.uniform(-9, 9, 2)
+        others = sorted(
+            (i for i in ids if i not in required),
+            key=lambda i: np.hypot(*(points[slots[i]] - centre)),
+        )
+        expected = [*required, *others[: max(size - len(required), 0)]]
+        found = active_set.choose_local(centre, required, slots, points, size)
+        assert list(found) == expected
+    everything = active_set.choose_local(centre, ids[:2], slots, points, 99)
+    assert {*everything} == {*ids}
+
+
+@pytest.mark.parametrize(
+    ("before", "read", "mapped", "lasted", "extra"),
+    [
+        *((9, 10, 1000, 3, 4), (9, 10, 1000, 4, 25), (5, 10, 1000, 4, 18)),
+        *((0, 2, 1000, 9, 8), (9, 2, 1000, 9, 10), (9, 2, 250, 9, 4)),
+        *((9, 4, 500, 0, 8), (3, 10, 125, 9, 5), (9, 12, 625, 9, 26)),
+    ],
+)
+def test_a_local_map_grows_after_long_phases_and_shrinks_after_short_ones(
+    before, read, mapped, lasted, extra
+):
+    assert active_set.extra_landmarks(before, read, mapped, lasted) == extra
+
+
 def test_a_removed_landmark_leaves_nothing_in_a_saved_state():
     slam = run(CompressedEkfSlam(*NOISE, local_size=12), wander(100, 40))
     places = dict(zip(slam.landmark_ids, slam.state_dict()["slots"], strict=True))
@@ -604,7 +635,7 @@ def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(change, messag
     assert_same_bits(before, slam.belief())
 
 
-@pytest.mark.parametrize("row", [0, 2, -1])
+@pytest.mark.parametrize("row", [0, 2, 3, -1])
 def test_a_saved_variance_of_a_local_landmark_must_be_positive(row):
     local = CompressedEkfSlam(*NOISE, base="invariant", local_size=20)
     state = run(map_all(local, 60), wander(60, 10)).state_dict()

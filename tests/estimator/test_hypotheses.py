@@ -15,6 +15,8 @@ from slamgym.estimator.map_management.managed_slam import (
     OVERLAP,
     Hypothesis,
     ManagedSlam,
+    _overlap,
+    cost_of,
     distinct,
 )
 from slamgym.estimator.models.bearing_range import predict_measurement
@@ -566,6 +568,56 @@ def test_variants_of_one_pose_leave_room_for_another(gap, ratio):
     assert len(kept) == count - is_variant
     assert (other in kept) is not is_variant
     assert distinct([*first, other], most=2) == first[:2]
+
+
+@pytest.mark.parametrize("k", range(3))
+def test_poses_overlap_only_where_every_coordinate_does(k):
+    one, stds = [1.0, -2.0, 3.0, 0.04, 0.09, 0.01], (0.2, 0.3, 0.1)
+    for gap, ratio in ((0.0, 1.0), (1.9, 1.0), (2.1, 1.0), (-1.2, 2.0), (1.7, 2.0)):
+        other = [*one]
+        other[k] += gap * stds[k]
+        other[k + 3] *= ratio**2
+        expected = bhattacharyya(0.0, 1.0, gap, ratio) <= OVERLAP
+        assert _overlap(one, other) == _overlap(other, one) == expected
+        other[k] -= 2 * np.pi  # only a heading is the same again
+        assert _overlap(one, other) == (expected and k == 2)
+
+
+def test_a_reading_of_the_pose_costs_what_it_is_unlikely():
+    noise = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
+    policy = {"management": {"association": "hypotheses"}}
+    slam = make_estimator("ekf", **noise, initial_pose_std=(0.5, 0.2, 0.1), **policy)
+    state = slam.state_dict()
+    second = {f"1.{k[2:]}": v.copy() for k, v in state.items() if k.startswith("0.")}
+    second["1.filter.mean"][:2] = 0.9, 0.5
+    second["1.filter.covariance"] *= 4.0
+    slam.load_state_dict(state | second | {"costs": np.array([0.0, 1.0])})
+    z, R, costs = np.array([1.0, 0.6]), np.array([[0.02, 0.01], [0.01, 0.03]]), []
+    for cost, h in zip((0.0, 1.0), slam.hypotheses, strict=True):
+        belief = h.filter.belief()
+        S, nu = belief.covariance[:2, :2] + R, z - belief.mean[:2]
+        costs.append(cost + nu @ np.linalg.solve(S, nu) + np.linalg.slogdet(S)[1])
+    assert costs[1] < costs[0]  # the second one is now the more probable
+    report = slam.observe_pose(z, np.eye(2, 3), R)
+    found = [h.cost for h in slam.hypotheses]
+    np.testing.assert_allclose(found, [0.0, costs[0] - costs[1]])
+    assert cost_of(report) == pytest.approx(costs[1] - 1.0)
+    assert cost_of(UpdateReport()) == 40.0  # of a rejected one: e²⁰ times less likely
+
+
+@pytest.mark.parametrize("association", ["nearest", "hypotheses"])
+@pytest.mark.parametrize(("backdate", "most"), [(True, 5), (False, 0)])
+def test_as_many_scans_are_kept_as_may_confirm_a_landmark(association, backdate, most):
+    noise = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
+    policy = {"association": association, "confirm": (2, 4), "backdate": backdate}
+    slam, sizes = make_estimator("ekf", **noise, management=policy), []
+    for k in range(9):
+        slam.predict((0.0, 0.0))
+        slam.update([(0.5, 4.0)] if k % 4 else [(0.5, 4.0), (-0.5, 3.0 + k)])
+        kept = slam.best.recent.scans
+        sizes.append(len(kept))
+        assert [scan.number for scan in kept] == [*range(k + 1)][k + 1 - len(kept) :]
+    assert sizes == [min(k, most) for k in range(1, 10)]
 
 
 def test_hypotheses_are_compared_where_rounding_makes_a_variance_negative():

@@ -164,6 +164,16 @@ def test_the_limit_of_nodes_returns_the_best_so_far_and_says_so():
     )
 
 
+@pytest.mark.parametrize("pairs_first", [False, True])
+def test_a_pair_exactly_at_its_limits_is_one(pairs_first):
+    nu, one = np.array([[[3.0, 0.0]]]), np.ones((1, 1), dtype=bool)
+    given = nu, np.zeros((2, 2)), np.ones((1, 1, 2)), one, np.full(1, 99.0)
+    at = Problem(*given, 9.0, np.array([np.inf, 9.0]), pairs_first)
+    assert solve(at).marks.tolist() == [[0]]
+    below = at._replace(gate=8.99), at._replace(limits=np.array([np.inf, 8.99]))
+    assert [solve(each).marks.tolist() for each in below] == [[[UNPAIRED]]] * 2
+
+
 @pytest.mark.parametrize("method", ["joint", "compatibility", "hypotheses"])
 def test_a_scan_is_assigned_as_step_by_step_in_numpy(method):
     rng, policy = np.random.default_rng(5), LandmarkPolicy(association=method)

@@ -1,5 +1,6 @@
 """The policy: who enters the map, who leaves it, who is one."""
 
+import math
 import re
 from dataclasses import replace
 from functools import partial
@@ -84,7 +85,9 @@ def polar(points, pose=(0, 0, 0)):
         ({"view": {"max_range": -1.0}}, "max_range must be a finite number > 0"),
         ({"view": {"max_range": 5, "min_range": 6}}, "max_range must be a finite"),
         ({"view": {"max_range": 5, "angle": 7.0}}, "angle must be at most 2π, got 7.0"),
-        ({"view": {"max_range": 5, "shadow": -1}}, "shadow must be a finite number >="),
+        *(({"view": {"max_range": 5, name: -1}}, f"{name} must be a finite number >=")
+          for name in ("min_range", "range_margin", "bearing_margin", "shadow")),
+        ({"view": {"max_range": 5, "angle": 0.0}}, "angle must be a finite number > 0"),
         ({"view": {"max_range": 5, "visible": 3}},
          "visible must be callable or None, got 3"),
         *(({field: value}, field) for field, value in {
@@ -436,6 +439,58 @@ def test_who_may_stand_behind_another_is_not_missed():
     assert removed_after(FieldOfView(30.0, shadow=0.01), scan=in_front) == 3
     behind = [(5, 1), (8, -4.05)]
     assert removed_after(FieldOfView(30.0, shadow=0.1), scan=behind) == 3
+
+
+def is_expected(view, pose, place, scan):
+    """Whether a scan should show a place, one condition after the other."""
+    away = math.dist(place, pose[:2])
+    bearing = math.atan2(place[1] - pose[1], place[0] - pose[0]) - pose[2]
+    if away > view.max_range - view.range_margin:
+        return False
+    if 0 < view.min_range > away - view.range_margin:
+        return False
+    aside = abs(math.remainder(bearing, 2 * math.pi))
+    if view.angle < 2 * math.pi and aside > view.angle / 2 - view.bearing_margin:
+        return False
+    gaps = [(abs(math.remainder(bearing - b, 2 * math.pi)), r) for b, r in scan]
+    return not view.shadow or all(b > view.shadow or r >= away for b, r in gaps)
+
+
+def test_a_scan_should_show_what_is_well_in_view_and_not_behind_a_reading():
+    rng, shares = np.random.default_rng(2), []
+    for _ in range(60):
+        far, margin, aside, shadow = rng.uniform((4, 0, 0, 0), (9, 1, 0.3, 0.4))
+        view = FieldOfView(
+            far,
+            min_range=rng.choice([0.0, 1.5]),
+            angle=rng.choice([2 * np.pi, 2.5]),
+            range_margin=margin,
+            bearing_margin=aside,
+            shadow=rng.choice([0.0, shadow]),
+        )
+        pose = rng.uniform((-2, -2, -9), (2, 2, 9))
+        places = rng.uniform(-6, 6, (40, 2))
+        scan = rng.uniform((-9, 0), (9, 6), (rng.integers(4), 2))
+        found = view.expects(pose, places, scan).tolist()
+        assert found == [is_expected(view, pose, place, scan) for place in places]
+        shares.append(np.mean(found))
+    assert 0.1 < np.mean(shares) < 0.6
+    edge = FieldOfView(5.0, min_range=1.0, range_margin=0.5, angle=2.0, shadow=0.5)
+    at = np.array([(4.5, 0.0), (1.5, 0.0)])  # on both limits
+    assert edge.expects(np.zeros(3), at, np.empty((0, 2))).all()
+    (behind, before) = edge.expects(np.zeros(3), at, np.array([(-0.5, 1.5)]))
+    assert (behind, before) == (False, True)  # on the edge of the shadow
+
+
+def test_landmarks_matter_as_far_as_a_scan_reads_and_as_they_may_be_missed():
+    scan = np.array([(0.0, 3.0), (1.0, np.inf), (2.0, 7.0)])
+    missing = {"view": FieldOfView(9.0), "remove_after": 3}
+    assert LandmarkPolicy().reach(scan) == 7.0
+    assert LandmarkPolicy(view=FieldOfView(9.0)).reach(scan) == 7.0
+    assert LandmarkPolicy(merge_within=0.5, **missing).reach(scan) == 9.5
+    assert LandmarkPolicy().reach(np.empty((0, 2))) == 0.0
+    policy = LandmarkPolicy(merge_within=1.2, merge_gate=9.0)
+    assert policy.worst_separation_std == pytest.approx(0.2)
 
 
 def test_the_visibility_model_is_asked_in_the_frame_of_the_map():

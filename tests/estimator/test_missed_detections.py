@@ -662,6 +662,18 @@ def test_a_saved_state_with_impossible_detections_is_refused(name, value):
         slam.load_state_dict(state)
 
 
+def test_a_run_begins_with_nothing_but_the_assumed_density():
+    state = {key: np.asarray(value) for key, value in Candidates().state_dict().items()}
+    assert state.pop("density").tolist() == [1.0, 2.0, 1.0, 1.0, 0.0]
+    assert state.pop("lost").tolist() == [0, 0, 0, 0, np.pi**2 / 3, 0, 0, 0]
+    for key, value in state.items():
+        assert not value.any(), key
+        assert value.size == 0 or key not in ("labels", "odds", "path", "seen"), key
+    kept = Candidates.from_state_dict(state | Candidates().state_dict()).state_dict()
+    for key, value in Candidates().state_dict().items():
+        np.testing.assert_array_equal(kept[key], value)
+
+
 @pytest.mark.parametrize("scan", [0, 30])
 @pytest.mark.parametrize("wrong", [60.0, 1e12])
 def test_a_single_wrong_range_does_not_stretch_the_cells(scan, wrong):

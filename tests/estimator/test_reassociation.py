@@ -1,5 +1,7 @@
 """The repair of the association of a drive."""
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from scipy.special import xlogy
@@ -225,6 +227,32 @@ def test_only_a_landmark_that_most_scans_show_is_born():
     for k, place in enumerate(state.places):
         born = search.birth(state.poses, np.delete(costs, k, 1), price, prices)
         np.testing.assert_allclose(born, place, atol=0.5)
+
+
+def test_each_scan_gives_its_readings_to_landmarks_at_the_least_cost():
+    search = _Search(two_laps(1)[1])
+    rng = np.random.default_rng(0)
+    costs = rng.uniform(0, 2 * PRICE, (len(search.owners), 4))
+    rank = np.arange(len(search.owners)) - search.data.firsts[search.owners]
+    costs[rank >= 4] = PRICE  # more would be too many for a search
+    labels, together = search.assigned(costs), np.zeros((4, 4), dtype=bool)
+    for scan in range(0, search.count, 7):
+        rows = np.flatnonzero(search.owners == scan)[:4]
+        table = np.hstack([costs[rows], np.full((len(rows),) * 2, PRICE)])
+        least = min(
+            table[range(len(rows)), marks].sum()
+            for marks in permutations(range(table.shape[1]), len(rows))
+        )
+        found = labels[rows]
+        used = found[found != NONE]
+        assert len({*used.tolist()}) == len(used)
+        paid = np.where(found == NONE, PRICE, costs[rows, found])
+        assert paid.sum() == pytest.approx(least)
+    for scan in range(search.count):
+        shown = labels[search.owners == scan]
+        shown = shown[shown != NONE]
+        together[np.ix_(shown, shown)] = True
+    np.testing.assert_array_equal(search.together(labels, 4), together)
 
 
 @pytest.mark.parametrize("gap", [30, 31])

@@ -3,8 +3,15 @@
 import numpy as np
 import pytest
 
-from slamgym.estimator import Belief, list_estimators, make_batch, make_estimator
+from slamgym.estimator import (
+    Belief,
+    UpdateReport,
+    list_estimators,
+    make_batch,
+    make_estimator,
+)
 from slamgym.estimator.interface import MapView
+from slamgym.estimator.registry import split_labels
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.02, 0.1)}
 
@@ -75,3 +82,26 @@ def test_reports_are_snapshots_that_compare_and_survive_a_pickle():
         report.innovation.ravel()
         @ np.linalg.solve(report.innovation_covariance, report.innovation.ravel()),
     )
+
+
+def test_reports_differ_where_any_part_does():
+    report = UpdateReport(innovation=np.ones((1, 2)), factor=np.eye(2))
+    assert report == UpdateReport(innovation=np.ones((1, 2)), factor=lambda: np.eye(2))
+    others = {"nis": 1.0, "degrees_of_freedom": 2, "merged_ids": ((1, 2),)}
+    others |= {"innovation": np.zeros((1, 2)), "factor": 2 * np.eye(2)}
+    others |= {f"{name}_rows": (1,) for name in ("tentative", "ambiguous")}
+    names = ("associated", "added", "rejected", "skipped", "near", "confirmed")
+    others |= {f"{name}_ids": (1,) for name in (*names, "removed")}
+    for name, value in (others | {"row_ids": (None,)}).items():
+        changed = report.replace(**{name: value})
+        assert changed != report, name
+        assert getattr(changed, name) is value
+        shown = f", 1 {name.partition('_')[0]}" in repr(changed)
+        is_list = name.endswith(("_ids", "_rows")) and name != "row_ids"
+        assert shown == is_list, name
+
+
+def test_labels_are_split_at_commas_outside_brackets():
+    labels = "invariant[iterations=3,min_range=0.5],ekf, m:C[a=[1,2],b=3] ,"
+    expected = ["invariant[iterations=3,min_range=0.5]", "ekf", "m:C[a=[1,2],b=3]"]
+    assert split_labels(labels) == expected

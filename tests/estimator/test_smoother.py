@@ -28,7 +28,13 @@ from slamgym.estimator.smoother import (
     reassociate,
     smooth,
 )
-from slamgym.estimator.smoother.optimiser import start_of
+from slamgym.estimator.smoother.drive import Sightings, landmark_order
+from slamgym.estimator.smoother.optimiser import (
+    Estimate,
+    _Iterate,
+    filter_options,
+    start_of,
+)
 
 START_STD = (0.1, 0.2, 0.05)
 RANGE = 7.0  # of the sensor [m]
@@ -578,6 +584,74 @@ def test_a_drive_assumes_by_default_what_filters_assume():
     for name in shared:
         ours, smoothers, theirs = (each[name] for each in defaults)
         assert ours == smoothers == theirs, name
+
+
+def test_scans_that_repeat_landmarks_are_split_where_they_repeat():
+    ids = np.array([3, 5, 3, 3, 9, 5])
+    parts = list(Sightings(np.arange(12.0).reshape(6, 2), ids).distinct())
+    assert [part.ids.tolist() for part in parts] == [[3, 5, 9], [3, 5], [3]]
+    rows = [(part.measurements[:, 0] / 2).tolist() for part in parts]
+    assert rows == [[0, 1, 4], [2, 5], [3]]
+    assert not list(Sightings(np.empty((0, 2)), ids[:0]).distinct())
+
+
+def test_a_drive_is_made_again_from_the_options_of_its_filter():
+    settings = {"initial_pose": (1.0, 2.0, 0.5), "noise_at_rest": False}
+    settings |= {"min_range": 0.3, "motion": "differential[track_width=0.4]"}
+    made = Drive((0.1, 0.2, 0.3), (0.4, 0.5), initial_pose_std=START_STD, **settings)
+    again = Drive(**filter_options(made))
+    for name in ("initial_pose", "initial_pose_std", "rules", "sensor"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(made, name))
+    one, other = again.motion_noise, made.motion_noise
+    assert (one.motion, one.at_rest) == (other.motion, other.at_rest)
+    np.testing.assert_allclose(one.variance, other.variance)
+
+
+def test_landmarks_are_ordered_by_their_last_reading_and_counted_backwards():
+    rng = np.random.default_rng(2)
+    ids, firsts = rng.integers(0, 9, 40), np.sort(rng.integers(0, 41, 12))
+    firsts[[0, -1]] = 0, 40
+    order, widths = landmark_order(ids, firsts)
+    last = {i: k for k, i in enumerate(ids.tolist())}
+    assert order.tolist() == sorted(last, key=last.get, reverse=True)
+    later = [len({*ids[first:].tolist()}) for first in firsts[:-1]]
+    assert widths.tolist() == [2 * count for count in later]
+
+
+def test_an_iterate_expects_its_steps_to_shrink_as_the_last_one_did():
+    def at(x):
+        return Estimate(np.array([[0.0, x, 1.0]]), np.zeros(2))
+
+    state = _Iterate(at(0.0), np.ones((1, 2)))
+    state.cost, found = 100.0, []
+    for x, cost in ((1.0, 60.0), (1.25, 50.0), (1.45, 44.0), (1.3, 44.0)):
+        state.move(at(x), cost)
+        found.append((state.moved, state.error, state.remaining, state.cost))
+    quarter = 0.25 / (1 - 0.25)
+    expected = [(1.0, 1.0, np.inf, 60.0), (0.25, 0.25 * quarter, 10 * quarter, 50.0)]
+    expected += [(0.2, 0.2, 6 * 0.6 / 0.4, 44.0), (0.15, 0.15, 0.0, 44.0)]
+    np.testing.assert_allclose(found, expected)
+    state.damping, found = 1e-2, []
+    for x in (1.0, 2.0, 3.0, 4.0):
+        state.move(at(x), 44.0)
+        found.append((state.damping, state.is_damped))
+    assert [damped for _, damped in found] == [True, True, True, False]
+    np.testing.assert_allclose([d for d, _ in found], [1e-3, 1e-4, 0, 0], rtol=1e-9)
+    turned = Estimate(np.array([[0.0, 4.0, 1.0 - 2 * np.pi]]), np.zeros(2))
+    state.move(turned, 44.0)
+    assert state.moved == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_cost_is_plausible_up_to_its_mean_and_six_deviations(example):
+    made = example[0]
+    freedom = 2 * made.readings - 2 * len(made.landmarks)
+    expected = 0.6 * freedom + 6 * np.sqrt(freedom / 2) + 1
+    assert made._optimiser.plausible_cost == pytest.approx(expected)
+    drive_ = recorded()[0]
+    drive_.observe_pose((1.0, 2.0), np.eye(2, 3), np.eye(2))
+    optimiser = smooth(drive_)._optimiser
+    expected = 0.6 * (freedom + 2) + 6 * np.sqrt((freedom + 2) / 2) + 1
+    assert optimiser.plausible_cost == pytest.approx(expected)
 
 
 def test_readings_that_a_filter_skips_are_not_in_its_drive():

@@ -22,7 +22,9 @@ from slamgym.estimator.large_maps.sparse_information.local_information import (
     ConditionalPose,
     LinearScan,
     SparseMap,
+    choose_local,
     cut_links,
+    local_map_size,
     relocate,
 )
 from slamgym.estimator.large_maps.sparse_information.scan_update import BASES
@@ -656,3 +658,30 @@ def test_an_update_is_added_to_the_rows_and_columns_of_its_front():
     upper = np.triu_indices(9)
     found = np.vstack([top, np.hstack([np.zeros((6, 3)), rest])])
     np.testing.assert_array_equal(found[upper], expected[upper])
+
+
+@pytest.mark.parametrize(
+    ("mapped", "readings", "required", "size"),
+    [(100, 2, 3, 50), (10**4, 9, 9, 79), (100, 17, 3, 51), (100, 2, 35, 52)],
+)
+def test_a_local_map_is_larger_for_large_maps_and_large_scans(
+    mapped, readings, required, size
+):
+    assert local_map_size(mapped, readings, required) == size
+
+
+def test_a_local_map_holds_what_is_required_and_the_nearest_others():
+    rng = np.random.default_rng(1)
+    mapped, points = rng.permutation(40)[:30], rng.uniform(-9, 9, (40, 2))
+    centre = rng.uniform(-9, 9, 2)
+    order = mapped[np.argsort(np.hypot(*(points[mapped] - centre).T))]
+    for required in (order[:4], order[2:3], order[:0]):
+        found = choose_local(mapped, points, centre, required, 9)
+        assert found[: len(required)].tolist() == required.tolist()
+        assert {*found.tolist()} == {*order[:9].tolist()}
+    far = order[-2:]
+    found = choose_local(mapped, points, centre, far, 9).tolist()
+    assert (found[:2], len({*found})) == (far.tolist(), 9)
+    assert {*found[2:]} < {*order[:9].tolist()}
+    assert len(choose_local(mapped, points, centre, order[:12], 9)) == 12
+    assert {*choose_local(mapped, points, centre, far, 99)} == {*mapped.tolist()}

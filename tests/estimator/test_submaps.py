@@ -17,6 +17,9 @@ from slamgym.estimator.large_maps.elimination import (
     common_ancestor,
     dissect,
 )
+from slamgym.estimator.large_maps.submaps import (
+    closed_submaps as closed_submaps_chapter,
+)
 from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.large_maps.submaps.closed_submaps import Neighbourhood, Region
 from slamgym.estimator.large_maps.submaps.factor import (
@@ -26,7 +29,7 @@ from slamgym.estimator.large_maps.submaps.factor import (
     quadratic,
     retract,
 )
-from slamgym.estimator.large_maps.submaps.graph import fuse
+from slamgym.estimator.large_maps.submaps.graph import ClosingRule, fuse
 from slamgym.estimator.large_maps.submaps.store import (
     CACHE_SIZE,
     MARKER,
@@ -852,3 +855,44 @@ def test_a_neighbourhood_is_renewed_for_the_farthest_of_recent_distances():
     near.forget()
     near.view(1.0)
     assert asked == [5.0, 5.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("limits", "landmarks", "readings", "std", "away", "closes"),
+    [
+        *(((None, None, None), n, 50, 9.0, 9e9, n >= 50) for n in (49, 50)),
+        *(((None, None, None), n, 51, 9.0, 9e9, n >= 102) for n in (101, 102)),
+        *(((7, None, None), n, 60, 9.0, 9e9, n >= 7) for n in (6, 7)),
+        *(((9, 0.5, None), 8, 1, std, 9e9, std > 0.5) for std in (0.5, 0.51)),
+        *(((9, None, 5.0), 8, 1, 9.0, away, away > 5) for away in (5.0, 5.01)),
+    ],
+)
+def test_a_submap_is_closed_at_any_of_its_limits(
+    limits, landmarks, readings, std, away, closes
+):
+    class Active:
+        pose = np.array([0.6 * away, -0.8 * away, 1.0])
+        pose_covariance = np.diag([1e9, 1e9, std**2])
+
+        def __len__(self):
+            return landmarks
+
+    assert ClosingRule.checked(*limits).closes(Active(), readings) == closes
+
+
+def test_a_region_is_twice_as_large_as_required_and_holds_the_nearest(monkeypatch):
+    region = Region(np.array([1.0, 2.0]), reach=3.0, slack=0.5)
+    assert region.radius == 7.0
+    assert region._replace(is_all=True).radius == np.inf
+    assert region._replace(farthest=4.0).radius == 4.0
+    for position, within, covers in (
+        *(((1.0, 2.0), 6.5, True), ((1.0, 2.0), 6.6, False)),
+        *(((1.0 + 3, 2.0 - 4), 1.5, True), ((1.0 + 3, 2.0 - 4), 1.6, False)),
+    ):
+        assert region.covers(np.array(position), within) == covers
+    points = region.centre + np.array([(7.0, 0), (0, 7.1), (2, 0), (0, -3), (-1, 0)])
+    inside, same = region.chosen(points)
+    assert (inside.tolist(), same) == ([0, 2, 3, 4], region)
+    monkeypatch.setattr(closed_submaps_chapter, "LARGEST_COUNT", 2)
+    inside, smaller = region.chosen(points)
+    assert (inside.tolist(), smaller.farthest) == ([2, 4], 2.0)
