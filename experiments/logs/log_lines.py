@@ -264,29 +264,51 @@ def read_text(path: str | PathLike[str]) -> str:
         raise line.error("UTF-8 text", byte) from None
 
 
-def texts(values: Array) -> list[str]:
-    """Write numbers so that reading gives the same bits, and nan as nothing.
-
-    Examples
-    --------
-    >>> texts(np.array([0.1, 2.0, np.nan]))
-    ['0.1', '2.0', '']
-    """
-    found = list(map(repr, values.tolist()))
-    for row in np.flatnonzero(np.isnan(values)).tolist():
-        found[row] = ""
-    return found
-
-
 def rows_of(separator: str, *columns: Iterable[str]) -> list[str]:
     """Write rows from columns of texts.
 
     Examples
     --------
-    >>> rows_of(",", ["a", "b"], texts(np.array([1.0, 2.0])))
+    >>> rows_of(",", ["a", "b"], ["1.0", "2.0"])
     ['a,1.0', 'b,2.0']
     """
     return list(map(separator.join, zip(*columns, strict=False)))
+
+
+def columns_of(
+    lines: Iterable[str], tag: str, separator: str, count: int
+) -> list[list[str]]:
+    """Return the columns of the rows that begin with a tag, without the tag.
+
+    It is the inverse of `rows_of`, for files that this package wrote.
+
+    Raises
+    ------
+    ValueError
+        If such a row has not ``count`` fields.
+
+    Examples
+    --------
+    >>> columns_of(["a,1,2", "b,1", "a,3,4"], "a", ",", 3)
+    [['1', '3'], ['2', '4']]
+    """
+    rows = [line for line in lines if line.startswith(tag + separator)]
+    fields = separator.join(rows).split(separator) if rows else []
+    if len(fields) != count * len(rows) or fields[::count] != [tag] * len(rows):
+        raise ValueError(f"rows of {tag} must have {count} fields")
+    return [fields[place::count] for place in range(1, count)]
+
+
+def table_of(columns: Iterable[Iterable[str]]) -> Array:
+    """Read numbers from columns of texts, shape (rows, columns).
+
+    Examples
+    --------
+    >>> table_of([["1", "2"], ["0.5", "nan"]])
+    array([[1. , 0.5],
+           [2. , nan]])
+    """
+    return np.column_stack([np.array([*map(float, each)]) for each in columns])
 
 
 def write_whole(path: str | PathLike[str], text: str) -> None:

@@ -36,13 +36,13 @@ from numpy.typing import ArrayLike
 from ...arrays import Array, IntArray
 from ...estimator.models.bearing_range import wrap_angle
 from ...estimator.models.motions import find_motion
+from .decimals import texts
 from .log_lines import (
     LogError,
     LogLine,
     read_lines,
     rows_of,
     shown,
-    texts,
     to_lines,
     write_whole,
 )
@@ -185,7 +185,7 @@ def read_slamlog(path: str | PathLike[str]) -> SlamLog:
     OSError
         If the file cannot be opened.
     """
-    return _parse(read_lines(path), Path(path).stem)
+    return parsed(read_lines(path), Path(path).stem)
 
 
 def write_slamlog(log: SlamLog, path: str | PathLike[str]) -> None:
@@ -237,7 +237,7 @@ def _text(lines: Iterable[str]) -> str:
 
 
 def _read_back(log: SlamLog, text: str, path: str | PathLike[str]) -> SlamLog:
-    copy = _parse(to_lines(text, str(path)), log.name)
+    copy = parsed(to_lines(text, str(path)), log.name)
     if (copy.name, copy.header) != (log.name, log.header):
         raise LogError(
             f"{path}: name and header must be single lines without spaces at the ends"
@@ -340,7 +340,8 @@ def format_line_of(lines: list[LogLine]) -> int | None:
     return None
 
 
-def _parse(lines: list[LogLine], default_name: str) -> SlamLog:
+def parsed(lines: list[LogLine], default_name: str) -> SlamLog:
+    """Return the log that the lines of a file hold; errors as `read_slamlog`."""
     place = format_line_of(lines)
     if place is None:
         raise lines[0].error(FORMAT_LINE, shown(lines[0].text))

@@ -28,7 +28,16 @@ from ...sim_configs import Scenario
 from ...sim_configs.field_types import unknown_choice
 from ...sim_configs.scenario_files import scenario_text
 from ..logs import slamlog
-from ..logs.log_lines import rows_of, texts
+from ..logs.decimals import texts
+from ..logs.log_lines import (
+    LARGEST,
+    ReadFile,
+    columns_of,
+    read_text,
+    rows_of,
+    table_of,
+    to_lines,
+)
 from ..logs.recording import log_of_episode
 from ..run_and_replay.filter_settings import settings_for_scenario
 from .trajectory import (
@@ -376,7 +385,69 @@ def _event_lines(trajectory: Trajectory) -> list[str]:
 def _read_slamlog(path: Path) -> Iterator[Trajectory]:
     """Yield the trajectories of a shard; see `TrajectoryFormat`."""
     for name, about in read_metadata(path):
-        yield _trajectory(slamlog.read_slamlog(path / f"{name}.csv"), about)
+        file = ReadFile(path / f"{name}.csv")
+        try:
+            found = _from_columns(read_text(file), about)
+        except (ValueError, LookupError):  # in another form, or damaged
+            found = _from_log(slamlog.read_slamlog(file), about)
+        yield found
+
+
+def _from_columns(text: str, about: dict[str, Any]) -> Trajectory:
+    """Read what `_write_slamlog` writes, by whole columns.
+
+    Raises
+    ------
+    ValueError, LookupError
+        If the text has another form, which `read_slamlog` reads or refuses.
+    """
+    hides = not about["scenario"].sensor.identities
+    lines = text.removesuffix("\n").split("\n")
+    moves = columns_of(lines, "odometry", ",", 5)
+    truth = columns_of(lines, "groundtruth", ",", 5)
+    readings = columns_of(lines, "measurement", ",", 7 if hides else 5)
+    head = len(lines) - sum(len(each[0]) for each in (moves, truth, readings))
+    log = slamlog.parsed(to_lines("\n".join(lines[:head]), ""), "")
+    tables = [*map(table_of, (moves[1:3], truth[1:], readings[2:4]))]
+    times = texts(np.arange(len(truth[0]), dtype=np.float64))
+    number = dict(zip(times, range(len(times)), strict=True))
+    step = np.array([*map(number.__getitem__, readings[0])])
+    ids = np.array([*map(int, readings[5 if hides else 1])])
+    row = np.arange(len(step)) - np.searchsorted(step, step) if hides else ids
+    shape = len(times), count_rows(about["scenario"])
+    measurements, mask = np.zeros((*shape, 2)), np.zeros(shape, dtype=np.bool_)
+    true_ids = np.full(shape, slamlog.NO_LANDMARK, dtype=np.int64)
+    mask[step, row], true_ids[step, row] = True, ids
+    odometry, poses, measurements[step, row] = tables
+    counts = np.bincount(step, minlength=len(times)).tolist()
+    order = "o".join("m" * count for count in counts) + "g" * len(times)
+    written, blank = [*map(str, ids.tolist())], [""] * len(ids)
+    is_usual = (
+        not log.events
+        and not len(log.ground_truth)
+        and "".join([line[0] for line in lines[head:]]) == order
+        and [moves[0], moves[3]] == [times[1:], ["1.0"] * len(odometry)]
+        and truth[0] == times
+        and (np.diff(step) >= 0).all()
+        and readings[4:6] == ([blank, written] if hides else [])
+        and readings[1] == (blank if hides else written)
+        and ids.min() >= -hides
+        and np.count_nonzero(mask) == len(ids)
+        and "_" not in "".join(lines[head:])
+        and all((abs(table) <= LARGEST).all() for table in tables)
+    )
+    if not is_usual:
+        raise ValueError("another form")
+    return Trajectory(
+        **about,
+        start_estimate=log.start,
+        odometry=odometry,
+        poses=poses,
+        landmarks=log.landmarks,
+        measurements=measurements,
+        mask=mask,
+        landmark_ids=true_ids if hides else None,
+    )
 
 
 def to_slamlog(trajectory: Trajectory) -> slamlog.SlamLog:
@@ -411,7 +482,7 @@ def to_slamlog(trajectory: Trajectory) -> slamlog.SlamLog:
     return log_of_episode(world, seed, start, landmarks, events, trajectory.poses)
 
 
-def _trajectory(log: slamlog.SlamLog, about: dict[str, Any]) -> Trajectory:
+def _from_log(log: slamlog.SlamLog, about: dict[str, Any]) -> Trajectory:
     moves = [event for event in log.events if isinstance(event, slamlog.OdometryRow)]
     rows = count_rows(about["scenario"])
     measurements = np.zeros((len(moves) + 1, rows, 2))

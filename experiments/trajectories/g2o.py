@@ -19,7 +19,6 @@ refused.
 """
 
 import math
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import count, repeat
 from pathlib import Path
@@ -29,7 +28,8 @@ import numpy as np
 
 from ...arrays import Array
 from ...sim_configs import Scenario
-from ..logs.log_lines import rows_of, texts
+from ..logs.decimals import texts
+from ..logs.log_lines import columns_of, rows_of, table_of
 from .formats import filtered_path, read_metadata, write_lines, write_metadata
 from .trajectory import Trajectory, array_of
 
@@ -117,7 +117,7 @@ def _odometry_edges(
     at_rest = max(0.0, smallest) ** -2
     moving = [max(std, smallest) ** -2 for std in motion.std]
     along, aside = (np.where(moves, value, at_rest) for value in moving[:2])
-    heading = [repr(moving[2] if moved else at_rest) for moved in moves.tolist()]
+    heading = texts(np.where(moves, moving[2], at_rest))
     xx, xy, yy = map(texts, _turned(along, aside, -odometry[:, 1]))
     start, end, zero = count(first_pose), count(first_pose + 1), repeat("0.0")
     distance, turn = map(texts, odometry.T)
@@ -139,7 +139,7 @@ def _readings(trajectory: Trajectory, smallest: float) -> tuple[list[str], list[
     range_std = np.maximum(range_std, smallest)
     cos, sin = _cos_sin(bearing)
     along, aside = (
-        np.array([std**-2 for std in stds.tolist()])
+        np.array([*map(math.pow, stds.tolist(), repeat(-2.0))])
         for stds in (range_std, distance * bearing_std)
     )
     information = _turned(along, aside, bearing)
@@ -171,41 +171,27 @@ def _cos_sin(angles: Array) -> tuple[Array, Array]:
 
 
 def _trajectory(path: Path, about: dict[str, Any]) -> Trajectory:
-    graph = _rows(path.with_name(f"{path.name}_gtsam.g2o"))
-    truth = _rows(path.with_name(f"{path.name}_truth.g2o"))
-    odometry, landmarks = (
-        _table(graph["EDGE_SE2"], 3, 5),
-        _table(truth["VERTEX_XY"], 2, 3),
+    graph, truth = (
+        path.with_name(f"{path.name}_{end}.g2o").read_text(encoding="utf-8").split("\n")
+        for end in ("gtsam", "truth")
     )
-    shape = (len(odometry) + 1, len(landmarks))
+    _, *start = columns_of(graph, "VERTEX_SE2", " ", 5)
+    _, _, distance, _, turn, *_ = columns_of(graph, "EDGE_SE2", " ", 12)
+    landmarks = table_of(columns_of(truth, "VERTEX_XY", " ", 4)[1:])
+    shape = (len(distance) + 1, len(landmarks))
     measurements, mask = np.zeros((*shape, 2)), np.zeros(shape, dtype=np.bool_)
-    readings = _table(graph["BR"], 1, 2, 3, 4)
-    step, landmark = readings[:, :2].astype(np.int64).T
-    places = step - len(landmarks), landmark
-    measurements[places], mask[places] = readings[:, 2:], True
+    step, landmark, *reading, _, _ = columns_of(graph, "BR", " ", 7)
+    places = (
+        np.array([*map(int, step)], dtype=np.int64) - len(landmarks),
+        np.array([*map(int, landmark)], dtype=np.int64),
+    )
+    measurements[places], mask[places] = table_of(reading), True
     return Trajectory(
         **about,
-        start_estimate=_table(graph["VERTEX_SE2"][:1], 2, 3, 4)[0],
-        odometry=odometry,
-        poses=_table(truth["VERTEX_SE2"], 2, 3, 4),
+        start_estimate=table_of(column[:1] for column in start)[0],
+        odometry=table_of([distance, turn]),
+        poses=table_of(columns_of(truth, "VERTEX_SE2", " ", 5)[1:]),
         landmarks=landmarks,
         measurements=measurements,
         mask=mask,
     )
-
-
-def _rows(path: Path) -> dict[str, list[str]]:
-    """Return the lines of a file by their tags."""
-    found: dict[str, list[str]] = defaultdict(list)
-    for line in path.read_text(encoding="utf-8").splitlines():
-        found[line.partition(" ")[0]].append(line)
-    return found
-
-
-def _table(lines: list[str], *columns: int) -> Array:
-    """Return columns of lines; column 0 is the tag."""
-    last = max(columns) + 1
-    parts = list(zip(*(line.split(None, last)[:last] for line in lines), strict=True))
-    if not parts:
-        return np.zeros((0, len(columns)))
-    return np.array([list(map(float, parts[k])) for k in columns]).T.copy()

@@ -307,6 +307,7 @@ add_words = cast(
 SOURCES = (
     *("jit.py", "kernel_variants.py", "arrays.py"),
     *("agents", "envs", "estimator", "evaluation"),
+    "experiments/logs/decimals.py",
 )
 #: Number of states of the sources whose kernels are kept; about 50 MB each.
 KEPT_STATES = 8

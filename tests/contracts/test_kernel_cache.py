@@ -424,6 +424,7 @@ def test_options_of_the_compiler_change_the_digest(monkeypatch):
 def test_lock_files_of_an_editor_are_no_sources(tmp_path, monkeypatch):
     for name in kernel_cache.SOURCES:
         place = tmp_path / name
+        place.parent.mkdir(parents=True, exist_ok=True)
         place.touch() if place.suffix else place.mkdir()
     monkeypatch.setattr(kernel_cache, "__file__", str(tmp_path / "jit.py"))
     before = digest_of_sources()

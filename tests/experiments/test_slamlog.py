@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slamgym.experiments.logs.decimals import texts
 from slamgym.experiments.logs.ground_truth import hides_identities, without_identities
 from slamgym.experiments.logs.slamlog import (
     LogError,
@@ -141,6 +142,22 @@ def test_hidden_identities_become_true_ids(tmp_path):
             np.testing.assert_array_equal(after.measurements, before.measurements)
         else:
             assert after is before
+
+
+def test_texts_of_numbers_are_those_of_repr():
+    rng = np.random.default_rng(0)
+    two, ten = 2.0 ** np.arange(-20, 60), 10.0 ** np.arange(-6, 19)
+    near = [np.nextafter(each, end) for each in (two, ten) for end in (0, np.inf)]
+    whole = rng.integers(-(2**54), 2**54, 20_000).astype(float)
+    drawn = rng.integers(-(2**63), 2**63 - 1, 5_000).view(np.float64)
+    usual = rng.standard_normal(100_000) * 10.0 ** rng.integers(-5, 18, 100_000)
+    short = np.round(usual[:20_000], 3)
+    special = [0.0, -0.0, np.inf, -np.inf, 5e-324]
+    for some in (two, ten, *near, whole, whole / 1024, drawn, usual, short, special):
+        values = np.asarray(some)[~np.isnan(some)]
+        assert texts(values) == [*map(repr, values.tolist())]
+        assert texts(-values[::2]) == [*map(repr, (-values[::2]).tolist())]
+    assert texts(np.array([1.0, np.nan])) == ["1.0", ""]
 
 
 def test_unknown_true_heading_is_nan(tmp_path):

@@ -15,6 +15,7 @@ from slamgym.experiments.logs.slamlog import OdometryRow, write_slamlog
 from slamgym.experiments.run_and_replay.log_replay import replay
 from slamgym.experiments.trajectories import (
     driven_episodes,
+    formats,
     generate_trajectories,
     load_trajectories,
 )
@@ -158,6 +159,57 @@ def test_a_slamlog_tells_a_filter_what_the_trajectory_says(preset, tmp_path):
     fmt("slamlog").write([drive], tmp_path / "shard")
     shard_file = tmp_path / "shard" / "seed_00000003.csv"
     assert shard_file.read_bytes() == (tmp_path / "log.csv").read_bytes()
+
+
+def read_as(layout, folder, monkeypatch, *, by_line):
+    """Read a shard of one slamlog, and return its arrays or what refuses it."""
+
+    def refuse(text, about):
+        raise ValueError
+
+    with monkeypatch.context() as patch:
+        if by_line:
+            patch.setattr(formats, "_from_columns", refuse)
+        try:
+            (read,) = layout.read(folder)
+        except (ValueError, LookupError) as error:
+            return f"{type(error).__name__}: {error}"
+    arrays = (getattr(read, name) for name in ARRAYS)
+    return [(a.dtype, a.shape, a.tobytes()) for a in arrays if a is not None]
+
+
+ODD = ("_", " ", "-", "+", ".", ",", "e", "0", "1", "x", "", "\n", "1e101", "nan", "٣")
+
+
+@pytest.mark.parametrize("preset", ["corridor", "hidden_identities"])
+def test_whole_columns_are_read_as_line_by_line_and_refused_alike(
+    preset, tmp_path, monkeypatch
+):
+    layout, rng = fmt("slamlog"), np.random.default_rng(5)
+    layout.write(drives(preset, steps=12, seeds=(3,)), tmp_path / "shard")
+    file = tmp_path / "shard" / "seed_00000003.csv"
+    text = file.read_text()
+    monkeypatch.setattr(formats, "_from_log", None)  # read by columns
+    whole = read_as(layout, file.parent, monkeypatch, by_line=False)
+    monkeypatch.undo()
+    assert whole == read_as(layout, file.parent, monkeypatch, by_line=True)
+    found = set()
+    for _ in range(300):
+        lines, kind = text.splitlines(keepends=True), rng.integers(4)
+        one, other = rng.integers(len(lines), size=2)
+        if kind == 0:
+            lines[one], lines[other] = lines[other], lines[one]
+        elif kind == 1:
+            lines.insert(one, lines[other])
+        else:
+            place = int(rng.integers(len(lines[one])))
+            kept = lines[one][place + (kind == 3) :]
+            lines[one] = lines[one][:place] + str(rng.choice(ODD)) + kept
+        file.write_text("".join(lines))
+        quick = read_as(layout, file.parent, monkeypatch, by_line=False)
+        assert quick == read_as(layout, file.parent, monkeypatch, by_line=True), lines
+        found.add(str(quick)[:8])
+    assert {"LogError", "[(dtype("} <= found
 
 
 def test_parquet_is_one_row_per_moment(tmp_path):
