@@ -5,6 +5,7 @@ import time
 import forked
 import numpy as np
 import pytest
+from drawn import check_looks
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
@@ -484,6 +485,14 @@ def test_clutter_is_marked_apart_from_readings():
         np.testing.assert_allclose(np.transpose(marks.get_data()), places)
     labels = [t.get_text() for t in figure_of(renderer).legends[0].get_texts()]
     assert "clutter" in labels
+
+
+def test_a_frame_looks_as_recorded():
+    sensor = {"max_range": 9.0, "field_of_view": 2.0, "occlusion": True}
+    world = SIX.with_changes(walls=((3.0, -9.0, 3.0, 9.0),), sensor=sensor)
+    renderer = WorldRenderer(world, LANDMARKS, "rgb_array", size_px=200)
+    renderer.render(snapshot(belief=FixedBelief(), collision=True))
+    check_looks(figure_of(renderer), "frame")
 
 
 def test_the_legend_shows_beliefs_as_ellipses(renderer):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import forked
 import numpy as np
 import pytest
+from drawn import check_looks
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.text import Text
 from PIL import Image
@@ -94,6 +95,17 @@ def drawn_texts(figure, monkeypatch):
     monkeypatch.setattr(Text, "draw", note)
     figure.canvas.draw()
     return [(text.get_text(), text.get_window_extent()) for text in drawn]
+
+
+@pytest.mark.parametrize("figure_of", FIGURES)
+def test_figures_look_as_recorded(figure_of):
+    check_looks(figure_of(make_trace()), figure_of.__name__)
+
+
+@pytest.mark.parametrize("figure_of", FIGURES[:4])
+def test_figures_of_large_maps_look_as_recorded(figure_of):
+    trace = make_trace(320, 90, nis=np.full(321, 300.0))
+    check_looks(figure_of(trace), f"{figure_of.__name__}_large")
 
 
 @pytest.mark.slow

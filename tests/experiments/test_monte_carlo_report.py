@@ -8,6 +8,7 @@ import re
 
 import numpy as np
 import pytest
+from drawn import check_looks
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from monte_carlo_dataset import typical, with_failures
@@ -739,6 +740,8 @@ def test_a_figure_for_print_is_as_wide_as_asked_and_names_its_world(name, width)
     assert figure.get_figwidth() * 25.4 == pytest.approx(width)
     said = {text.get_text() for text in figure.findobj(Text)}
     assert "six_landmarks, 40 runs of 29 steps" in said
+    if width == 85.0:
+        check_looks(figure, f"{name}_figure")
     figure.draw_without_rendering()
     box = figure.get_tightbbox()
     assert box.x0 > -0.1

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from drawn import check_looks
 
 from slamgym.experiments import monte_carlo_study as package
 from slamgym.experiments.command_line.commands import Reporter
@@ -96,6 +97,8 @@ def test_the_figure_shows_a_panel_for_each_place(effects):
         assert len(marks) == 22  # (1 + 2 × 5) of two estimators
     names = [tick.get_text() for tick in figure.axes[0].get_yticklabels()]
     assert names == ["unchanged", *SIGMAS]
+    few = [e for e in effects if e.estimator == "ekf" and e.sigma in ("none", "σy")]
+    check_looks(noise_effects_figure(few), "noise_effects_figure")
 
 
 def test_bars_of_the_figure_are_a_standard_error_to_either_side(effects):

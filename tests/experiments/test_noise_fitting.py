@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import slamgym
+from drawn import check_looks
 from recordings import recorded
 from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.signal import lfilter
@@ -433,9 +434,10 @@ def test_the_summary_is_that_of_replays(example):
 
 
 def test_the_figure_has_a_column_for_each_noise(example):
-    axes = noise_fit_figure(example).axes
-    assert len(axes) == 4
-    assert axes[0].get_title(loc="left") == "bearing, before"
+    figure = noise_fit_figure(example)
+    assert len(figure.axes) == 4
+    assert figure.axes[0].get_title(loc="left") == "bearing, before"
+    check_looks(figure, "noise_fit_figure")
 
 
 def with_readings(log, change):

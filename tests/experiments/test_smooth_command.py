@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import slamgym
+from drawn import check_looks
 from drives import MEASUREMENT_STD, MOTION_STD, drive
 
 from slamgym.estimator.smoother import Drive, SmoothedDrive, smooth
@@ -73,7 +74,9 @@ def test_the_map_shows_all_ellipses_and_true_landmarks():
         log, landmark_ids=np.arange(7), landmarks=np.concatenate([SIX, farther])
     )
     found = smoothed(log)
-    (axes,) = smoothed_figure(found).axes
+    figure = smoothed_figure(found)
+    check_looks(figure, "smoothed_figure")
+    (axes,) = figure.axes
     low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
     drive = found.drive
     reach = 3 * np.sqrt(np.diagonal(drive.pose_covariances, axis1=1, axis2=2)[:, :2])
