@@ -4,10 +4,20 @@ import re
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from slamgym.estimator.models.sensors import BEARING_RANGE
 from slamgym.evaluation import CAUSES, SmallNoise, diagnose
-from slamgym.evaluation.diagnosis import errors_of
+from slamgym.evaluation.diagnosis import (
+    _change,
+    _exceeds,
+    blame_association,
+    diverged_runs,
+    errors_of,
+    excess_of,
+    runs_to_repeat,
+    spurious_knowledge,
+)
 from slamgym.evaluation.hypothesis_tests import time_average_test
 from slamgym.evaluation.noise_findings import (
     CHANNELS,
@@ -571,3 +581,201 @@ def test_arrays_that_do_not_fit_are_refused(place, message):
     data[place] = data[place][:, :, :2] if place == 0 else data[place][:, :4]
     with pytest.raises(ValueError, match=message):
         summed(*data)
+
+
+# ---- the parts of the answer, by scipy and by hand
+
+
+def test_p_values_of_the_errors_are_those_of_runs_and_of_diverged_ones():
+    rng = np.random.default_rng(20)
+    for of_pose, of_heading, lost in [
+        *((1.3, 1.2, 0), (0.7, 1.05, 0), (1.05, 0.6, 0), (1.0, 1.5, 2)),
+        *((1.05, 1.0, 3), (1.0, 1.0, 0), (1.6, 0.0, 0)),
+    ]:
+        pose = of_pose * rng.chisquare(3, (40, 15))
+        pose[:lost] += 30
+        heading = of_heading * rng.chisquare(1, (40, 9))[:, : 9 * (of_heading > 0)]
+        scores = (pose / 3, heading) if of_heading else (pose / 3,)
+        averages = [score.mean(axis=1) for score in scores]
+        p_values = [stats.binom.sf(lost - 1, 40, 1e-3)]
+        for each in averages:
+            margin = np.clip(each.mean(), 1 / 1.1, 1.1)
+            beyond = time_average_test(each / margin, 1).p_value
+            p_values.append(1.0 if margin == each.mean() else beyond)
+        found = errors_of(pose, heading)
+        assert found.p_value == pytest.approx(min(1, len(p_values) * min(p_values)))
+        assert found.diverged == lost
+        ratios = [each.mean() for each in averages]
+        far = int(np.argmax(np.abs(np.log(ratios))))
+        assert found.of == ("pose", "heading")[far]
+        assert found.ratio == pytest.approx(ratios[far])
+        plain = min(time_average_test(each, 1).p_value for each in averages)
+        assert found.p_of_one == pytest.approx(min(1, len(averages) * plain))
+        assert (f", and {lost} runs diverged" in found.text) == (lost > 1)
+
+
+def test_a_run_diverges_beyond_the_quantile_of_one_nees():
+    edge = stats.chi2.isf(1e-4, 3)
+    pose = edge + np.array([[-1, 1 - 1e-9], [-1, 1 + 1e-9]])
+    assert diverged_runs(pose).tolist() == [False, True]
+
+
+def steady(ratios, degrees=3):
+    """NEES of two steps, whose averages per degree are given."""
+    return np.repeat(degrees * np.asarray(ratios)[:, None], 2, axis=1)
+
+
+WIDE = np.tile([0.5, 2.5], 100)
+
+
+@pytest.mark.parametrize(
+    ("ratios", "lost", "count"),
+    [
+        (np.full(200, 2.01), (), 20),  # most err clearly: a tenth of the runs
+        (np.full(60, 2.01), (), 10),
+        (WIDE, (), 49),  # (3.5 × 1 / 0.5)²
+        (np.tile([0.5, 1.5], 300), (), 307),  # (3.5 × 0.5 / 0.1)²
+        (np.tile([0.5, 1.5], 100), (), 200),
+        (np.tile([1.4, 1.6], 100), (), 20),  # (3.5 × 0.1 / 0.5)² is less
+        (np.ones(200), (3, 90), 91),
+        (np.ones(200), (3, 40, 50, 60, 70, 80), 71),  # the first five
+        (np.ones(200), (3, 4), 20),
+    ],
+)
+def test_as_many_runs_are_repeated_as_show_half_of_the_excess(ratios, lost, count):
+    ratios = np.where(np.isin(np.arange(len(ratios)), lost), 30.0, ratios)
+    still = np.ones((len(ratios), 1))
+    assert runs_to_repeat(steady(ratios), still) == count
+    if ratios.mean() != 1 and not lost:
+        assert runs_to_repeat(3 * still, steady(ratios, 1)) == count
+
+
+@pytest.mark.parametrize(
+    ("after", "known", "factor", "cause", "count"),
+    [
+        ([0.1, 2.1], 100, 0.1, "cannot tell", 144),  # (3 × 1 / 0.25)²
+        ([0.1, 2.1], 100, 0.01, "cannot tell", 144),
+        ([0.1, 2.1], 144, 0.01, "cannot tell", 0),
+        ([0.1, 2.1], 100, 0.1, "wrong covariance", 144),
+        ([0.1, 2.1], 100, 0.01, "wrong covariance", 0),
+        ([0.1, 2.1], 100, 0.1, "linearisation", 0),
+        ([0.1, 2.1], 4, 0.1, "cannot tell", 49),  # too few to know the deviation
+        ([2.1, 2.1, 0.1], 99, 0.1, "cannot tell", 49),  # it seems to stay
+        ([0.9, 1.3], 48, 0.01, "cannot tell", 49),
+        ([0.9, 1.3], 49, 0.01, "cannot tell", 0),
+    ],
+)
+def test_more_runs_are_repeated_where_those_show_too_little(
+    after, known, factor, cause, count
+):
+    found = np.resize(np.array(after), 200)
+    found[known:] = np.nan
+    still, one = np.ones((200, 1)), np.where(np.isfinite(found), 1.0, np.nan)
+    small = SmallNoise(3 * found, one, factor)
+    assert runs_to_repeat(steady(WIDE), still, small, cause) == count
+    small = SmallNoise(3 * one, found, factor)
+    assert runs_to_repeat(3 * still, steady(WIDE, 1), small, cause) == count
+
+
+@pytest.mark.parametrize("times", [1.0, 1.25])
+def test_the_sentence_about_less_noise_has_the_interval_of_students_t(times):
+    z = np.random.default_rng(21).standard_normal(60)
+    after = times * (1.05 + 0.3 * (z - z.mean()) / z.std())
+    pose, still = steady(np.tile([5.0, 7.0], 30)), np.ones((60, 2))
+    low, high = stats.t.interval(0.9, 59, after.mean(), stats.sem(after))
+    said = (
+        f"the noise, the squared errors of the pose are {after.mean():.3g} times "
+        f"(90 % interval {low:.3g} to {high:.3g})"
+    )
+    small = SmallNoise(3 * after, times * still[:, 0], 0.02)
+    cause, text = excess_of(pose, still, small, of_the_noise=times)
+    assert cause == "linearisation"
+    assert text == f"With 2 % of {said}, so the excess vanishes with the noise."
+    larger = SmallNoise(np.full(60, 12.0), still[:, 0])
+    _, text = excess_of(pose, still, small._replace(larger=larger), 0.0, times)
+    assert f"With 2 % of {said}, and with a tenth 4 times, so" in text
+    for half, cause in ((0.49, "linearisation"), (0.51, "cannot tell")):
+        spread = half * np.sqrt(60) / stats.t.isf(0.05, 59) / z.std(ddof=1)
+        wide = times * (1 + spread * (z - z.mean()))
+        changed = SmallNoise(3 * wide, times * still[:, 0])
+        assert excess_of(pose, still, changed, of_the_noise=times)[0] == cause
+
+
+def shaken(mean, runs=20, spread=0.05):
+    return mean + spread * np.resize([-1.0, 1.0], runs)
+
+
+@pytest.mark.parametrize(
+    ("many", "few", "lost", "grows", "change"),
+    [
+        (np.full(20, 3.0), np.full(20, 1.98), 0, np.inf, "shrinks"),
+        (np.full(20, 3.0), np.full(20, 2.0), 0, np.inf, "stays"),
+        (np.full(20, 3.0), np.full(20, 21.0), 0, 10.0, "stays"),
+        (np.full(20, 3.0), np.full(20, 21.1), 0, 10.0, "grows"),
+        (np.full(20, 3.0), np.repeat([1.0, 21.0], [16, 4]), 0, np.inf, "shrinks"),
+        (np.full(20, 3.0), np.repeat([1.0, 81.0], [15, 5]), 0, np.inf, "stays"),
+        (np.full(20, 3.0), np.full(20, np.nan), 0, np.inf, ""),
+        (np.full(4, 3.0), np.full(4, 1.0), 0, np.inf, ""),
+        (np.full(5, 3.0), np.full(5, 1.0), 0, np.inf, "shrinks"),
+        (shaken(1.8), shaken(1.7), 0, np.inf, "stays"),
+        (shaken(1.8), shaken(1.1), 0, np.inf, "shrinks"),
+        (shaken(1.8), shaken(9.9), 0, 10.0, "grows"),
+        (shaken(1.8), shaken(8.9), 0, 10.0, "stays"),
+        (shaken(1.8, spread=0.4), shaken(1.4)[::-1], 0, np.inf, ""),
+        (shaken(0.4), shaken(0.5), 0, np.inf, "stays"),
+        (shaken(0.4), shaken(0.9), 0, np.inf, "shrinks"),
+        (np.repeat([30.0, 1.0], [2, 18]), np.ones(20), 2, np.inf, "shrinks"),
+        (np.repeat([30.0, 1.0], [2, 18]), np.repeat([29.0, 1.0], [2, 18]), 2, 10.0,
+         "stays"),
+        (np.repeat([30.0, 1.0], [1, 19]), np.repeat([29.0, 1.0], [1, 19]), 1, 10.0,
+         ""),
+    ],
+)  # fmt: skip
+def test_an_excess_grows_stays_or_shrinks(many, few, lost, grows, change):
+    sign = -1.0 if many.mean() < 1 else 1.0
+    assert _change(many, few, np.arange(len(many)) < lost, sign, grows) == change
+
+
+def test_knowledge_of_the_heading_is_tested_by_students_test():
+    knowledge = np.random.default_rng(22).normal(0.85, 0.1, 30)
+    expected = stats.ttest_1samp(knowledge, 0.9, alternative="less").pvalue
+    assert spurious_knowledge(knowledge) == pytest.approx(expected)
+
+
+def test_blame_is_the_smaller_p_value_of_two_tests_of_ranks():
+    rng = np.random.default_rng(23)
+    for lost, slope in ((0, 0.1), (3, 0.02), (3, 0.0)):
+        mistakes = rng.integers(0, 6, 40).astype(float)
+        pose = rng.chisquare(3, (40, 10)) * (1 + slope * mistakes[:, None])
+        pose[:lost] += 30
+        mistakes[:lost] += 2
+        many, gone = mistakes > np.median(mistakes), diverged_runs(pose)
+        pairs = [(pose.mean(axis=1), many)] + [(mistakes, gone)] * (lost > 1)
+        p_values = [
+            stats.mannwhitneyu(x[rows], x[~rows], alternative="greater").pvalue
+            for x, rows in pairs
+        ]
+        found = blame_association(pose, mistakes, None)
+        assert found.p_value == pytest.approx(min(1, 2 * min(p_values)))
+        assert found.share == np.mean(mistakes > 0)
+        known = pose / (1.2 + slope * mistakes[:, None])
+        paired = stats.wilcoxon(
+            (pose - known).mean(axis=1), alternative="greater"
+        ).pvalue
+        more = gone.sum() - diverged_runs(known).sum()
+        found = blame_association(pose, mistakes, known)
+        both = paired, stats.binom.sf(more - 1, 40, 1e-3)
+        assert found.p_value == pytest.approx(min(1, 2 * min(both)))
+        assert f"would be {known.mean() / 3:.3g} per degree" in found.text
+
+
+def test_errors_exceed_what_the_noise_explains_beyond_a_tenth():
+    ratios = np.random.default_rng(24).normal(1.0, 0.2, 40)
+    still = np.ones((40, 1))
+    for times in np.linspace(1.0, 1.4, 21):
+        each = times * ratios
+        p_value = time_average_test(each / 1.1, 1).p_value
+        expected = each.mean() > 1.1 and p_value < 0.01
+        assert _exceeds(steady(3 * each), 3 * still, 3.0) == expected
+        assert _exceeds(9 * still, steady(3 * each, 1), 3.0) == expected
+    assert not _exceeds(steady(3 * ratios), still, np.inf)

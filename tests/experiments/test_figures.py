@@ -53,7 +53,7 @@ def typical(figure_of):
 
 
 def comparison(trace):
-    return comparison_figure([trace, trace], walls=WALLS)
+    return comparison_figure([trace] * 3, walls=WALLS)
 
 
 WALLS = ((-30.0, 0.0, 30.0, 0.0), (30.0, 0.0, 30.0, 5.0))

@@ -63,6 +63,8 @@ def _lines(artist):
         return [f"{name} {_fields(ticks)}", *_lines(artist.label)]
     if isinstance(artist, Legend):
         looks = _fields({name: getattr(artist, name) for name in _LEGEND})
+        widths = [each.get_linewidth() for each in artist.legend_handles]
+        looks += f" frame={artist.get_frame_on()} keys={np.ravel(widths).tolist()}"
         texts = [artist.get_title(), *artist.get_texts()]
         named = " | ".join(text.get_text() for text in texts)
         return [f"{name} {looks} | {named}", *_lines(texts[-1])]
