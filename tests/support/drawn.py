@@ -1,6 +1,7 @@
 """What a figure shows, as text: a line for each artist with its style and its data."""
 
 from collections import Counter
+from difflib import unified_diff
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +30,14 @@ _USUAL += ("xscale=linear", "yscale=linear", "facecolor=#ffffffff", "zorder=2")
 
 
 def check_looks(figure, name):
-    """Compare a figure with its text in ``looks``; delete the file to record another."""
+    """Compare a figure with its text in ``looks``; delete this to record another."""
     lines = [f"{n} × {line}" for line, n in Counter(described(figure)).items()]
     file = Path(__file__).with_name("looks") / f"{name}.txt"
     if not file.exists():
         file.write_text("\n".join([*lines, ""]))
         pytest.fail(f"recorded {file}: read it, and run the test again")
-    assert lines == file.read_text().splitlines()
+    differ = "\n".join(unified_diff(file.read_text().splitlines(), lines, n=0))
+    assert not differ, differ
 
 
 def described(figure):
@@ -49,13 +51,9 @@ def described(figure):
 def _lines(artist):
     name = type(artist).__name__.removeprefix("FillBetween")
     if isinstance(artist, Axes):
-        spec = artist.get_subplotspec()
-        place = {"cell": [spec.num1, spec.num2]} if spec else {}
-        for way in ("width", "height") if spec else ():
-            ratios = getattr(spec.get_gridspec(), f"get_{way}_ratios")()
-            place[f"{way}s"] = list(map(float, ratios))
+        place = _got(artist, _AXES) | _cell(artist.get_subplotspec())
         inside = [line for each in artist.get_children()[:-1] for line in _lines(each)]
-        return [f"{name} {_fields(_got(artist, _AXES) | place)}", *inside]
+        return [f"{name} {_fields(place)}", *inside]
     if isinstance(artist, Axis):
         ticks, locator = artist.get_tick_params(), artist.get_major_locator()
         if not isinstance(locator, AutoLocator):
@@ -68,6 +66,20 @@ def _lines(artist):
         texts = [artist.get_title(), *artist.get_texts()]
         named = " | ".join(text.get_text() for text in texts)
         return [f"{name} {looks} | {named}", *_lines(texts[-1])]
+    return _plain(artist, name)
+
+
+def _cell(spec):
+    """Return where a layout has axes, and the ratios of its columns and rows."""
+    if not spec:
+        return {}
+    grid = spec.get_gridspec()
+    ratios = grid.get_width_ratios(), grid.get_height_ratios()
+    columns, rows = (list(map(float, each)) for each in ratios)
+    return {"cell": [spec.num1, spec.num2], "widths": columns, "heights": rows}
+
+
+def _plain(artist, name):
     if isinstance(artist, Spine):
         hue = to_hex(artist.get_edgecolor())
         return [f"Spine {artist.spine_type} {hue}"] if artist.get_visible() else []
@@ -96,10 +108,8 @@ def _short(value, is_colour=False):
     """Write a value; nothing for what is not set, or what matplotlib counts."""
     if value is None or str(value).startswith("_child"):
         return ""
-    if isinstance(value, str | bool):
-        return str(value)
-    if isinstance(value, int | float | np.number):
-        return f"{value:.4g}"
+    if isinstance(value, str | int | float | np.number):
+        return str(value) if isinstance(value, str | bool) else f"{value:.4g}"
     if isinstance(value, list | tuple) and len(value) <= 4 and not is_colour:
         return f"({', '.join(_short(each) or 'None' for each in value)})"
     if is_colour:
