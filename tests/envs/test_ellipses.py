@@ -74,6 +74,7 @@ def test_eigenvalue_negative_by_rounding_counts_as_zero():
         (np.ones(2), r"shape \(…, 2, 2\), got \(2,\)"),
         ([[1.0, np.nan], [np.nan, 1.0]], "finite"),
         ([[1.0, 0.5], [0.4, 1.0]], "symmetric"),
+        ([[1.0, 0.4], [0.5, 1.0]], "symmetric, got entries 0.1 apart"),
         ([[1.0, 2.0], [2.0, 1.0]], "no negative eigenvalue, got -1 m²"),
     ],
 )

@@ -13,6 +13,7 @@ from matplotlib.patches import Ellipse
 from matplotlib.text import Text
 
 from slamgym.envs.bearing_range import LineOfSight
+from slamgym.envs.controllers import planned_path
 from slamgym.envs.rendering import RenderState, WorldRenderer
 from slamgym.envs.rendering.render_state import AxesLimits, visible_area
 from slamgym.envs.rendering.scene import Clock
@@ -293,6 +294,45 @@ def test_view_follows_a_robot_that_leaves_it_and_returns_with_the_episode():
     assert (limits.x, limits.y) == first
 
 
+def fitted(low, high, aspect):
+    """A rectangle about the same centre, widened to an aspect; both ends per axis."""
+    width = max(high[0] - low[0], (high[1] - low[1]) * aspect)
+    half, centre = np.array([width, width / aspect]) / 2, (low + high) / 2
+    return np.stack([centre - half, centre + half])
+
+
+@pytest.mark.parametrize("aspect", [1.0, 1.7])
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("side", [0, 1])
+def test_the_view_grows_where_the_robot_comes_near_its_border(aspect, axis, side):
+    limits = AxesLimits(SIX, LANDMARKS, aspect)
+    box = np.stack([limits.x, limits.y], axis=1)
+    points = np.concatenate([LANDMARKS, planned_path(SIX)[:, :2]])
+    low, high = points.min(axis=0), points.max(axis=0)
+    room = 0.06 * (high - low).max()
+    np.testing.assert_allclose(box, fitted(low - room, high + room, aspect))
+    span, place = (box[1] - box[0]).max(), box.mean(axis=0)
+    for inside, changes in ((0.0201, False), (0.0199, True)):
+        place[axis] = box[side, axis] + (0.5 - side) * 2 * inside * span
+        moment = snapshot((*place, 0.0), path=box.mean(axis=0)[None])
+        assert limits.follow(moment) == changes
+    grown = box.copy()
+    grown[side, axis] = place[axis] - (0.5 - side) * 2 * 0.25 * span
+    expected = fitted(*grown, aspect)
+    np.testing.assert_allclose([limits.x, limits.y], expected.T)
+    again = AxesLimits(SIX, LANDMARKS, aspect)
+    middle = (*box.mean(axis=0), 0.0)
+    assert again.follow(snapshot(middle, path=place[None]))  # as where it has been
+    np.testing.assert_allclose([again.x, again.y], expected.T)
+
+
+def test_a_view_has_room_for_eight_radii_of_the_robot():
+    still = {"sequence": "commands", "commands": [(0.0, 0.0, 1)]}
+    world = SIX.with_changes(controls=still, robot={"radius": 2.0})
+    limits = AxesLimits(world, np.array([[0.0, 0.0], [3.0, 0.0]]), aspect=1.0)
+    assert np.ptp(limits.x) == pytest.approx(16.0)
+
+
 def test_frame_after_leaving_the_view_shows_the_robot(renderer):
     renderer.render(snapshot())
     renderer.render(snapshot((90.0, -20.0, 0.0)))
@@ -463,9 +503,12 @@ def test_a_large_world_is_shown_around_the_robot():
     limits = AxesLimits(city, landmarks, aspect=1.0)
     assert np.ptp(limits.x) == pytest.approx(6 * city.sensor.max_range)
     first = limits.x, limits.y
-    assert not limits.follow(snapshot((5.0, 0.0, 0.0)))
-    assert limits.follow(snapshot((9.0, 0.0, 0.0)))
-    assert np.mean(limits.x) == pytest.approx(9.0)
+    edge = np.ptp(limits.x) / 4
+    for far, changes in ((0.999, False), (-0.999, False), (1.001, True)):
+        assert limits.follow(snapshot((far * edge, 0.0, 0.0))) == changes
+    assert np.mean(limits.x) == pytest.approx(1.001 * edge)
+    assert limits.follow(snapshot((9.0, -2 * edge, 0.0)))
+    assert (np.mean(limits.x), np.mean(limits.y)) == pytest.approx((9, -2 * edge))
     assert np.ptp(limits.x) == pytest.approx(6 * city.sensor.max_range)
     assert limits.follow(snapshot((0.0, 0.0, 0.0), step=0))
     assert (limits.x, limits.y) == first

@@ -548,8 +548,23 @@ def test_the_ratio_named_is_farthest_from_one_as_a_factor():
 
 def test_few_runs_decide_nothing():
     found = diagnose(**honest(0, runs=19))
-    assert found.cause == "cannot tell"
+    assert (found.cause, found.p_value) == ("cannot tell", 1.0)
     assert "19 runs" in found.sentence
+    assert diagnose(**honest(0, runs=20)).cause == "honest"
+
+
+def test_innovations_are_too_large_from_a_seventh_on():
+    said = "; the squared innovations are 1.16 times too large. "
+    assert said in diagnose(**wrong(11), nis_ratio=1.16).sentence
+    assert "innovations" not in diagnose(**wrong(11), nis_ratio=1.15).sentence
+
+
+def test_leading_steps_without_nees_do_not_count():
+    scores = wrong(11)
+    early = ((0, 0), (3, 0))
+    for name in ("nees", "heading_nees"):
+        scores[f"{name}"] = np.pad(scores[name], early, constant_values=np.nan)
+    assert diagnose(**scores) == diagnose(**wrong(11))
 
 
 @pytest.mark.parametrize(
@@ -557,6 +572,13 @@ def test_few_runs_decide_nothing():
     [
         ("noise", np.zeros((RUNS, 5, 6)), r"noise must have shape \(60, 5, 12\)"),
         ("noise", np.full((RUNS, 5, 9), np.nan), "noise must be finite"),
+        (
+            "noise",
+            np.where(np.arange(9), np.ones((RUNS, 5, 9)), np.nan),
+            "noise must be",
+        ),
+        ("nees", np.where(np.eye(RUNS, STEPS, 3), np.nan, 3), "nees must be finite"),
+        ("nees", np.ones((RUNS, 0)), r"nees must have shape"),
         ("nees", np.ones(RUNS), r"nees must have shape \(runs, steps\)"),
         ("nees", np.full((RUNS, STEPS), np.nan), "nees must be finite"),
         ("heading_nees", np.ones((RUNS, 2)), "heading_nees must have shape"),

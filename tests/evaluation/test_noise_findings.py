@@ -9,6 +9,7 @@ from slamgym.evaluation.noise_findings import (
     CHANNELS,
     HEAVY_TAILS,
     _growth,
+    _size_beside_tails,
     noise_findings,
     noise_sums,
     significant_findings,
@@ -235,7 +236,7 @@ def test_noise_of_another_size_far_away_is_no_heavy_tail(factor, size):
     assert others == []
 
 
-@pytest.mark.parametrize("growth", [0.12, -0.04])
+@pytest.mark.parametrize("growth", [0.12, -0.04, 0.1, 0.01, -0.02, 0.005])
 def test_the_impact_of_a_growth_is_that_of_a_line_through_the_squares(growth):
     rng = np.random.default_rng(6)
     r, w = rng.uniform(1, 9, 5000), rng.standard_normal(5000)
@@ -246,7 +247,36 @@ def test_the_impact_of_a_growth_is_that_of_a_line_through_the_squares(growth):
     ends = r.mean() + r.std() * np.array([-1, 1])
     along = np.polyval(np.polyfit(r, squares, 1), ends)
     expected = np.abs(np.log([*along, squares.mean()])).max()
-    assert _growth("range", found, squares.mean()).impact == pytest.approx(expected)
+    seen = _growth("range", found, squares.mean())
+    assert seen.impact == pytest.approx(expected)
+    rho = np.corrcoef(r, squares)[0, 1]
+    p_value = 2 * stats.norm.sf(abs(rho) * np.sqrt(5000))
+    assert seen.p_value == pytest.approx(p_value, rel=1e-6, abs=0)
+    assert seen.matters == (abs(along[1] - along[0]) >= 0.2 * squares.mean())
+    sides = np.sign(along - 1)
+    assert seen.sign == (sides[0] if sides[0] == sides[1] else 0)
+    size = "too small" if along.max() > 1.05 else "too large"
+    assert seen.cause == f"range noise {size}"
+    near, far = np.sqrt(along)
+    assert seen.text == (
+        f"σr is {far:.3g} times what it assumes at distances of {ends[1]:.2g} m, "
+        f"and {near:.3g} times at {ends[0]:.2g} m"
+    )
+
+
+@pytest.mark.parametrize("kurtosis", [3.6, 6.0])
+@pytest.mark.parametrize("variance", [0.5, 1.05, 1.4, 2.5])
+def test_tails_explain_a_size_up_to_the_variance_of_student_noise(variance, kurtosis):
+    student = stats.t(4 + 6 / (kurtosis - 3)).var()
+    explained = np.clip(variance, 1.0, student)
+    score = abs(variance - explained) / (variance * np.sqrt((kurtosis - 1) / 500))
+    found = _size_beside_tails("turn", 500.0, variance, kurtosis)
+    assert found.p_value == pytest.approx(2 * stats.norm.sf(score), rel=1e-9)
+    assert found.impact == pytest.approx(abs(np.log(variance / explained)))
+    assert found.matters == (abs(variance / explained - 1) >= 0.2)
+    size = "small" if variance > 1 else "large"
+    assert found.cause == f"motion noise too {size}"
+    assert (found.sign, found.at_most) == (np.sign(variance - 1), max(variance, 1))
 
 
 def test_heavy_tails_are_named_even_if_the_noise_grows_with_the_distance():
