@@ -151,7 +151,7 @@ TESTS = {
     "experiments/command_line/smooth": "smooth_command",
     "experiments/command_line/tables": "replay monte_carlo_report noise_fitting",
     "experiments/consistency_protocol": "consistency_protocol",
-    "experiments/estimate_conventions": "judging",
+    "experiments/estimate_conventions": "estimate_conventions judging",
     "experiments/estimate_files": "estimate_files judging",
     "experiments/figures": "figures",
     "experiments/figures/smoothed": "smooth_command",

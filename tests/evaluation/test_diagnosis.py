@@ -1,6 +1,7 @@
 """The noise of a world by its truth, and the cause that it points to."""
 
 import re
+from itertools import product
 
 import numpy as np
 import pytest
@@ -11,6 +12,11 @@ from slamgym.evaluation import CAUSES, SmallNoise, diagnose
 from slamgym.evaluation.diagnosis import (
     _change,
     _exceeds,
+    _interval,
+    _is_positive,
+    _is_small,
+    _larger,
+    _rest_of,
     blame_association,
     diverged_runs,
     errors_of,
@@ -801,3 +807,54 @@ def test_errors_exceed_what_the_noise_explains_beyond_a_tenth():
         assert _exceeds(steady(3 * each), 3 * still, 3.0) == expected
         assert _exceeds(9 * still, steady(3 * each, 1), 3.0) == expected
     assert not _exceeds(steady(3 * ratios), still, np.inf)
+
+
+def test_means_of_few_runs_are_tested_by_students_test():
+    rng = np.random.default_rng(25)
+    for n in (3, 5, 8) * 60:
+        values = rng.normal(1.0, 1.0, n)
+        test = stats.ttest_1samp(values, 0, alternative="greater")
+        assert _is_positive(values) == (test.pvalue < 0.05)
+        low, high = stats.t.interval(0.9, n - 1, values.mean(), stats.sem(values))
+        assert _interval(values) == pytest.approx((max(low, 0), high))
+        before = rng.uniform(0.0, 4.0)
+        left = np.clip(abs(before - 1) / 4, 0.25, 0.5)
+        assert _is_small(before, values / 2, 1.0) == (high / 2 <= 1 + left)
+        assert _is_small(before, values / 2, -1.0) == (max(low, 0) / 2 >= 1 - left)
+        chosen = np.arange(n) < n // 2
+        others = stats.mannwhitneyu(
+            values[chosen], values[~chosen], alternative="greater"
+        )
+        assert _larger(values, chosen, n // 2) == others.pvalue
+        assert _larger(values, chosen, n // 2 + 1) == 1
+        assert _larger(values, ~chosen, n // 2 + 1) == 1
+
+
+def test_what_is_left_with_less_noise_leaves_few_diverged_runs_out():
+    rng = np.random.default_rng(26)
+    for lost, sign, of in [
+        *product((0, 1, 2, 3, 6), (1.0, -1.0), ("pose", "heading"))
+    ] * 6:
+        after = {
+            name: rng.uniform(0.6, 1.6) * rng.gamma(20, 0.05, 40)
+            for name in ("pose", "heading")
+        }
+        after["pose"][:lost] = 7.1
+        known = np.arange(40) > 38 - rng.choice([39, 34], p=[0.5, 0.5])
+        gone = known & (after["pose"] > stats.chi2.isf(1e-4, 3) / 3)
+        is_few = gone.sum() <= 0.05 * known.sum()
+        kept = known & ~gone if is_few else known
+        means, off = {name: x[kept].mean() for name, x in after.items()}, {}
+        for name, mean in means.items():
+            margin = np.clip(mean, 1 / 1.1, 1.1)
+            p_value = time_average_test(after[name][kept] / margin, 1).p_value
+            if margin != mean and (mean - 1) * sign > 0 and p_value < 0.025:
+                off[name] = abs(np.log(mean))
+        many = stats.binom.sf(gone.sum() - 1, known.sum(), 1e-3) < 0.05
+        found = _rest_of(after, known, of, sign)
+        assert found.remains == (bool(off) or (sign > 0 and not is_few and many))
+        assert found.of == (max(off, key=off.get) if off else of)
+        assert found.ratio == pytest.approx(means[found.of])
+        assert (found.low, found.high) == _interval(after[found.of][kept])
+        np.testing.assert_array_equal(found.kept, kept)
+        assert (found.diverged, found.few_diverged) == (gone.sum(), is_few)

@@ -12,10 +12,19 @@ from recordings import recorded
 from slamgym.estimator.filters.drive_likelihood import drive_likelihood
 from slamgym.estimator.models.bearing_range import wrap_angle
 from slamgym.experiments.log_conventions import (
+    LogAsRead,
+    WrongConvention,
     _Comparison,
+    _is_far_off,
+    _LogFit,
+    _named,
+    _rise,
     events_of,
+    is_used,
     mistake_in_log,
+    others,
     part_of,
+    unbroken,
 )
 from slamgym.experiments.logs import (
     OdometryRow,
@@ -335,3 +344,205 @@ def test_commands_name_the_mistake_and_suggest_no_noise(corridor, tmp_path):
         assert "--motion-std" not in told or command != "fit-noise"
         assert "inflation" not in told
     assert file.read_text() == text
+
+
+# ---- a log of four steps by hand
+
+ROWS = np.array(
+    [[1, 0.5, 0.1], [2, -0.4, 0.2], [3, 0.3, 0.1], [4, -2, 0.3], [5, 3, 0.1]]
+)
+READ = np.column_stack([np.linspace(-3, 3, 9), np.linspace(2, 6, 9)])
+PART = LogAsRead(
+    ROWS,
+    np.array([1, 1, 2, 3, 3]),
+    READ,
+    np.array([7, 4, 7, 4, 4, -1, 9, 7, 4]),
+    np.array([0, 0, 1, 1, 1, 2, 2, 3, 3]),
+    np.array([True, True, False, True]),
+    "turn-last",
+    0.25,
+)
+
+
+def test_each_convention_is_read_as_its_remedy_says():
+    (b, r), (d, alpha, dt), degree = READ.T, ROWS.T, np.pi / 180
+    turned = [0.25 + alpha[PART.row_steps <= step].sum() for step in PART.steps]
+    late = {"measurements": READ[:-1], "steps": PART.steps[:-1]}
+    early = {"measurements": READ[1:], "steps": PART.steps[1:]}
+    expected = {
+        "the bearings are clockwise": (-b, r, 1),
+        "the bearings are in degrees": (b * degree, r, degree),
+        "bearings and turns are in degrees": (b * degree, r, degree),
+        "the range stands before the bearing": (r, b, 1),
+        "the bearings are measured from the left of the robot": (b + HALF, r, 1),
+        "the bearings are measured from the right of the robot": (b - HALF, r, 1),
+        "the bearings are measured from the rear of the robot": (b + np.pi, r, 1),
+        "the bearings are clockwise from the left of the robot, its y axis": (
+            (HALF - b, r, 1)
+        ),
+        "the bearings are measured from the x axis of the world": (b - turned, r, 1),
+        "the ranges are in centimetres": (b, r / 100, 1 / 100),
+        "the ranges are in millimetres": (b, r / 1000, 1 / 1000),
+    }
+    turns = np.diff(alpha, prepend=0.25)
+    rows = {
+        "bearings and turns are in degrees": (d, alpha * degree),
+        "the distances driven are in centimetres": (d / 100, alpha),
+        "the distances driven are in millimetres": (d / 1000, alpha),
+        "the turns of the odometry are clockwise": (d, -alpha),
+        "the turns of the odometry are in degrees": (d, alpha * degree),
+        "the odometry holds headings in place of turns": (d, wrap_angle(turns)),
+        "the odometry holds velocities in place of increments": (d * dt, alpha * dt),
+    }
+    changes = {
+        "the robot drives arcs": {"motion": "midpoint"},
+        "the robot turns before it drives": {"motion": "turn-first"},
+        "the ids stand one row too late": late | {"landmarks": PART.landmarks[1:]},
+        "the ids stand one row too early": early | {"landmarks": PART.landmarks[:-1]},
+        "the measurements stand one row of odometry too late": {
+            "steps": PART.steps - 1,
+            "is_read": PART.is_read[[1, 2, 3, 0]],
+            "moved": -1,
+        },
+        "the measurements stand one row of odometry too early": {
+            "steps": PART.steps + 1,
+            "is_read": PART.is_read[[3, 0, 1, 2]],
+            "moved": 1,
+        },
+    }
+    found = {it.name: it.reading for it in others(PART)}
+    assert set(found) == {*expected, *rows, *changes}
+    for name, reading in found.items():
+        whole = PART._asdict() | changes.get(name, {})
+        if name in expected:
+            bearing, distance, volume = expected[name]
+            whole["measurements"] = np.column_stack([wrap_angle(bearing), distance])
+            whole["log_volume"] = np.log(volume)
+        if name in rows:
+            whole["rows"] = np.column_stack([*rows[name], dt])
+        for field, value in whole.items():
+            if isinstance(value, str):
+                assert getattr(reading, field) == value
+            else:
+                np.testing.assert_allclose(getattr(reading, field), value, atol=1e-12)
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_velocities_without_durations_are_tried_with_usual_ones(dt):
+    rows = ROWS * [1, 1, 0] + [0, 0, dt]
+    rates = [it for it in others(PART._replace(rows=rows)) if "veloc" in it.name]
+    tried = [it.reading.rows[0, 0] for it in rates]
+    durations = [0.5, 0.25, 0.2, 0.1, 0.05, 0.04, 1 / 30, 0.02, 0.01]
+    assert tried == pytest.approx(durations)
+    for it, duration in zip(rates, durations, strict=True):
+        np.testing.assert_allclose(it.reading.rows, rows * [duration, duration, 1])
+        assert f"by {duration:.3g}, the duration" in it.remedy
+
+
+def test_pairs_of_rows_are_read_in_the_frame_of_the_world_and_exchanged():
+    rows = np.array([[0, 0.5, 0], [2, 0.1, 0.2], [0, -0.3, 0], [4, 0.2, 0.1]])
+    part = PART._replace(rows=rows, row_steps=np.array([1, 1, 2, 2]))
+    found = {it.name: it.reading.rows for it in others(part)}
+    seen = found["the increments are in the frame of the world"]
+    heading = 0.25 + 0.6
+    expected = [0.5 - 0.25, 0.1 + 0.25, -0.3 - heading, 0.2 + heading]
+    np.testing.assert_allclose(
+        seen, np.column_stack([rows[:, 0], expected, rows[:, 2]])
+    )
+    name = "the rows of a turn stand before those of the drive that it follows"
+    np.testing.assert_array_equal(found[name], rows[[1, 0, 3, 2]])
+    assert "the robot drives arcs" not in found
+    for broken in ([3, 0.5, 0], [0, 0.5, 0.1]):
+        other = np.vstack([rows[:2], [broken], rows[3:]])
+        assert name not in {it.name for it in others(part._replace(rows=other))}
+    still = rows * [1, 1, 0]
+    assert name not in {it.name for it in others(part._replace(rows=still))}
+
+
+def test_events_hold_the_first_reading_of_each_landmark_in_scans_that_are_read():
+    used = [True, True, True, True, False, False, False, True, True]
+    assert is_used(PART).tolist() == used
+    (d, alpha, dt), none = ROWS.T, np.zeros(5)
+    halves = np.column_stack([none, alpha / 2, none, d, alpha / 2, dt])
+    first = np.column_stack([none, alpha, none, d, none, dt])
+    for motion, table in (
+        ("turn-last", ROWS),
+        ("midpoint", halves),
+        ("turn-first", first),
+    ):
+        events = events_of(PART._replace(motion=motion))
+        many = 1 if motion == "turn-last" else 2
+        np.testing.assert_array_equal(events[0], np.reshape(table, (-1, 3)))
+        assert events[1].tolist() == [0, 0, 2 * many, 3 * many, 5 * many]
+        np.testing.assert_array_equal(events[2], READ[used])
+        assert events[3].tolist() == [1, 0, 1, 0, 1, 0]
+        assert events[4].tolist() == [0, 2, 4, 4, 6]
+    assert unbroken(PART).is_read.all()
+    outside = PART._replace(landmarks=np.array([7, 4, 7, -1, -1, -1, -1, -1, -1]))
+    assert unbroken(outside).is_read.tolist() == [True, True, False, False]
+
+
+def test_a_rise_is_compared_with_its_scatter_over_the_pieces():
+    rng = np.random.default_rng(0)
+    before, after = rng.normal(size=(2, 1, 400))
+    for shift in (0.0, 0.5, 2.0):
+        after = before + rng.normal(shift, 1.0, (1, 400))
+        before[0, ::7] = 0.0  # steps without a scan
+        steps = np.flatnonzero(before[0])
+        rises = (after - before)[0, steps]
+        pieces = np.array([piece.sum() for piece in np.array_split(rises, 30)])
+        large = pieces[abs(pieces) > 2]
+        fits = (_LogFit(*[np.zeros(1)] * 3, each) for each in (after, before))
+        errors, share = _rise(*fits)
+        error = np.sqrt(((pieces - pieces.mean()) ** 2).mean() * 30)
+        assert errors == pytest.approx(rises.sum() / error)
+        assert share == (large > 0).mean()
+    lost = _LogFit(*[np.zeros(1)] * 3, np.full((1, 400), -np.inf))
+    assert _rise(lost, _LogFit(*[np.zeros(1)] * 3, before)) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("nis", "rejected", "loss", "is_far"),
+    [
+        *((1.0, 0.0, 0.0, False), (0.59, 0.0, 0.0, True), (0.61, 0.0, 0.0, False)),
+        *((1.39, 0.0, 0.0, False), (1.41, 0.0, 0.0, True), (1.0, 0.3, 0.0, True)),
+        *((1.0, 0.0, 0.11, True), (1.0, 0.0, 0.09, False)),
+    ],
+)
+def test_a_log_is_far_off_by_nis_rejections_or_likelihood(nis, rejected, loss, is_far):
+    likelihoods = np.zeros(25)
+    likelihoods[3] = loss
+    as_given = np.arange(25) == 12  # 5 factors of the motion by 5 of the sensor
+    fit = _LogFit(
+        likelihoods,
+        np.where(as_given, nis, 5.0),
+        np.where(as_given, rejected, 0.9),
+        np.zeros((25, 3)),
+    )
+    assert _is_far_off(fit) == is_far
+
+
+def test_a_mistake_is_written_with_its_numbers_and_those_as_given():
+    after = _LogFit(np.array([-3.0, -1.5]), np.array([4.0, 1.1]), np.array([0.5, 0.04]),
+                    np.zeros((2, 1)))  # fmt: skip
+    before = _LogFit(
+        np.array([-9.0, -4.0]),
+        np.array([9.0, 55.5]),
+        np.array([0.9, 0.3]),
+        np.zeros((2, 1)),
+    )
+    pair = [each for each in others(PART) if "clockwise" in each.name][::2]
+    found = _named([(after, each) for each in pair], before, np.array([1.0, 4.0]))
+    name = f"{pair[0].name} or {pair[1].name}"
+    remedy = f"{pair[0].remedy}, or {pair[1].remedy}"
+    plain = WrongConvention(name, remedy, 2.5, (1.1, 55.5), (0.04, 0.3), (1.0, 4.0))
+    assert found == plain
+    text = (
+        f"The log breaks a convention: {name}. Without this mistake and with 1 × the "
+        "noise of the motion, 4 × that of the sensor, NIS is 1.1 per degree of "
+        "freedom, not 55.5, 4% of the readings are rejected, not 30%, and the log "
+        f"likelihood rises by 2.5 per reading. Remedy: {remedy}."
+    )
+    assert str(found) == text
+    assert found.as_dict() == {**found._asdict(), "text": text}
+    assert "noise" not in str(found._replace(factors=(1.0, 1.0)))
