@@ -23,7 +23,7 @@ from ..models.bearing_range import locate_landmark, wrap_angle
 from ..models.rigid_motion import seen_from
 from ..models.sensors import BEARING_RANGE
 from .drive import Drive, Sightings, path_between
-from .elimination import conditionals
+from .elimination import PART, Sensitivity
 from .optimiser import (
     KINDS,
     Estimate,
@@ -268,9 +268,7 @@ def _landmarks_at(
 class _Marginals(NamedTuple):
     """What the covariances are made of."""
 
-    given_map: Array  # Π, shape (N, 3, 3)
-    transitions: Array  # Φ, shape (N, 3, 3)
-    sensitivity: Array  # Ψ, shape (N, 3, 2n)
+    sensitivity: Sensitivity  # Π, Φ and Ψ
     factor: Array  # lower Cholesky factor of S, shape (2n, 2n)
     landmarks: Array  # P_l, shape (2n, 2n)
 
@@ -284,7 +282,7 @@ class SmoothedDrive:
         P_jk = Π_j Φ_{j+1}ᵀ … Φ_kᵀ + Ψ_j P_l Ψ_kᵀ    for j < k
 
     with the Schur complement S of the landmarks and Π, Φ, Ψ of
-    `substitution.conditionals`.
+    `elimination.Sensitivity`.
 
     Parameters
     ----------
@@ -336,12 +334,9 @@ class SmoothedDrive:
 
     @cached_property
     def _marginals(self) -> _Marginals:
-        minimum = self._optimiser.linearised(self._solution)
-        poses, elimination = self._solution.estimate.poses, minimum.elimination
-        factor = factorised(minimum.information)
+        factor = factorised(self._optimiser.linearised(self._solution))
         return _Marginals(
-            *conditionals(poses, elimination),
-            elimination.rows,
+            self._optimiser.sensitivity(self._solution),
             factor[0],
             np.asarray(cho_solve(factor, np.eye(len(self._all)))),
         )
@@ -372,11 +367,22 @@ class SmoothedDrive:
     @property
     def pose_covariances(self) -> Array:
         """Marginal covariance of each pose, shape (N, 3, 3)."""
-        found = self._marginals
-        rows = found.sensitivity.reshape(-1, len(self._all))
-        root = solve_triangular(found.factor, rows.T, lower=True)
-        root = root.T.reshape(found.sensitivity.shape)
-        return np.asarray(found.given_map + root @ root.transpose(0, 2, 1))
+        return self.covariances_of(range(len(self.poses)))
+
+    def covariances_of(self, poses: Sequence[int] | IntArray) -> Array:
+        """Return the marginal covariance of some poses, shape (p, 3, 3).
+
+        Negative ones count from the end.
+        """
+        chosen = np.array([self._pose(pose) for pose in poses], dtype=np.int64)
+        sensitivity, factor, _ = self._marginals
+        covariances = sensitivity.given_map[chosen]
+        for first in range(0, len(chosen), PART):
+            own = sensitivity.of(chosen[first : first + PART])
+            rows = own.reshape(-1, len(self._all)).T
+            root = solve_triangular(factor, rows, lower=True).T.reshape(own.shape)
+            covariances[first : first + PART] += root @ root.transpose(0, 2, 1)
+        return covariances
 
     @property
     def landmark_covariances(self) -> Array:
@@ -409,7 +415,8 @@ class SmoothedDrive:
         """
         chosen = [self._pose(pose) for pose in poses]
         columns = self._columns(self._known(landmark_ids))
-        to_landmarks = self._marginals.sensitivity[chosen].reshape(-1, len(self._all))
+        sensitivity = self._marginals.sensitivity.of(np.array(chosen, dtype=np.int64))
+        to_landmarks = sensitivity.reshape(-1, len(self._all))
         spread = to_landmarks @ self._marginals.landmarks
         count = 3 * len(chosen)
         joint = np.empty((count + len(columns),) * 2)
@@ -438,12 +445,13 @@ class SmoothedDrive:
     def _given_map(self, poses: Sequence[int]) -> Array:
         """Return the joint covariance of some poses if the map was known."""
         blocks = np.empty((len(poses), 3, len(poses), 3))
+        sensitivity = self._marginals.sensitivity
         for at, first in enumerate(poses):
             later = {pose for pose in poses if pose >= first}
-            moved = self._marginals.given_map[first]
+            moved = sensitivity.given_map[first]
             for k in range(first, max(later) + 1):
                 if k > first:
-                    moved = self._marginals.transitions[k] @ moved
+                    moved = sensitivity.transitions[k] @ moved
                 for other in [i for i, pose in enumerate(poses) if pose == k]:
                     blocks[other, :, at] = moved
                     blocks[at, :, other] = moved.T

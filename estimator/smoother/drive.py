@@ -465,27 +465,31 @@ def path_between(
     >>> path_between(np.array([[0.0, 0, 0], [2.4, 0, 0]]), motions, noise)[:, 0]
     array([0. , 1.1, 2.4])
     """
-    path = [poses[:1]]
+    path, covariances = [poses[:1]], np.array([motion.covariance for motion in motions])
+    inverses = np.linalg.pinv(covariances, hermitian=True)
     for k in range(1, len(poses)):
-        path.append(_between(poses[k - 1], poses[k], motions[k], noise))
+        path.append(_between(poses[k - 1 : k + 1], motions[k], inverses[k], noise))
     found = np.concatenate(path)
     found[:, 2] = wrap_angle(found[:, 2])
     return found
 
 
 def _between(
-    first: Array, last: Array, motion: OdometryBetween, noise: MotionNoise
+    ends: Array, motion: OdometryBetween, inverse: Array, noise: MotionNoise
 ) -> Array:
-    """Return the poses after the readings of one motion, shape (P, 3)."""
+    """Return the poses after the readings of one motion, shape (P, 3).
+
+    ``ends`` are its first and last pose, (2, 3), and ``inverse`` is Σ⁻¹.
+    """
+    first, last = ends
     if len(motion.steps) == 1:
-        return last[None]
+        return np.asarray(last[None])
     turn = pose_rotation(first[2])
     gap = turn.T @ (last - first) - motion.increment
     gap[2] = wrap_angle(gap[2])
-    pull = np.linalg.pinv(motion.covariance, hermitian=True) @ gap
-    path = np.empty((len(motion.steps), 3))
+    pull = inverse @ gap
+    path, onward = np.empty((len(motion.steps), 3)), np.eye(3)
     for i, (pose, covariance) in enumerate(_along(motion.steps, noise)):
-        onward = np.eye(3)
         onward[0, 2] = -(motion.increment[1] - pose[1])
         onward[1, 2] = motion.increment[0] - pose[0]
         path[i] = first + turn @ (pose + covariance @ onward.T @ pull)

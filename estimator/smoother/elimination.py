@@ -14,9 +14,13 @@ q = G δ_{k−1} + s, with noise w ~ N(0, I), is eliminated by minimising over w
 
 and pose k by writing q in terms of pose k − 1.  E is never inverted: directions
 without noise, and a start that is known, are exact.  What remains, C and η, is the
-Schur complement of the landmarks.  :func:`substitute` goes back, forwards in time.
-This is the backward information filter of a two-pass smoother [1]_ with the landmarks
-as parameters.
+Schur complement of the landmarks.  Once δ_l is known, a second pass with λ − B δ_l in
+place of λ needs no B, and :func:`substitute` goes back, forwards in time.  This is the
+backward information filter of a two-pass smoother [1]_ with the landmarks as
+parameters.
+
+The rows W of all poses would be the largest arrays of a smoother.  So the drive is
+eliminated in parts of `PART` poses, and each part can be eliminated once more.
 
 References
 ----------
@@ -26,12 +30,13 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import log1p, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Array
+from ...arrays import Array, IntArray
 from ...jit import jit, njit_internal
 from ..kernels.scan_update import as_rules, variances
 from ..models.bearing_range import (
@@ -44,17 +49,8 @@ from ..models.bearing_range import (
 from ..models.rigid_motion import composed_jit
 from .drive import DriveArrays
 
-
-class Elimination(NamedTuple):
-    """What eliminating N poses leaves, for the way back."""
-
-    curvatures: Array  # (N, 3, 3) Λ
-    slopes: Array  # (N, 3) λ
-    gains: Array  # (N, 3, 3) U
-    shifts: Array  # (N, 3) s
-    rows: Array  # (N, 3, 2n) W
-    blocks: Array  # (n, 2, 2) C before Wᵀ W is subtracted
-    right: Array  # (2n,) η
+#: Poses of a part.
+PART = 256
 
 
 class System(NamedTuple):
@@ -65,33 +61,57 @@ class System(NamedTuple):
     coupling: Array  # (3, 2n)
 
 
+class Elimination(NamedTuple):
+    """What eliminating N poses in p parts leaves, for the way back."""
+
+    curvatures: Array  # (N, 3, 3) Λ
+    slopes: Array  # (N, 3) λ
+    gains: Array  # (N, 3, 3) U
+    shifts: Array  # (N, 3) s
+    rows: Array  # (PART, 3, 2n) W of the last part taken
+    blocks: Array  # (n, 2, 2) C before Wᵀ W is subtracted
+    right: Array  # (2n,) η
+    ends: System  # of the poses behind each part, one after the other along axis 0
+
+
 def new_elimination(poses: int, landmarks: int) -> Elimination:
-    """Allocate room; rows beyond the landmarks that a pose meets stay zero."""
+    """Allocate room."""
+    parts, size = -(-poses // PART), 2 * landmarks
     return Elimination(
         np.zeros((poses, 3, 3)),
         np.zeros((poses, 3)),
         np.zeros((poses, 3, 3)),
         np.zeros((poses, 3)),
-        np.zeros((poses, 3, 2 * landmarks)),
+        np.zeros((min(poses, PART), 3, size)),
         np.zeros((landmarks, 2, 2)),
-        np.zeros(2 * landmarks),
+        np.zeros(size),
+        System(
+            np.zeros((parts, 3, 3)), np.zeros((parts, 3)), np.zeros((parts, 3, size))
+        ),
     )
 
 
 @jit
 def eliminate(
-    poses: Array,
-    landmarks: Array,
+    part: int,
+    estimate: tuple[Array, Array],
+    landmark_step: Array,
     drive: DriveArrays,
     stds: Array,
     robust: tuple[float, float],
     damping: float,
     out: Elimination,
 ) -> None:
-    """Linearise at poses (N, 3) and landmarks (2n,), and eliminate the poses.
+    """Linearise at poses (N, 3) and landmarks (2n,), and eliminate a part of the poses.
+
+    The parts are taken from the last one to the first.  A part may be taken again.
 
     Parameters
     ----------
+    part : int
+        Poses part · `PART` and the next ones.
+    landmark_step : ndarray, shape (2n,)
+        δ_l, where it is known, else zeros.  ``drive`` has the widths 0 then.
     stds : ndarray, shape (M, 2)
         Those of each reading.
     robust
@@ -99,19 +119,18 @@ def eliminate(
     damping : float
         Levenberg-Marquardt's: the part by which readings count more against a step.
     out
-        Filled.
+        Filled; C and η are added to.
     """
-    curvature, slope = np.zeros((3, 3)), np.zeros(3)
-    coupling = np.zeros((3, len(landmarks)))
+    poses, first, ends = estimate[0], part * PART, out.ends
+    curvature, slope = ends.curvature[part].copy(), ends.slope[part].copy()
+    coupling = ends.coupling[part].copy()
     system = System(curvature, slope, coupling)
     noise, room = np.empty((3, 3)), np.empty((5, 3, 3))
-    out.blocks[:] = 0.0
-    out.right[:] = 0.0
-    for k in range(len(poses) - 1, -1, -1):
-        width = drive.widths[k]
+    for k in range(min(first + PART, len(poses)) - 1, first - 1, -1):
+        width, rows = drive.widths[k], out.rows[k - first]
         before = curvature[0, 0], curvature[1, 1], curvature[2, 2]
         for j in range(drive.firsts[k], drive.firsts[k + 1]):
-            _absorb((k, j), poses, landmarks, drive, stds, robust, system, out)
+            _absorb((k, j), estimate, landmark_step, drive, stds, robust, system, out)
         for j in range(drive.fixes.firsts[k], drive.fixes.firsts[k + 1]):
             _absorb_pose(poses[k], drive, j, robust, system, room[0])
         for i in range(3):
@@ -121,11 +140,15 @@ def eliminate(
                 out.curvatures[k, i, j] = curvature[i, j]
         _noise_in_world(poses, drive, k, noise, out.shifts[k])
         _minimise(curvature, slope, noise, room, out.gains[k])
-        _minimise_landmarks(coupling, width, k, room, out)
+        _minimise_landmarks(coupling, width, k, room, rows, out)
         _shift(system, width, k, out)
         if k > 0:
             turned = poses[k - 1, 1] - poses[k, 1], poses[k, 0] - poses[k - 1, 0]
             _change_pose(system, width, turned)
+    if part > 0:
+        ends.curvature[part - 1], ends.slope[part - 1] = curvature, slope
+        ends.coupling[part - 1] = coupling
+        return
     for i in range(len(out.blocks)):
         for axis in range(2):
             out.blocks[i, axis, axis] *= 1 + damping
@@ -134,16 +157,19 @@ def eliminate(
 @njit_internal
 def _absorb(
     where: tuple[int, int],
-    poses: Array,
-    landmarks: Array,
+    estimate: tuple[Array, Array],
+    landmark_step: Array,
     drive: DriveArrays,
     stds: Array,
     robust: tuple[float, float],
     system: System,
     out: Elimination,
 ) -> None:
-    """Add reading j of pose k: Hᵀ Q⁻¹ H and Hᵀ Q⁻¹ ν, weighted by a robust kernel."""
-    k, j = where
+    """Add reading j of pose k: Hᵀ Q⁻¹ H and Hᵀ Q⁻¹ ν, weighted by a robust kernel.
+
+    ν is what the step of the landmarks leaves of the innovation.
+    """
+    (k, j), (poses, landmarks) = where, estimate
     curvature, slope, coupling = system
     std, std_below, c = stds[j, 0], stds[j, 1], drive.columns[j]
     nu, nu_below = innovation(poses, landmarks, drive, k, j)
@@ -152,6 +178,8 @@ def _absorb(
     squared = (nu / std) ** 2 + (nu_below / std_below) ** 2
     weight = robust_weight(squared, robust[0], robust[1])
     a, b = weight / std**2, weight / std_below**2
+    nu -= ax * landmark_step[c] + ay * landmark_step[c + 1]
+    nu_below -= bx * landmark_step[c] + by * landmark_step[c + 1]
     xx, yy = a * ax * ax + b * bx * bx, a * ay * ay + b * by * by
     xy = a * ax * ay + b * bx * by
     ux, uy = a * ax * nu + b * bx * nu_below, a * ay * nu + b * by * nu_below
@@ -251,10 +279,11 @@ def _minimise(
 
 @njit_internal
 def _minimise_landmarks(
-    coupling: Array, width: int, k: int, room: Array, out: Elimination
+    coupling: Array, width: int, k: int, room: Array, rows: Array, out: Elimination
 ) -> None:
-    """Write W; B ← Tᵀ B, η ← η − Wᵀ Uᵀ λ."""
-    T, U, rows = room[0], out.gains[k], out.rows[k]
+    """Write W, zero beyond the width; B ← Tᵀ B, η ← η − Wᵀ Uᵀ λ."""
+    T, U = room[0], out.gains[k]
+    rows[:, width:] = 0.0
     u0, u1, u2 = room[4, 0, 0], room[4, 0, 1], room[4, 0, 2]
     for c in range(width):
         x, y, z = coupling[0, c], coupling[1, c], coupling[2, c]
@@ -294,19 +323,16 @@ def _change_pose(system: System, width: int, turned: tuple[float, float]) -> Non
 
 
 # --------------------------------------------------------------------------------------
-# Go back over the eliminated poses, forwards in time, with the step δ_l of the
-# landmarks::
+# Go back over the eliminated poses, forwards in time.  With the λ of the second pass::
 #
-#     δ_k = q − U (Uᵀ (Λ q − λ) + W δ_l),    q = G δ_{k−1} + s
+#     δ_k = q − U Uᵀ (Λ q − λ),    q = G δ_{k−1} + s
 #
 # and the covariance of pose k follows from that of pose k − 1.
 
 
 @jit
-def substitute(
-    poses: Array, drive: DriveArrays, landmark_step: Array, out: Elimination
-) -> Array:
-    """Return the new poses, shape (N, 3), given the step of the landmarks.
+def substitute(poses: Array, drive: DriveArrays, out: Elimination) -> Array:
+    """Return the new poses, shape (N, 3), after the pass with the landmarks' step.
 
     They are driven: q is taken from the new pose k − 1, and the noise found acts in its
     frame.  A direction without noise therefore has none, whatever the step.
@@ -322,30 +348,19 @@ def substitute(
             turn = before[2] - poses[k - 1, 2]
         q[0], q[1] = x - poses[k, 0], y - poses[k, 1]
         q[2] = wrap_angle_jit(heading - poses[k, 2])
-        _pull(k, q, landmark_step, out, u)
         U = out.gains[k]
+        u[:] = 0.0
+        for a in range(3):
+            force = -out.slopes[k, a]
+            for j in range(3):
+                force += out.curvatures[k, a, j] * q[j]
+            for i in range(3):
+                u[i] += U[a, i] * force
         dx = -(U[0, 0] * u[0] + U[0, 1] * u[1] + U[0, 2] * u[2])
         dy = -(U[1, 0] * u[0] + U[1, 1] * u[1] + U[1, 2] * u[2])
         new[k, 0], new[k, 1], _, _, _ = composed_jit(x, y, turn, dx, dy, 0.0)
         new[k, 2] = heading - (U[2, 0] * u[0] + U[2, 1] * u[1] + U[2, 2] * u[2])
     return new
-
-
-@njit_internal
-def _pull(
-    k: int, q: Array, landmark_step: Array, out: Elimination, pull: Array
-) -> None:
-    """Write Uᵀ (Λ q − λ) + W δ_l."""
-    pull[:] = 0.0
-    for i in range(3):
-        for c in range(len(landmark_step)):
-            pull[i] += out.rows[k, i, c] * landmark_step[c]
-    for a in range(3):
-        force = -out.slopes[k, a]
-        for j in range(3):
-            force += out.curvatures[k, a, j] * q[j]
-        for i in range(3):
-            pull[i] += out.gains[k, a, i] * force
 
 
 @jit
@@ -355,10 +370,7 @@ def conditionals(poses: Array, out: Elimination) -> tuple[Array, Array]:
     ::
 
         x_k = Φ_k x_{k−1} − U_k W_k l + U_k n,    n ~ N(0, I),    Φ_k = T_k G_k
-        Π_k = Φ_k Π_{k−1} Φ_kᵀ + K_k,    Ψ_k = Φ_k Ψ_{k−1} − U_k W_k
-
-    so that the error of pose k is Ψ_k e_l plus independent noise of covariance Π_k.
-    Ψ overwrites the rows W.
+        Π_k = Φ_k Π_{k−1} Φ_kᵀ + K_k
 
     Returns
     -------
@@ -375,28 +387,81 @@ def conditionals(poses: Array, out: Elimination) -> tuple[Array, Array]:
         right_transposed(U, U, K)
         multiply(K, out.curvatures[k], phi)
         complement(phi)
-        rows = out.rows[k]
-        for c in range(rows.shape[1]):
-            x, y, z = rows[0, c], rows[1, c], rows[2, c]
-            for i in range(3):
-                rows[i, c] = -(U[i, 0] * x + U[i, 1] * y + U[i, 2] * z)
         if k > 0:
             tx, ty = poses[k - 1, 1] - poses[k, 1], poses[k, 0] - poses[k - 1, 0]
-            before = out.rows[k - 1]
             for i in range(3):
                 phi[i, 2] += tx * phi[i, 0] + ty * phi[i, 1]
-                for c in range(rows.shape[1]):
-                    rows[i, c] += (
-                        phi[i, 0] * before[0, c]
-                        + phi[i, 1] * before[1, c]
-                        + phi[i, 2] * before[2, c]
-                    )
             multiply(phi, covariances[k - 1], moved)
             right_transposed(moved, phi, covariances[k])
         for i in range(3):
             for j in range(3):
                 covariances[k, i, j] += K[i, j]
     return covariances, transitions
+
+
+@jit
+def fill_sensitivity(
+    part: int, before: Array, transitions: Array, out: Elimination
+) -> None:
+    """Replace the rows W of a part by Ψ_k = Φ_k Ψ_{k−1} − U_k W_k.
+
+    The error of pose k is Ψ_k e_l plus independent noise of covariance Π_k.  ``before``
+    is Ψ of the pose before the part, zeros where there is none.
+    """
+    first = part * PART
+    for k in range(first, min(first + PART, len(transitions))):
+        U, phi, rows = out.gains[k], transitions[k], out.rows[k - first]
+        for c in range(rows.shape[1]):
+            x, y, z = rows[0, c], rows[1, c], rows[2, c]
+            a, b, turn = before[0, c], before[1, c], before[2, c]
+            for i in range(3):
+                rows[i, c] = -(U[i, 0] * x + U[i, 1] * y + U[i, 2] * z)
+                rows[i, c] += phi[i, 0] * a + phi[i, 1] * b + phi[i, 2] * turn
+        before = rows
+
+
+class Sensitivity:
+    """Ψ of any poses, computed for one part after the other.
+
+    Parameters
+    ----------
+    poses : ndarray, shape (N, 3)
+        Where they were eliminated.
+    out : Elimination
+        What that has left.
+    again : callable
+        Eliminates one part once more.
+    """
+
+    def __init__(
+        self, poses: Array, out: Elimination, again: Callable[[int], None]
+    ) -> None:
+        #: Π and Φ of `conditionals`.
+        self.given_map, self.transitions = conditionals(poses, out)
+        self._out, self._again = out, again
+        self._before = [np.zeros_like(out.rows[0])]  # Ψ of the pose before each part
+        self._part = -1  # whose Ψ the rows hold
+
+    def of(self, poses: IntArray) -> Array:
+        """Return Ψ of some poses, shape (p, 3, 2n)."""
+        parts, rows = np.divmod(poses, PART)
+        found = np.empty((len(poses), *self._out.rows.shape[1:]))
+        for part in np.unique(parts).tolist():
+            for k in range(min(part, len(self._before) - 1), part + 1):
+                self._fill(k)
+            found[parts == part] = self._out.rows[rows[parts == part]]
+        return found
+
+    def _fill(self, part: int) -> None:
+        """Fill the rows with Ψ of a part; that of the pose before it is known."""
+        if part == self._part:
+            return
+        self._part = -1
+        self._again(part)
+        fill_sensitivity(part, self._before[part], self.transitions, self._out)
+        if part + 1 == len(self._before):
+            self._before.append(self._out.rows[-1].copy())
+        self._part = part
 
 
 # --------------------------------------------------------------------------------------

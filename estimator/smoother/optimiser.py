@@ -7,6 +7,7 @@ landmarks out of local minima.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,13 +72,6 @@ class Solution(NamedTuple):
     is_damped: bool
 
 
-class Minimum(NamedTuple):
-    """The system of a solution, linearised there."""
-
-    elimination: elimination.Elimination
-    information: Array  # of the landmarks, shape (2n, 2n)
-
-
 class _Iterate:
     """An estimate on its way to the solution."""
 
@@ -112,6 +106,8 @@ class Optimiser:
         self._drive, self._sensor = drive, noise.sensor
         poses, landmarks = len(drive.increments), int(drive.widths[0]) // 2
         self._room = elimination.new_elimination(poses, landmarks)
+        self._parts = range(len(self._room.ends.slope))[::-1]
+        self._still = np.zeros(2 * landmarks)  # a step of the landmarks
         rules = noise.rules
         self._rule_values = np.array(rules)
         self._robust = noise.kind, noise.scale
@@ -183,10 +179,17 @@ class Optimiser:
             is_found &= self._relocate(state) == 0
         return is_found
 
-    def linearised(self, solution: Solution) -> Minimum:
-        """Return the system of a solution, which the next call overwrites."""
+    def linearised(self, solution: Solution) -> Array:
+        """Return the information of the landmarks at a solution, (2n, 2n)."""
         stds = self.reading_stds(solution.estimate)
-        return Minimum(self._room, self.linearise(solution.estimate, stds))
+        return self._linearise(solution.estimate, stds, 0.0)
+
+    def sensitivity(self, solution: Solution) -> elimination.Sensitivity:
+        """Return that of the poses to the landmarks, after :meth:`linearised`."""
+        estimate, room = solution.estimate, self._room
+        stds = self.reading_stds(estimate)
+        again = partial(self._eliminate, self._drive, estimate, stds, 0.0, self._still)
+        return elimination.Sensitivity(estimate.poses, room, again)
 
     def reading_stds(self, estimate: Estimate) -> Array:
         """Return (σβ, σr) of each reading, shape (M, 2), at its expected range."""
@@ -199,17 +202,33 @@ class Optimiser:
         total = for_sensor(elimination.total_cost, self._sensor)
         return float(total(*estimate, self._drive, stds, *self._robust))
 
-    def linearise(self, estimate: Estimate, stds: Array, damping: float = 0.0) -> Array:
+    def _linearise(self, estimate: Estimate, stds: Array, damping: float) -> Array:
         """Eliminate the poses; return the information of the landmarks, (2n, 2n)."""
-        room, drive = self._room, self._drive
-        eliminate = for_sensor(elimination.eliminate, self._sensor)
-        eliminate(*estimate, drive, stds, self._robust, damping, room)
-        rows = room.rows.reshape(-1, len(room.right))
-        information = -(rows.T @ rows)
-        n = len(room.blocks)
+        room, drive, n = self._room, self._drive, len(self._room.blocks)
+        room.blocks[:], room.right[:], information = 0.0, 0.0, np.zeros((2 * n, 2 * n))
+        for part in self._parts:
+            self._eliminate(drive, estimate, stds, damping, self._still, part)
+            first = part * elimination.PART
+            rows = room.rows[: len(estimate.poses) - first].reshape(-1, 2 * n)
+            met = rows[:, : drive.widths[first]]
+            information[: met.shape[1], : met.shape[1]] -= met.T @ met
         at = np.arange(n)
         information.reshape(n, 2, n, 2)[at, :, at, :] += room.blocks
         return information
+
+    def _eliminate(
+        self,
+        drive: DriveArrays,
+        estimate: Estimate,
+        stds: Array,
+        damping: float,
+        landmark_step: Array,
+        part: int,
+    ) -> None:
+        """Eliminate one part of the poses."""
+        rest = drive, stds, self._robust, damping, self._room
+        eliminate = for_sensor(elimination.eliminate, self._sensor)
+        eliminate(part, tuple(estimate), landmark_step, *rest)
 
     def _descend(self, state: _Iterate) -> None:
         """Take one step that does not raise the cost."""
@@ -245,12 +264,12 @@ class Optimiser:
         state.cost = self.cost(state.estimate, state.stds)
 
     def _step(self, estimate: Estimate, stds: Array, damping: float) -> Estimate:
-        information = self.linearise(estimate, stds, damping)
-        factor = factorised(information)
+        factor = factorised(self._linearise(estimate, stds, damping))
         landmark_step = cho_solve(factor, self._room.right)
-        poses = elimination.substitute(
-            estimate.poses, self._drive, landmark_step, self._room
-        )
+        alone = self._drive._replace(widths=np.zeros_like(self._drive.widths))
+        for part in self._parts:
+            self._eliminate(alone, estimate, stds, damping, landmark_step, part)
+        poses = elimination.substitute(estimate.poses, self._drive, self._room)
         return Estimate(poses, estimate.landmarks + landmark_step)
 
 

@@ -261,7 +261,7 @@ class _Search:
         at = Estimate(poses.copy(), places[rows][order].ravel())
         try:
             found = optimiser.minimise(at, TOLERANCE, ITERATIONS, strict=False)
-            information = optimiser.linearised(found).information
+            information = optimiser.linearised(found)
             inverse = np.linalg.inv(information)
         except np.linalg.LinAlgError:
             return None

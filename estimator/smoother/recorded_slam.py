@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -171,14 +172,22 @@ class RecordedSlam(interface.FilterWrapper):
             If the state holds no drive, or the filter refuses it.
         """
         saved_states.refuse_other_state(state, [HISTORY])
-        history = state[HISTORY]
-        if not _is_history(history):
+        if not _is_history(history := state[HISTORY]):
             raise ValueError(
                 f"state['{HISTORY}'] must be the events of a drive, got {history!r}"
             )
+        self._load(state, self._slam.load_state_dict)
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state that this process has saved, without checks."""
+        self._load(state, partial(interface.restore, self._slam))
+
+    def _load(
+        self, state: Mapping[str, Any], load: Callable[[Mapping[str, Any]], None]
+    ) -> None:
         with changing(self, "load_state_dict", anew=True):
-            self._slam.load_state_dict(state)
-            self._last, self._report = history.item(), interface.UpdateReport()
+            load(state)
+            self._last, self._report = state[HISTORY].item(), interface.UpdateReport()
 
     def snapshot(self) -> tuple[Any, Event | None, interface.UpdateReport]:
         """Return the present state for :meth:`resume`."""

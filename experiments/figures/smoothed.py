@@ -34,7 +34,10 @@ def smoothed_figure(smoothed: SmoothedLog) -> Figure:
     accuracy = path_accuracy(smoothed.log, trace.t, smoothed.poses)
     truth, landmarks = _truth_beside(smoothed, accuracy)
     chosen = np.arange(0, len(drive.poses), -(-len(drive.poses) // _MOST_POSES))
-    poses, covariances = drive.poses[chosen, :2], drive.pose_covariances[chosen, :2, :2]
+    poses, covariances = (
+        drive.poses[chosen, :2],
+        drive.covariances_of(chosen)[:, :2, :2],
+    )
     paths = [smoothed.poses[:, :2], trace.poses[:, :2], drive.landmarks]
     limits = box_around(
         np.concatenate([*paths, truth, landmarks]),

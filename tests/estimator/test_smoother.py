@@ -29,6 +29,7 @@ from slamgym.estimator.smoother import (
     smooth,
 )
 from slamgym.estimator.smoother.drive import Sightings, landmark_order
+from slamgym.estimator.smoother.elimination import PART
 from slamgym.estimator.smoother.optimiser import (
     Estimate,
     _Iterate,
@@ -272,16 +273,18 @@ def test_marginals_are_parts_of_the_joint_covariance(example):
     assert belief.pose.tolist() == made.poses[-1].tolist()
 
 
-def test_a_linear_drive_is_smoothed_as_rauch_tung_and_striebel_do():
+@pytest.mark.parametrize("steps", [15, 2 * PART, 2 * PART + 90])
+def test_a_linear_drive_is_smoothed_as_rauch_tung_and_striebel_do(steps):
     rng = np.random.default_rng(1)
-    steps, motion_std, range_std, places = 15, 0.3, 0.1, np.array([40.0, 50.0])
+    motion_std, range_std, places = 0.3, 0.1, np.array([40.0, 50.0])
     made = Drive((motion_std, 0, 0), (0.1, range_std), initial_pose_std=(0.5, 0, 0))
     x, readings, moves = 0.5 * rng.standard_normal(), [], rng.uniform(0.2, 1.0, steps)
+    moves[1::2] *= -1
     for k in range(steps):
         if k:
             x += moves[k] + motion_std * rng.standard_normal()
             made.predict((moves[k], 0.0))
-        seen = [0] if k % 3 else [0, 1]
+        seen = [0] if k % 3 or k > 0.6 * steps else [0, 1]
         ranges = places[seen] - x + range_std * rng.standard_normal(len(seen))
         made.update(np.column_stack([np.zeros(len(seen)), ranges]), seen)
         readings.append((seen, ranges))
@@ -291,10 +294,15 @@ def test_a_linear_drive_is_smoothed_as_rauch_tung_and_striebel_do():
     )
     assert smoothed.poses[:, 0] == pytest.approx(means[:, 0], abs=1e-11)
     assert smoothed.landmarks[:, 0] == pytest.approx(means[-1, 1:], abs=1e-11)
-    for k in range(steps):
+    every = rng.permutation(steps)
+    for k in every[:100]:
         part = smoothed.covariance([k])[np.ix_([0, 3, 5], [0, 3, 5])]
         assert part == pytest.approx(covariances[k], rel=1e-11, abs=1e-12)
     assert not smoothed.poses[:, 1:].any()
+    found, expected = smoothed.pose_covariances, np.array(covariances)
+    assert found[:, 0, 0] == pytest.approx(expected[:, 0, 0], rel=1e-11)
+    assert smoothed.covariances_of(every) == pytest.approx(found[every], rel=1e-11)
+    assert smoothed.covariances_of([-1])[0].tolist() == found[-1].tolist()
 
 
 def rauch_tung_striebel(readings, moves, start_std, motion_std, range_std):
@@ -706,8 +714,10 @@ def test_a_filter_that_goes_back_takes_its_drive_back():
     other = SmoothingSlam(**NOISE)
     other.load_state_dict(slam.state_dict())
     assert other.smoothed().poses.tolist() == [[1.0, 0.0, 0.0]]
-    slam.load_state_dict(before)
-    assert repr(slam.smoothed()) == repr(expected)
+    for load in (slam.load_state_dict, slam.restore):
+        load(before)
+        assert repr(slam.smoothed()) == repr(expected)
+        slam.predict((0.5, 0.0))
 
 
 def test_recording_does_not_change_the_filter():
