@@ -29,6 +29,7 @@ from scipy.sparse import csc_array
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit_in_place
 from .multifrontal import (
+    GrowingCovariance,
     InformationMatrix,
     Node,
     add_update,
@@ -435,9 +436,9 @@ class SubmapElimination:
         """Return A H⁻¹ Aᵀ, shape (v, v), for a sparse A, shape (v, N)."""
         return marginal_covariance(self._nodes, rows)[0]
 
-    def inverse(self, more: int) -> tuple[Array, IntArray]:
-        """Return H⁻¹ with room for more variables, and the row of each unknown."""
-        return inverse(self._nodes, len(self._solved), more)
+    def inverse(self, rows: IntArray, size: int) -> GrowingCovariance:
+        """Return H⁻¹ with the row of each unknown, and room up to a size."""
+        return inverse(self._nodes, rows, size)
 
     @property
     def nbytes(self) -> int:

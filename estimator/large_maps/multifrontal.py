@@ -160,7 +160,47 @@ def marginal_covariance(
     return total, live
 
 
-def inverse(nodes: Sequence[Node], size: int, more: int = 0) -> tuple[Array, IntArray]:
+class GrowingCovariance:
+    """Covariance of variables that are added one group after another.
+
+    A variable's row is its number, and its column its place in the order of adding:
+    products then read whole blocks, and the rows are in the order that is wanted.
+
+    Parameters
+    ----------
+    size : int
+        Number of variables.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.matrix = np.empty((size, size))
+        #: The column of each variable.
+        self.places = np.empty(size, dtype=np.int64)
+        self._added = np.empty(size, dtype=np.int64)
+        self._count = 0
+
+    def append(self, new: IntArray, at: IntArray, T: Array, noise: Array) -> None:
+        """Add variables y = T x + w.
+
+        Parameters
+        ----------
+        new, at : ndarray, shapes (p,) and (r,)
+            Numbers of y, and of x, which have been added before.
+        T : ndarray, shape (p, r)
+        noise : ndarray, shape (p, p)
+            Covariance of w.
+        """
+        done, own = self._count, slice(self._count, self._count + len(new))
+        rows = T @ self.matrix[at, :done]
+        P = noise + rows[:, self.places[at]] @ T.T
+        self.matrix[new, :done] = rows
+        self.matrix[self._added[:done], own] = rows.T
+        self.matrix[new, own] = (P + P.T) / 2
+        self.places[new] = np.arange(own.start, own.stop)
+        self._added[own], self._count = new, own.stop
+
+
+def inverse(nodes: Sequence[Node], rows: IntArray, size: int) -> GrowingCovariance:
     """Return H⁻¹ from nodes that eliminate all unknowns, the last node first.
 
     With T = L⁻ᵀ X, the rows of a node follow from those of its rest, for all unknowns o
@@ -172,47 +212,17 @@ def inverse(nodes: Sequence[Node], size: int, more: int = 0) -> tuple[Array, Int
     ----------
     nodes : sequence of Node
         Children first.
-    size, more : int
-        Number of unknowns N, and of the variables that :func:`append` adds.
-
-    Returns
-    -------
-    covariance : ndarray, shape (N + more, N + more)
-        Σ, with the unknowns in another order. The last ``more`` rows and columns are
-        not set.
-    places : ndarray, shape (N,)
+    rows : ndarray, shape (N,)
         The row of each unknown.
+    size : int
+        Number of unknowns, and of the variables that the caller will add.
     """
-    covariance, places = np.empty((size + more,) * 2), np.empty(size, dtype=np.int64)
-    done = 0
+    found = GrowingCovariance(size)
     for node in reversed(nodes):
         root = solved(node.lower, np.eye(len(node.own)))
         T = solved(node.lower, node.response, transposed=True)
-        append(covariance, done, places[node.rest], -T, root.T @ root)
-        places[node.own] = done + np.arange(len(node.own))
-        done += len(node.own)
-    return covariance, places
-
-
-def append(covariance: Array, done: int, at: IntArray, T: Array, noise: Array) -> None:
-    """Add variables y = T x + w to the first variables of a covariance, in place.
-
-    Parameters
-    ----------
-    covariance : ndarray
-        Its first ``done`` rows and columns are set. Those of y are written after them.
-    done : int
-        Number of variables so far.
-    at : ndarray, shape (r,)
-        Rows of x.
-    T : ndarray, shape (p, r)
-    noise : ndarray, shape (p, p)
-        Covariance of w.
-    """
-    rows, new = T @ covariance[at, :done], slice(done, done + len(T))
-    own = noise + rows[:, at] @ T.T
-    covariance[new, :done], covariance[:done, new] = rows, rows.T
-    covariance[new, new] = (own + own.T) / 2
+        found.append(rows[node.own], rows[node.rest], -T, root.T @ root)
+    return found
 
 
 def solved(lower: Array, right: Array, *, transposed: bool = False) -> Array:

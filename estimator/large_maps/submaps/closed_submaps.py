@@ -28,6 +28,7 @@ from . import joining
 from .factor import Gaussian, retract
 from .store import LostSubmapError, Submap, SubmapStore
 
+NO_SLOTS: IntArray = np.empty(0, dtype=np.int64)
 ROUGHLY_CONVERGED = 0.1  # decrement at which to stop while computing initial frames
 
 
@@ -62,7 +63,8 @@ class ClosedSubmaps:
         self.slots: set[int] = set().union(*(s.slots.tolist() for s in summaries))
         self._initialisation = initialisation or joining.FrameInitialisation()
         self._joined: joining.JoinedMap | None = None
-        self._whole: tuple[IntArray, Gaussian] | None = None
+        #: Landmarks of the last whole map, and their marginal if it is cached.
+        self._whole: tuple[IntArray, Gaussian | None] = NO_SLOTS, None
 
     def __len__(self) -> int:
         return len(self.summaries)
@@ -72,7 +74,7 @@ class ClosedSubmaps:
         """Memory of the submaps and the joined map [bytes]."""
         summaries = sum(summary.nbytes for summary in self.summaries)
         joined = 0 if self._joined is None else self._joined.nbytes
-        whole = 0 if self._whole is None else self._whole[1].covariance.nbytes
+        whole = 0 if self._whole[1] is None else self._whole[1].covariance.nbytes
         return self.store.nbytes + summaries + joined + whole
 
     def load(self, index: int) -> Submap:
@@ -138,15 +140,21 @@ class ClosedSubmaps:
         known : ndarray, shape (J + 1, 3)
             As for :meth:`join`.
         remember : bool
-            Whether to cache the result until a submap is appended.
+            Whether to cache the result, from the second call for these landmarks on,
+            until a submap is appended.
+
+        The caller may overwrite the covariance.
         """
         if not self.summaries:
             return Gaussian(known[0], np.zeros((3, 3)))
-        if not remember:
+        before, found = self._whole
+        if not remember or not np.array_equal(before, slots):
+            self._whole = (slots, None) if remember else self._whole
             return self.join(known).marginal(slots)
-        if self._whole is None or not np.array_equal(self._whole[0], slots):
-            self._whole = slots, self.join(known).marginal(slots)
-        return self._whole[1]
+        if found is None:
+            found = self.join(known).marginal(slots)
+            self._whole = slots, found
+        return found._replace(covariance=found.covariance.copy())
 
     def near(
         self, slots: IntArray, count: int, region: Region, known: Array
@@ -172,7 +180,7 @@ class ClosedSubmaps:
     def discard_frames(self) -> None:
         """Discard the cached frames and the joined map."""
         self._initialisation = joining.FrameInitialisation()
-        self._joined = self._whole = None
+        self._joined, self._whole = None, (NO_SLOTS, None)
 
     def _refined(self, first: int, last: int, frames: Array) -> Array:
         """Return the frames of some submaps, joined with a coarse tolerance."""

@@ -247,14 +247,38 @@ class Gaussian(NamedTuple):
 
     mean: Array  # (x, y, θ, l1x, l1y, …), shape (3 + 2n,)
     covariance: Array  # (3 + 2n, 3 + 2n)
-    #: The row of the covariance of each entry of the mean, if it has another order.
+    #: The column of each entry of the mean, if there are more than these, in any order.
     order: IntArray | None = None
 
     def block(self, rows: IntArray, columns: slice = slice(None)) -> Array:
         """Return rows of the covariance, in the order of the mean."""
         if self.order is None:
             return self.covariance[rows, columns]
-        return self.covariance[self.order[rows]].take(self.order[columns], axis=1)
+        return self.covariance[rows].take(self.order[columns], axis=1)
+
+    def taken(self, size: int) -> Array:
+        """Return an array of this size that begins with the covariance.
+
+        A covariance with an order is lost, because its memory is used.
+        """
+        if self.order is not None and size <= len(self.covariance):
+            memory = self.covariance.reshape(-1)[: size**2].reshape(size, size)
+            row = np.empty(len(self.covariance))
+            _sort_columns(self.covariance, self.order, row, memory)
+            return memory
+        count, array = len(self.mean), np.empty((size, size))
+        array[:count, :count] = self.block(np.arange(count))
+        return array
+
+
+@jit_in_place
+def _sort_columns(matrix: Array, order: IntArray, row: Array, found: Array) -> None:
+    """Write rows with their entries in an order; both begin at the same address."""
+    for i in range(len(order)):
+        for j in range(len(row)):
+            row[j] = matrix[i, j]
+        for j in range(len(order)):
+            found[i, j] = row[order[j]]
 
 
 def times(factor: complex, rows: Array) -> Array:

@@ -29,11 +29,9 @@ from ...models.rigid_motion import (
 )
 from ..multifrontal import AT_ONCE, pairs
 from ..undo import Undo, attributes, undo_all
-from .closed_submaps import ClosedSubmaps, Region
+from .closed_submaps import NO_SLOTS, ClosedSubmaps, Region
 from .factor import Gaussian, retract, times, with_uncertain_start
 from .store import LandmarkIndex, Submap, link_name
-
-NO_SLOTS: IntArray = np.empty(0, dtype=np.int64)
 
 
 class SubmapGraph:
@@ -325,8 +323,9 @@ def _composed(
         T[:, 5] += T[:, 3:] @ state_of(1j * points_of(own), 0.0)
     at = np.r_[0:3, cut : cut + len(own)]
     rows = T @ (local.covariance - V[:, at].T @ V)
-    covariance = np.empty((2 * len(points) + 1,) * 2)
-    _fill_map(covariance, world, lever, V)
+    W = _changes(world, lever, V)
+    covariance = world.taken(2 * len(points) + 1)
+    _change_map(covariance, W)
     few = np.r_[0:3, cut : len(covariance)]
     covariance[few, 3:cut] = rows[:, 3:cut] + np.outer(rows[:, 2], lever[3:])
     covariance[3:cut, few] = covariance[few, 3:cut].T
@@ -336,8 +335,8 @@ def _composed(
     return Gaussian(state_of(points, float(pose[2])), covariance)
 
 
-def _fill_map(covariance: Array, world: Gaussian, lever: Array, V: Array) -> None:
-    """Write the covariance of the map's landmarks after the fusion.
+def _changes(world: Gaussian, lever: Array, V: Array) -> Array:
+    """Return u, d and W, rows that change the covariance of the map by the fusion.
 
     ::
 
@@ -345,17 +344,20 @@ def _fill_map(covariance: Array, world: Gaussian, lever: Array, V: Array) -> Non
 
     The turn of the map about its origin adds d = J (q − q before) to the derivatives.
     """
-    cut, heading = len(lever), world.block(np.array([2]))[0]
+    heading = world.block(np.array([2]))[0]
     d = lever - state_of(1j * points_of(world.mean), 0.0)
     u = heading + d * (heading[2] / 2)
-    W = np.vstack([u, d, V[:, :cut] + np.outer(V[:, 2], lever)])
-    left = np.vstack([W[1], W[0], -W[2:]])
+    return np.vstack([u, d, V[:, : len(lever)] + np.outer(V[:, 2], lever)])
+
+
+def _change_map(covariance: Array, W: Array) -> None:
+    """Change the covariance of the map's landmarks; see `_changes`."""
+    left, cut = np.vstack([W[1], W[0], -W[2:]]), W.shape[1]
     for first in range(3, cut, AT_ONCE):
         own, so_far = slice(first, min(first + AT_ONCE, cut)), slice(3, first)
         here = slice(3, own.stop)
-        rows = world.block(np.arange(own.start, own.stop), here)
+        rows = covariance[own, here]
         rows += left[:, own].T @ W[:, here]
-        covariance[own, so_far] = rows[:, : first - 3]
         covariance[so_far, own] = rows[:, : first - 3].T
         covariance[own, own] = as_covariance(rows[:, first - 3 :])
 

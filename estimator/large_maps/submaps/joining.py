@@ -20,7 +20,7 @@ from scipy.sparse import coo_array
 from ....arrays import Array, IntArray
 from ...models.rigid_motion import ErrorFrame, compose, points_of
 from ..elimination import Quadratic, SubmapElimination, dissect
-from ..multifrontal import append, pairs
+from ..multifrontal import pairs
 from .factor import (
     FactorError,
     Gaussian,
@@ -163,15 +163,20 @@ class JoinedMap:
     def _large_covariance(
         self, size: int, rows: IntArray, columns: IntArray, owned: Sequence[Owned]
     ) -> tuple[Array, IntArray]:
-        """Return the covariance of all unknowns, and the order of a large part."""
-        P, places = self._factors.inverse(size - len(rows))
-        done, order = len(places), np.empty(size, dtype=np.int64)
-        order[rows] = places[columns]
+        """Return the covariance of a large part, then of the other unknowns.
+
+        Also the column of each entry of the part.
+        """
+        number = np.full(3 * self._count + self._points.size, -1)
+        number[columns] = rows
+        others = number < 0
+        total = size + int(others.sum())
+        number[others] = np.arange(size, total)
+        found = self._factors.inverse(number, total)
         for where, unknowns, private in owned:
-            append(P, done, places[unknowns], private.jacobian, private.covariance)
-            order[where] = done + np.arange(len(where))
-            done += len(where)
-        return P, order
+            at = number[unknowns]
+            found.append(where, at, private.jacobian, private.covariance)
+        return found.matrix, found.places[:size]
 
     @property
     def _factors(self) -> SubmapElimination:
