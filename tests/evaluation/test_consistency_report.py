@@ -12,6 +12,7 @@ from slamgym.evaluation.consistency_report import (
     assert_consistent,
     evaluate_consistency,
 )
+from slamgym.evaluation.map_consistency import map_test
 
 RUNS, STEPS = 100, 40
 
@@ -186,3 +187,79 @@ def test_the_last_step_is_tested_at_the_last_step(scores):
     expected = hypothesis_tests.final_step_test(nees[:, -1], 3)
     assert report(*scores).final_step == expected
     assert not expected.accepted
+
+
+def test_a_report_holds_the_tests_of_the_runs_that_succeeded():
+    rng = np.random.default_rng(9)
+    nees, nis = rng.chisquare(3, (24, 60)), rng.chisquare(4, (24, 60))
+    freedom = np.full((24, 60), 4)
+    nees[:, :3], nees[5, 40:], freedom[7, 3], nis[7, 3] = np.nan, np.nan, 0, np.nan
+    errors, in_map = rng.standard_normal((24, 4, 2)), rng.chisquare(2, (24, 4))
+    of_maps = rng.chisquare(8, 24), np.full(24, 8), in_map
+    errors[5], of_maps[0][5], in_map[5] = 9, 99, 99
+    nees[:2] *= 9
+    good = np.arange(24) != 5
+    found = evaluate_consistency(
+        nees, nis, freedom, frame="additive", rng=np.random.default_rng(3),
+        landmarks=errors, map_nees=of_maps[0], map_dof=of_maps[1], landmark_nees=in_map,
+    )  # fmt: skip
+    scores, averages = nees[good, 3:], nees[good, 3:].mean(axis=1)
+    grid = np.array([6, 11, 17, 22, 28, 34, 39, 45, 50, 56])
+    tests = hypothesis_tests
+    expected = {
+        "runs": 24,
+        "failed_runs": (5,),
+        "undefined_steps": 3,
+        "used_runs": 23,
+        "frame": "additive",
+        "degrees_of_freedom": 3,
+        "final_step": tests.final_step_test(scores[:, -1], 3),
+        "time_average": tests.time_average_test(averages, 3),
+        "bootstrap": tests.bootstrap_test(averages, 3, rng=np.random.default_rng(3)),
+        "nis": tests.nis_test(nis[good], freedom[good]),
+        "whiteness": tests.whiteness_test(nis[good], freedom[good], lags=10),
+        "equivalence": tests.equivalence_test(averages, 3),
+        "mean_ratio": pytest.approx(averages.mean() / 3),
+        "median_ratio": pytest.approx(np.median(averages) / 3),
+        "share_above_3": np.mean(averages / 3 > 3),
+        "deciding_runs": 2,
+        "ratio_of_others": pytest.approx(averages[2:].mean() / 3),
+    }
+    for name, value in expected.items():
+        assert getattr(found, name) == value, name
+    assert found.family_steps.tolist() == (grid + 3).tolist()
+    family = tests.family_test(scores[:, grid], 3)
+    np.testing.assert_array_equal(found.family.statistic, family.statistic)
+    alone = map_test(errors[good], *(part[good] for part in of_maps))
+    assert found.map.sentence() == alone.sentence()
+    assert found.map.p_value == alone.p_value
+    rate = (0.05 - 0.005) / 3
+    assert found.deciding_rate == pytest.approx(rate)
+    p_values = found.final_step.p_value, found.time_average.p_value, family.p_value
+    assert found.pose_p_value == pytest.approx(min(p_values) * 0.05 / rate)
+    assert found.p_value == min(found.pose_p_value, alone.p_value * 10)
+
+
+@pytest.mark.parametrize("count", [9, 10, 19, 20])
+def test_few_runs_are_warned_of_and_their_averages_do_not_count(scores, count):
+    found = report(*(part[:count] for part in scores))
+    average = found.time_average.p_value
+    assert found.average_p_value == (average if count >= 10 else 1.0)
+    assert any(f"Only {count} runs" in each for each in found.warnings()) == (
+        count < 20
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda part: [part[0][:, :1], *part[1:]], "nees must have shape"),
+        (lambda part: [part[0][0], *part[1:]], "nees must have shape"),
+        (lambda part: [part[0], part[1][:, 1:], part[2]], "nis must have shape"),
+        (lambda part: [*part[:2], part[2][:, 1:]], "nis_dof must have shape"),
+        (lambda part: [np.nan * part[0], *part[1:]], "got 0 of 100"),
+    ],
+)
+def test_scores_that_do_not_fit_are_refused(scores, change, message):
+    with pytest.raises(ValueError, match=message):
+        report(*change(list(scores)))

@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
+from slamgym.evaluation.hypothesis_tests import equivalence_test
 from slamgym.evaluation.map_consistency import MapEvidence, map_test
 
 HONEST = np.random.default_rng(4).standard_normal((100, 20, 2))
@@ -75,6 +77,80 @@ def test_a_map_without_nees_is_not_shown_to_be_consistent():
     found = map_test(errors)
     assert found.accepted
     assert not found.shown
+
+
+def p_outside(total, freedom):
+    """p-value of a sum of NEES that is χ² times a ratio from 0.8 to 1.25."""
+    tails = stats.chi2.cdf(total / 0.8, freedom), stats.chi2.sf(total / 1.25, freedom)
+    return min(1.0, 2 * min(tails))
+
+
+@pytest.mark.parametrize("joint", [False, True])
+@pytest.mark.parametrize("size", [1.0, 1.25, 0.8])
+def test_a_report_is_that_of_sums_over_the_runs_that_know_a_landmark(joint, size):
+    rng = np.random.default_rng(8)
+    errors = size * np.linspace(0.9, 1.2, 6)[:, None] * rng.standard_normal((31, 6, 2))
+    errors[rng.random((31, 6)) < 0.2] = np.nan
+    errors[3:, 4], errors[5], errors[6, 0] = np.nan, np.nan, np.inf
+    in_map, whole = rng.chisquare(2, (31, 6)), size * rng.chisquare(10, 31)
+    freedom = np.where(np.isnan(errors[..., 0]).all(axis=1), 0, 10)
+    given = (whole, freedom) if joint else ()
+    found = map_test(errors, *given, landmark_nees=in_map)
+    kept = [run for run in range(31) if run not in (5, 6)]
+    squares = (errors[kept] ** 2).sum(axis=2)
+    known = ~np.isnan(squares)
+    assert (found.runs, found.undefined, found.all_runs) == (29, 1, 30)
+    assert (found.joint, found.indefinite) == (joint, 0)
+    assert found.landmarks.tolist() == [0, 1, 2, 3, 5]
+    count = len(found.landmarks)
+    for place, k in enumerate(found.landmarks):
+        rows = known[:, k]
+        n = 2 * rows.sum()
+        total, alone = squares[rows, k].sum(), in_map[kept][rows, k].sum()
+        mean = errors[kept][rows, k].mean(axis=0)
+        expected = {
+            "ratios": total / n,
+            "p_values": min(1, count * p_outside(total, n)),
+            "map_ratios": alone / n,
+            "map_p_values": min(1, count * p_outside(alone, n)),
+            "means": mean,
+            "mean_p_values": min(
+                1, count * stats.ncx2.sf(n / 2 * mean @ mean, 2, n / 2 * 0.25**2)
+            ),
+        }
+        for name, value in expected.items():
+            assert getattr(found, name)[place] == pytest.approx(value, rel=1e-6), name
+    totals = whole[kept] if joint else np.nansum(squares, axis=1)
+    sizes = freedom[kept] if joint else 2 * known.sum(axis=1)
+    together = p_outside(totals.sum(), sizes.sum()) if joint else 1.0
+    assert found.joint_p_value == pytest.approx(together)
+    assert found.equivalence == equivalence_test(totals / sizes, 1)
+    each = [found.p_values, found.map_p_values, found.mean_p_values]
+    assert found.p_value == pytest.approx(min(1, 4 * min(together, np.min(each))))
+    np.testing.assert_array_equal(found.landmark_p_values, np.min(each, axis=0))
+    worst = abs(np.log(found.ratios)).argmax()
+    sizes = np.linalg.norm(found.means, axis=1)
+    low, high = found.equivalence.interval
+    what = "whole map" if joint else "average over the landmarks"
+    assert found.sentence() == (
+        f"Map at the end, {what}: ratio {(found.equivalence.statistic):.3f}, 90 % "
+        f"interval [{low:.3f}, {high:.3f}]; landmark {found.landmarks[worst]} seen "
+        f"from the robot has {found.ratios[worst]:.3g}; the largest mean error is "
+        f"{sizes.max():.2f} deviations (landmark {found.landmarks[sizes.argmax()]}); "
+        f"1 of 30 maps have no NEES: {'accepted' if found.accepted else 'rejected'}, "
+        f"p = {found.p_value:.2g} (rejects a consistent map in at most 0.5%)."
+    )
+
+
+def test_two_maps_are_enough_and_one_is_not():
+    assert map_test(HONEST[:1]) is None
+    assert map_test(HONEST[:2]).landmarks.tolist() == list(range(20))
+    none = np.full((3, 20, 2), np.nan)
+    assert map_test(none) is None
+    half = HONEST[:7].copy()
+    half[3:, 2], half[4:, 3] = np.nan, np.nan  # of 3 and of 4 maps out of 7
+    assert 2 not in map_test(half).landmarks
+    assert 3 in map_test(half).landmarks
 
 
 # after every run
