@@ -205,6 +205,7 @@ ROOMS = (
 )
 CPU_SECONDS = 300  # of the tests of a mutant, which then count as endless
 OUTCOMES = {0: "survived", 1: "killed", 2: "killed", 4: "killed"}  # 2, 4: at import
+DEFAULTS = "tests/contracts/test_defaults.py"
 EXPLAINED = Path(__file__).with_name("mutants_explained.txt")
 RESULTS = ROOT / "results" / "mutants.jsonl"
 
@@ -260,7 +261,7 @@ def preload() -> None:
 def all_tests_of(file: str) -> Tests:
     """Return what judges the mutants that survive the other tests of a file."""
     examples = f"src/slamgym/{file.removeprefix('src/slamgym/')}"
-    return Tests((examples, *tests_of(file).files), slow=True)
+    return Tests((examples, *tests_of(file).files, DEFAULTS), slow=True)
 
 
 def verdict(tests: Tests, file: str = "", text: str = "", function: str = "") -> str:

@@ -11,6 +11,12 @@ from scipy.spatial.transform import Rotation
 from slamgym.evaluation.nees import normalised_squared_error
 from slamgym.experiments.space_poses import (
     Pose,
+    SpaceEstimate,
+    _fit,
+    _nearer,
+    _pose_readings,
+    _readings,
+    _stacked,
     adjoint,
     between,
     composed,
@@ -324,3 +330,169 @@ def test_left_errors_are_normalised_by_their_own_covariance():
     left = logarithm(between(pose, composed(pose, exponential(twists))))
     nees = normalised_squared_error(left, np.broadcast_to(np.eye(6) / 100, (200, 6, 6)))
     assert nees.mean() == pytest.approx((100 * twists**2).sum(axis=1).mean())
+
+
+# ---- the readings, by formulas of matrices
+
+
+def some_poses(rng, runs=6, steps=5):
+    """Poses, truth near them, and covariances, of a few drives."""
+    poses = exponential(rng.normal(size=(runs, steps, 6)))
+    roots = rng.normal(0, 0.05, (runs, steps, 6, 6))
+    claims = roots @ roots.swapaxes(-1, -2) + 1e-4 * np.eye(6)
+    noise = np.linalg.cholesky(claims) @ rng.normal(size=(runs, steps, 6, 1))
+    return poses, composed(poses, exponential(noise[..., 0])), claims
+
+
+def each_pose(poses):
+    for at in np.ndindex(poses.positions.shape[:2]):
+        yield at, whole(Pose(poses.positions[at], poses.rotations[at]))
+
+
+def vector(matrix):
+    return np.array(
+        [*matrix[:3, 3], matrix[2, 1], matrix[0, 2], matrix[1, 0]], dtype=float
+    )
+
+
+@pytest.mark.parametrize("order", ["translation-first", "rotation-first"])
+def test_covariances_in_space_are_read_in_every_convention(order):
+    poses, truth, claims = some_poses(np.random.default_rng(30))
+    found = dict(_readings(truth, poses, claims, order))
+    swap = {"translation-first": np.eye(6), "rotation-first": SWAP}
+    degrees = np.diag([1, 1, 1, *[np.pi / 180] * 3])
+    for at, X in each_pose(poses):
+        T = whole(Pose(truth.positions[at], truth.rotations[at]))
+        left, R = vector(logm(np.linalg.inv(X) @ T).real), X[:3, :3]
+        errors = {
+            "left": left,
+            "right": vector(logm(T @ np.linalg.inv(X)).real),
+            "decoupled": np.append(T[:3, 3] - X[:3, 3], left[3:]),
+        }
+        ad = adjoint(Pose(X[:3, 3], R))
+        plain = np.block([[R, np.zeros((3, 3))], [np.zeros((3, 3)), np.eye(3)]])
+        A = {"left": np.eye(6), "right": ad, "decoupled": plain}
+        C = swap[order] @ claims[at] @ swap[order].T
+        expected = {}
+        for each, matrix in swap.items():
+            own = "" if each == "translation-first" else ", rotation first"
+            for kind, error in errors.items():
+                name = f"covariances of the {kind} error{own}"
+                expected[name] = error, matrix @ claims[at] @ matrix.T
+                if each != order:
+                    continue
+                turned = degrees @ C @ degrees
+                expected[f"{name}, rotations in degrees"] = error, turned
+                for target in set(errors) - {kind}:
+                    back = A[kind] @ np.linalg.inv(A[target])
+                    said = f"transported to the {target} error by Jᵀ P J instead of"
+                    expected[f"{name}, {said} J P Jᵀ"] = error, back.T @ C @ back
+        assert set(found) == set(expected)
+        for name, (error, matrix) in expected.items():
+            np.testing.assert_allclose(found[name][0][at], error, atol=1e-7)
+            np.testing.assert_allclose(
+                found[name][1][at], matrix, rtol=1e-9, atol=1e-12
+            )
+
+
+def test_poses_in_space_are_read_in_every_convention():
+    rng = np.random.default_rng(31)
+    poses, truth, _ = some_poses(rng)
+    truth = truth._replace(positions=7 * truth.positions)
+    found = {name: pair for name, *pair in _pose_readings(truth, poses)}
+    scale = np.sqrt(
+        np.square(truth.positions - truth.positions.mean(axis=1)[:, None]).sum()
+        / np.square(poses.positions - poses.positions.mean(axis=1)[:, None]).sum()
+    )
+    unit = f"positions in a unit of {scale:.3g} m"
+    first = "quaternions that begin with qw"
+    shifts = [-2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2]
+    late = {
+        f"time stamps that are {abs(s):.2g} steps too {'late' if s > 0 else 'early'}": s
+        for s in shifts
+    }
+    both = {INVERSE, first, f"{INVERSE}, in the truth", f"{first}, in the truth"}
+    assert set(found) == {*both, unit, *late}
+    np.testing.assert_allclose(found[unit][1].positions, scale * poses.positions)
+    assert found[unit][0] is truth
+    for at, X in each_pose(poses):
+        for name, place in ((INVERSE, 1), (first, 1), (INVERSE, 0), (first, 0)):
+            given = (
+                X if place else whole(Pose(truth.positions[at], truth.rotations[at]))
+            )
+            x, y, z, w = Rotation.from_matrix(given[:3, :3]).as_quat()
+            rolled = given.copy()
+            rolled[:3, :3] = Rotation.from_quat([y, z, w, x]).as_matrix()
+            read = found[name if place else f"{name}, in the truth"]
+            assert read[1 - place] is (truth, poses)[1 - place]
+            expected = np.linalg.inv(given) if name == INVERSE else rolled
+            shown = Pose(read[place].positions[at], read[place].rotations[at])
+            np.testing.assert_allclose(whole(shown), expected, atol=1e-12)
+    twist = np.array([0.5, 0, 0.2, 0.1, 0, 0.6])
+    line = exponential(np.arange(9.0)[None, :, None] * twist)
+    for name, shift in late.items():
+        ((then, same),) = [p for n, *p in _pose_readings(line, line) if n == name]
+        expected = exponential(np.clip(np.arange(9.0) - shift, 0, 8)[:, None] * twist)
+        np.testing.assert_allclose(then.positions[0], expected.positions, atol=1e-12)
+        np.testing.assert_allclose(then.rotations[0], expected.rotations, atol=1e-12)
+        assert same is line
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.85, 1.0, 1.2, 1.4])
+def test_a_fit_in_space_is_that_of_whitened_errors_after_the_start(scale):
+    rng = np.random.default_rng(32)
+    _, _, claims = some_poses(rng, 9)
+    errors = scale * np.linalg.cholesky(claims) @ rng.normal(size=(9, 5, 6, 1))
+    is_honest, likelihood, nees = _fit(errors[..., 0], claims)
+    squares, logs = np.empty((9, 4, 6)), np.empty((9, 4))
+    for run, step in np.ndindex(9, 4):
+        P, e = claims[run, step + 1], errors[run, step + 1, :, 0]
+        root = np.linalg.cholesky(SWAP @ P @ SWAP.T)
+        squares[run, step] = np.linalg.solve(root, SWAP @ e) ** 2
+        logs[run, step] = np.linalg.slogdet(P)[1]
+    np.testing.assert_allclose(
+        likelihood, -0.5 * (squares.sum(axis=2) + logs).mean(axis=1)
+    )
+    runs = squares.mean(axis=1)
+    mean = runs.mean(axis=0)
+    assert nees == pytest.approx(mean.mean())
+    limit = np.log(1.5) + 3 * runs.std(axis=0) / 3 / mean
+    assert is_honest == (abs(np.log(mean)) <= np.minimum(limit, np.log(2.5))).all()
+    assert _fit(errors[..., 0], -claims)[0] is False
+
+
+def test_estimates_in_space_of_several_lengths_are_thinned_to_the_shortest():
+    rng, drives = np.random.default_rng(33), []
+    for count, left in ((9, 2), (5, 1)):
+        poses, truth, claims = (
+            Pose(*(part[0] for part in each)) if isinstance(each, Pose) else each[0]
+            for each in some_poses(rng, 1, count)
+        )
+        drives.append((truth, SpaceEstimate("file", poses, claims), left))
+    exact, found, claims, left_out = _stacked(drives)
+    assert left_out == 3
+    for run, rows in enumerate(([0, 2, 4, 6, 8], [0, 1, 2, 3, 4])):
+        truth, estimate, _ = drives[run]
+        np.testing.assert_array_equal(exact.positions[run], truth.positions[rows])
+        np.testing.assert_array_equal(exact.rotations[run], truth.rotations[rows])
+        np.testing.assert_array_equal(
+            found.positions[run], estimate.poses.positions[rows]
+        )
+        np.testing.assert_array_equal(claims[run], estimate.covariances[rows])
+
+
+def test_far_smaller_errors_in_space_are_named_with_both():
+    truth, *_ = some_poses(np.random.default_rng(34))
+    off = np.tile([0.01, 0, 0, 0, 0, 0.002], (6, 5, 1))
+    origin = Pose(np.zeros((6, 5, 3)), np.tile(np.eye(3), (6, 5, 1, 1)))
+    near = composed(exponential(off), truth)
+    poses = between(near, origin)
+    assert _nearer(truth, near) == ""
+    gaps = np.linalg.norm(truth.positions - poses.positions, axis=-1)
+    turns = Rotation.from_matrix(
+        (truth.rotations.swapaxes(-1, -2) @ poses.rotations).reshape(-1, 3, 3)
+    ).magnitude()
+    assert _nearer(truth, poses) == (
+        f"convention: {INVERSE}, in the truth: read so, the median errors are 0.01 m "
+        f"and 0.002 rad instead of {np.median(gaps):.2g} m and {np.median(turns):.2g} rad."
+    )
