@@ -492,7 +492,8 @@ def test_far_smaller_errors_in_space_are_named_with_both():
     turns = Rotation.from_matrix(
         (truth.rotations.swapaxes(-1, -2) @ poses.rotations).reshape(-1, 3, 3)
     ).magnitude()
+    before = f"{np.median(gaps):.2g} m and {np.median(turns):.2g} rad"
     assert _nearer(truth, poses) == (
-        f"convention: {INVERSE}, in the truth: read so, the median errors are 0.01 "
-        f"m and 0.002 rad instead of {np.median(gaps):.2g} m and {np.median(turns):.2g} rad."
+        f"convention: {INVERSE}, in the truth: read so, the median errors are 0.01 m "
+        f"and 0.002 rad instead of {before}."
     )
