@@ -184,6 +184,12 @@ TESTS = {
     "experiments/viewers/rerun_recording": "rerun_recording",
     "experiments/viewers/run_page": "run_page",
     "sim_configs": "scenario layouts controls city randomisation extreme_scenarios",
+    "sim_configs/scenario": (
+        "scenario randomisation controls models_of_worlds drawn_worlds"
+    ),
+    "sim_configs/scenario_files": (
+        "scenario randomisation drawn_worlds figures hostile_files"
+    ),
     "src/slamgym": "public_names kernel_cache leaves scenario",
     "src/slamgym/argument_checks": (
         "errors_change_nothing magnitudes filter_memory hypothesis_tests association"

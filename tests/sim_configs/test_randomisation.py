@@ -12,7 +12,8 @@ from slamgym.sim_configs import (
     place_landmarks,
     save_scenario,
 )
-from slamgym.sim_configs.scenario import Randomise
+from slamgym.sim_configs.scenario import RANGES, Randomise
+from slamgym.sim_configs.scenario_files import copied_draw, widest_scenario
 
 BASE = load_scenario("dropout")  # a random layout with a seed of its own, finite range
 FACTORS = {
@@ -169,3 +170,26 @@ def test_a_shift_of_landmarks_that_are_new_anyway_is_refused():
     layout = {"layout": "random", "count": 5, "bounds": [0.0, 0.0, 2.0, 4.0]}
     with pytest.raises(ScenarioError, match="landmark_shift must be 0 where every"):
         BASE.with_changes(landmarks=layout, randomise={"landmark_shift": 1.0})
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_a_draw_is_that_of_its_formula_at_a_share_of_the_ranges(share):
+    ranges = {name: [0.4, 0.9] for name in (*FACTORS, *VALUES)}
+    scenario = BASE.with_changes(randomise=ranges, start={"std": [0.1, 0.2, 0.3]})
+    drawn = scenario.at_share(share)
+    for name, factor in FACTORS.items():
+        assert factor(drawn) == pytest.approx(0.4 * (0.9 / 0.4) ** share), name
+    for name, value in VALUES.items():
+        assert value(drawn) == pytest.approx(0.4 + 0.5 * share), name
+    unmoved = np.zeros((BASE.landmarks.count, 2))
+    assert copied_draw(scenario, dict.fromkeys(RANGES, share), unmoved) == drawn
+    assert (widest_scenario(scenario) == drawn) == (share == 1)
+    assert widest_scenario(BASE) is BASE
+    scaled = BASE.with_changes(randomise={"map_scale": [0.5, 2.0]})
+    points = place_landmarks(BASE.landmarks, np.random.default_rng(0))
+    for moved in (unmoved, unmoved + 0.3):
+        shares = dict.fromkeys(RANGES, share)
+        map_of = copied_draw(scaled, shares, moved).landmarks
+        middle = points.mean(axis=0)
+        expected = middle + 0.5 * 4**share * (points - middle)
+        np.testing.assert_allclose(map_of.points, expected)

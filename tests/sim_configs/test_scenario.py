@@ -1,6 +1,9 @@
+import errno
 import json
 import math
+import os
 import pickle
+import platform
 import re
 import subprocess
 import sys
@@ -394,3 +397,46 @@ def test_importing_scenarios_loads_nothing_heavy():
         [sys.executable, "-c", code], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+def _fail_to_write(path, name):
+    with files.replace_when_written(path) as partial:
+        partial.write_text("half")
+        raise OSError(errno.EFBIG, "File too large", name)
+
+
+def test_a_file_is_written_under_a_hidden_name_of_its_process(tmp_path):
+    path = tmp_path / "map.toml"
+    path.write_text("former")
+    with files.replace_when_written(path) as partial:
+        assert partial.parent == tmp_path
+        name = re.escape(f".map.{os.getpid()}@{platform.node()}-")
+        assert re.fullmatch(rf"{name}[0-9a-f]{{8}}\.toml", partial.name)
+        assert partial in files.unfinished
+        partial.write_text("new")
+        assert path.read_text() == "former"
+    assert (path.read_text(), partial in files.unfinished) == ("new", False)
+    for name, named in ((None, "map.toml"), ("other", "other")):
+        with pytest.raises(OSError, match="too large") as caught:
+            _fail_to_write(path, name)
+        assert Path(caught.value.filename).name == named
+    assert path.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(
+        FileNotFoundError, match=r"the folder of .*a/map does not exist"
+    ):
+        files.replace_when_written(tmp_path / "a" / "map").__enter__()
+
+
+def test_only_what_ended_processes_of_this_machine_left_is_removed(tmp_path):
+    ended, node = 2**22 + 7, platform.node()  # no process has so large a number
+    gone = tmp_path / f".map.{ended}@{node}-01234567.toml"
+    kept = [
+        tmp_path / f".map.{os.getpid()}@{node}-01234567.toml",
+        tmp_path / f".map.{ended}@another-01234567.toml",
+        tmp_path / f"map.{ended}@{node}-01234567.toml",
+    ]
+    for path in (gone, *kept):
+        path.touch()
+    files.remove_unfinished(tmp_path)
+    assert set(tmp_path.iterdir()) == set(kept)
