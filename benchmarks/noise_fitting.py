@@ -37,8 +37,9 @@ def truth_of(log: SlamLog) -> dict[str, float]:
     known = settings_for(log)
     values = (*known.motion_std, *known.measurement_std)
     names = ("σx", "σy", "σα", "σβ", "σr")
-    more = known.options.get("range_std_per_metre", 0.0)
-    return dict(zip(names, values, strict=True)) | {"σr per metre": more}
+    more = {"σr per metre": "range_std_per_metre", "σβ in metres": "bearing_std_metres"}
+    growing = {name: known.options.get(key, 0.0) for name, key in more.items()}
+    return dict(zip(names, values, strict=True)) | growing
 
 
 def coverage(world: str, runs: int, seed: int) -> None:
@@ -58,6 +59,7 @@ def coverage(world: str, runs: int, seed: int) -> None:
             verdicts[noise.name][noise.verdict] += 1
             if true:
                 errors[noise.name].append(noise.value / true)
+        held.update(truth.keys() - {noise.name for noise in result.noise})  # left out
         inflated += result.suggested.settings != result.fitted.settings
     seconds = (time.process_time() - started) / runs
     for name, true in truth.items():

@@ -147,6 +147,9 @@ def drive_likelihood(
         )
     check_events(events)
     record = _new_record(len(values), events, keep_beliefs)
+    *odometry, dt = events.motions.T
+    moved = estimator.motion.displacements(np.column_stack(odometry))
+    events = events._replace(motions=np.column_stack([moved, dt]))
     work = partial(_follow, estimator, events, values, gate, record)
     share_out(work, len(values), threads or usable_cores())
     record.poses[..., :2] += estimator.map.mean[:2]
@@ -215,16 +218,13 @@ def _follow(
     record: DriveRecord,
     part: slice,
 ) -> None:
-    """Fill a part of a record, with room of its own."""
+    """Fill a part of a record, with room of its own; the motions are displacements."""
     landmarks = int(events.landmarks.max(initial=-1)) + 1
     capacity = GaussianMap.capacity_for(landmarks)
     most = int(np.diff(events.first_readings).max(initial=0))
     belief = np.zeros(capacity), aligned_zeros(capacity, capacity), np.zeros(capacity)
     first, motion = estimator.map, estimator.motion_values
     rules = estimator.rules._replace(gate=gate)
-    *odometry, dt = events.motions.T
-    moved = estimator.motion.displacements(np.column_stack(odometry))
-    events = events._replace(motions=np.column_stack([moved, dt]))
     follow_drive(
         tuple(events),  # numba checks the type of a named one at every call
         noises[part],
@@ -293,27 +293,16 @@ def follow_drive(
         size = len(start[0])  # a literal would compile all kernels anew
         x, y = belief.mean[0], belief.mean[1]
         for s in range(len(drive.first_motions) - 1):
-            for k in range(drive.first_motions[s], drive.first_motions[s + 1]):
-                dx, dy, turn = (
-                    drive.motions[k, 0],
-                    drive.motions[k, 1],
-                    drive.motions[k, 2],
-                )
-                moves = noise_at_rest or dx != 0 or dy != 0 or turn != 0
-                for i in range(3):
-                    sigma = noises[b, MOTION + i]
-                    variance[i] = sigma * sigma * drive.motions[k, 3] * moves
-                predict(
-                    belief.mean,
-                    belief.covariance,
-                    belief.reference,
-                    len(start[0]),  # `carry` moves the rest before a scan
-                    dx,
-                    dy,
-                    turn,
-                    variance,
-                    rules.linearisation,
-                )
+            move(
+                belief,
+                len(start[0]),
+                drive,
+                s,
+                noises[b, MOTION:SENSOR],
+                variance,
+                noise_at_rest,
+                rules,
+            )
             first = drive.first_readings[s]
             count = drive.first_readings[s + 1] - first
             if count == 0:
@@ -340,6 +329,41 @@ def follow_drive(
             at_estimate = rules.linearisation == scan.AT_ESTIMATE
             at = belief.mean if at_estimate else belief.reference
             x, y = at[0], at[1]
+
+
+@njit_internal
+def move(
+    belief: BeliefArrays,
+    size: int,
+    drive: DriveEvents,
+    s: int,
+    noise: Array,
+    variance: Array,
+    noise_at_rest: bool,
+    rules: Rules,
+) -> None:
+    """Predict the pose through the motions of a step; `carry` moves the rest later."""
+    for k in range(drive.first_motions[s], drive.first_motions[s + 1]):
+        dx, dy, turn = drive.motions[k, 0], drive.motions[k, 1], drive.motions[k, 2]
+        moves = noise_at_rest or dx != 0 or dy != 0 or turn != 0
+        dt = drive.motions[k, 3] * moves
+        at_estimate = rules.linearisation == scan.AT_ESTIMATE
+        if at_estimate and dx == 0 and dy == 0 and dt == 0:
+            belief.mean[2] += turn  # as half of a midpoint motion, or at rest
+            continue
+        for i in range(3):
+            variance[i] = noise[i] * noise[i] * dt
+        predict(
+            belief.mean,
+            belief.covariance,
+            belief.reference,
+            size,
+            dx,
+            dy,
+            turn,
+            variance,
+            rules.linearisation,
+        )
 
 
 @njit_internal

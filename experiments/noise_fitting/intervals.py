@@ -39,7 +39,10 @@ class Interval(NamedTuple):
 
 
 def intervals(
-    likelihoods: Likelihoods, parameters: Array, log_likelihood: float
+    likelihoods: Likelihoods,
+    parameters: Array,
+    log_likelihood: float,
+    information: Array,
 ) -> list[Interval]:
     """Return the 95 % intervals of the most likely parameters.
 
@@ -56,17 +59,19 @@ def intervals(
         Where it has its maximum; some may be zero.
     log_likelihood : float
         The maximum.
+    information : ndarray, shape (k, k)
+        About the logarithms of those > 0.
     """
     free = np.flatnonzero(parameters > 0)
-    information = np.zeros(len(parameters))
-    along = restricted(likelihoods, parameters, free)
-    information[free] = np.diag(scores(along, np.log(parameters[free])).information)
+    whole = np.zeros((len(parameters), len(parameters)))
+    whole[np.ix_(free, free)] = information
+    of_each = np.diag(whole)
     found = {
         i: _profiled(likelihoods, parameters, i, log_likelihood)
-        for i in np.flatnonzero(information < LITTLE).tolist()
+        for i in np.flatnonzero(of_each < LITTLE).tolist()
     }
-    sure = np.flatnonzero(information >= 1.0)
-    widths = _widths(likelihoods, parameters, sure, information)
+    sure = np.flatnonzero(of_each >= 1.0)
+    widths = _widths(likelihoods, parameters, sure, whole[np.ix_(sure, sure)])
     for i, width in zip(sure.tolist(), widths, strict=True):
         if i not in found:
             spread = np.exp(NORMAL * width)
@@ -115,11 +120,10 @@ def _widths(
     if not len(chosen):
         return np.empty(0)
     along = restricted(likelihoods, parameters, chosen)
-    theta = np.log(parameters[chosen])
-    steps = np.clip(0.5 / np.sqrt(information[chosen]), 0.005, 0.1)
-    bent = curvature(along, theta, steps)
+    steps = np.clip(0.5 / np.sqrt(np.diag(information)), 0.005, 0.1)
+    bent = curvature(along, np.log(parameters[chosen]), steps)
     if not (np.linalg.eigvalsh(bent) > 0).all():
-        bent = scores(along, theta).information
+        bent = information
     return np.asarray(np.sqrt(np.diag(np.linalg.pinv(bent))))
 
 

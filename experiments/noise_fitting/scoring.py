@@ -40,7 +40,7 @@ FARTHEST = 2.0  # the most that an iteration changes one θ
 SHARES = (8.0, 3.0, 1.5, 1.0, 0.5, 0.15)  # of the step that are tried at once
 FAINT = 0.05  # information on θ beside which that of the readings is none
 LITTLE = 16.0  # information on θ, that of a standard deviation of ¼
-GAIN = 1e-4  # in ℓ, below which an iteration ends a climb
+GAIN = 1e-3  # in ℓ, below which an iteration ends a climb: .04 standard deviations
 BETTER = 1e-2  # in ℓ, from which on one value is more likely than another
 MOST = 60  # iterations of a climb
 CLIMBS = 8
@@ -54,6 +54,8 @@ class Maximum(NamedTuple):
     #: Shape (p,).
     parameters: Array
     log_likelihood: float
+    #: I, shape (p, p).
+    information: Array
     converged: bool
     #: Number of values tried.
     passes: int
@@ -78,7 +80,7 @@ class _Climb(NamedTuple):
 
 
 def maximise(
-    likelihoods: Likelihoods, starts: Array, *, most: int | None = None
+    likelihoods: Likelihoods, starts: Array, *, most: int = MOST, gain: float = GAIN
 ) -> Maximum:
     """Find the most likely parameters by scoring (Berndt et al. [1]_).
 
@@ -99,8 +101,11 @@ def maximise(
         See :data:`Likelihoods`.
     starts : ndarray, shape (k, p)
         Parameters > 0; the search begins at the most likely of them.
-    most : int, optional
-        Iterations of a climb, `MOST` where not given.
+    most : int
+        Iterations of a climb.
+    gain : float
+        A climb ends where an iteration should increase ℓ by less, or has changed it by
+        less, as beside a jump of ℓ.
 
     Raises
     ------
@@ -119,7 +124,7 @@ def maximise(
         raise np.linalg.LinAlgError("the readings are impossible under every noise")
     theta, passes = np.log(starts[best]), len(starts)
     for _ in range(CLIMBS):
-        climb = _climb(likelihoods, theta, MOST if most is None else most)
+        climb = _climb(likelihoods, theta, most, gain)
         passes += climb.passes
         if not climb.converged:
             break
@@ -129,17 +134,15 @@ def maximise(
         if not (values > climb.scores.value + BETTER).any():
             break
         theta = tried[int(np.argmax(values))]
-    return Maximum(np.exp(climb.theta), climb.scores.value, climb.converged, passes)
+    value, _, information = climb.scores
+    return Maximum(np.exp(climb.theta), value, information, climb.converged, passes)
 
 
-def _climb(likelihoods: Likelihoods, theta: Array, most: int) -> _Climb:
-    damping, passes, here, known = 1e-3, 0, None, None
+def _climb(likelihoods: Likelihoods, theta: Array, most: int, gain: float) -> _Climb:
+    here, damping, passes = scores(likelihoods, theta), 1e-3, 2 * len(theta) + 1
     for _ in range(most):
-        if here is None:
-            here = scores(likelihoods, theta, here=known)
-            passes += 2 * len(theta) + (known is None)
         step = _step(here, damping)
-        if 0.5 * float(here.gradient @ step) < GAIN:
+        if 0.5 * float(here.gradient @ step) < gain:
             return _Climb(theta, here, True, passes)
         if damping > 1e4:
             break
@@ -149,13 +152,16 @@ def _climb(likelihoods: Likelihoods, theta: Array, most: int) -> _Climb:
         found = totals(by_step)
         passes += len(tried)
         best = int(np.argmax(found))
-        if found[best] > here.value:
+        rise = found[best] - here.value
+        if rise > 0:
             damping *= 0.2 if SHARES[best] >= 0.5 else 4
-            theta, here, known = tried[best], None, by_step[best]
+            theta = tried[best]
+            here = scores(likelihoods, theta, here=by_step[best])
+            passes += 2 * len(theta)
         else:
             damping *= 30
-    if here is None:
-        here = scores(likelihoods, theta, here=known)
+        if abs(rise) < gain:
+            return _Climb(theta, here, True, passes)
     return _Climb(theta, here, False, passes)
 
 
@@ -207,17 +213,17 @@ def scores(
 
 def curvature(likelihoods: Likelihoods, theta: Array, widths: Array) -> Array:
     """Return −∂²ℓ/∂θ², shape (p, p), by differences of these widths (p,)."""
-    p = len(theta)
-    pairs = [(i, j) for i in range(p) for j in range(i, p)]
-    points = [theta]
-    for i, j in pairs:
-        a, b = widths[i] * np.eye(p)[i], widths[j] * np.eye(p)[j]
-        points += [theta + a + b, theta + a - b, theta - a + b, theta - a - b]
-    values = totals(likelihoods(np.exp(np.array(points))))
+    p, (rows, columns) = len(theta), np.triu_indices(len(theta))
+    steps = np.diag(widths)
+    both = np.vstack([steps, steps[rows] + steps[columns]])
+    around = np.exp(theta + np.vstack([np.zeros(p), both, -both]))
+    here, *values = totals(likelihoods(around))
+    rises = np.reshape(values, (2, -1)).sum(axis=0) - 2 * here  # to either side
     result = np.empty((p, p))
-    for k, (i, j) in enumerate(pairs):
-        pp, pm, mp, mm = values[1 + 4 * k : 5 + 4 * k]
-        result[i, j] = result[j, i] = -(pp - pm - mp + mm) / (4 * widths[i] * widths[j])
+    products = rises[p:] - rises[rows] - rises[columns]
+    result[rows, columns] = -products / (2 * widths[rows] * widths[columns])
+    result[columns, rows] = result[rows, columns]
+    np.fill_diagonal(result, -rises[p:][rows == columns] / (2 * widths) ** 2)
     return result
 
 
@@ -358,6 +364,17 @@ def without_readings(events: DriveEvents, dropped: BoolArray) -> DriveEvents:
         readings=events.readings[kept],
         landmarks=events.landmarks[kept],
         first_readings=counts[events.first_readings],
+    )
+
+
+def scans_of(events: DriveEvents) -> DriveEvents:
+    """Return the events with one step for each scan, without motions after the last."""
+    ends = np.append(0, np.flatnonzero(np.diff(events.first_readings)) + 1)
+    motions, readings = events.first_motions[ends], events.first_readings[ends]
+    return events._replace(
+        motions=events.motions[: motions[-1]],
+        first_motions=motions,
+        first_readings=readings,
     )
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from .intervals import NOT_ZERO, Verdict, intervals
 
 ROUNDS = 12  # of rejecting readings and fitting the others
 COARSE = 6  # iterations of a round after which readings are rejected anew
+ROUGH = 0.1  # gain in ℓ that ends a climb while it is open what is fitted
 FACTORS = 4.0 ** np.arange(-3, 3)  # of motion and of sensor noise, tried at the start
 
 
@@ -66,6 +67,8 @@ class _NoiseFit(NamedTuple):
     free: BoolArray
     #: Its logarithm.
     likelihood: float
+    #: About the logarithms of the fitted entries; nothing at the start.
+    information: Array
     converged: bool
     passes: int
 
@@ -100,23 +103,21 @@ def most_likely_noise(likelihood: LogLikelihood, before: Array) -> Found:
     numpy.linalg.LinAlgError
         If the fit diverges.
     """
-    start = positive_start(before, _typical_range(likelihood))
-    chosen = np.ones(len(ENTRIES), dtype=np.bool_)
-    chosen[IN_METRES] = start[IN_METRES] > 0  # otherwise only if it is worth it
-    smooth, found = _in_turns(likelihood, start, chosen)
-    if not chosen[IN_METRES]:
+    start = _coarse_start(likelihood, before)
+    smooth, found = _in_turns(likelihood, start, ROUGH)
+    if not found.free[IN_METRES]:
         metres = _in_metres(smooth, found)
         if metres.likelihood > found.likelihood + WORTH:
-            chosen[IN_METRES] = True
-            smooth, found = _in_turns(likelihood, metres.noise, chosen)
+            found = metres
+    smooth, found = _in_turns(likelihood, found, scoring.GAIN)
+    at = np.flatnonzero(found.free)
     found = _without_zeros(smooth, _without_needless(smooth, found))
     _refuse_diverged(found)
     _refuse_exact(found.noise, _typical_range(smooth))
-    noise, at = found.noise, np.flatnonzero(chosen)
+    noise = found.noise
     along = scoring.restricted(smooth.of, noise, at)
-    judged = dict(
-        zip(at.tolist(), intervals(along, noise[at], found.likelihood), strict=True)
-    )
+    each = intervals(along, noise[at], found.likelihood, found.information)
+    judged = dict(zip(at.tolist(), each, strict=True))
     for i, interval in judged.items():
         if interval.verdict == "unknown":
             noise[i] = before[i]
@@ -128,14 +129,14 @@ def most_likely_noise(likelihood: LogLikelihood, before: Array) -> Found:
 
 
 def _in_turns(
-    likelihood: LogLikelihood, start: Array, chosen: BoolArray
+    likelihood: LogLikelihood, found: _NoiseFit, gain: float
 ) -> tuple[LogLikelihood, _NoiseFit]:
     """Alternate between rejecting readings and fitting, until nothing changes."""
-    found = _coarse_start(likelihood, start, chosen)
     rejected = likelihood.rejected(found.noise)
     for round_ in range(ROUNDS):
         smooth = likelihood.without(rejected)
-        found = _fit(smooth, found, most=None if round_ > 2 else COARSE)
+        most = COARSE if round_ <= 2 else scoring.MOST
+        found = _fit(smooth, found, most=most, gain=gain)
         again = likelihood.rejected(found.noise)
         _refuse_most(again)
         if found.converged and (again == rejected).all():
@@ -151,37 +152,36 @@ def _in_metres(smooth: LogLikelihood, found: _NoiseFit) -> _NoiseFit:
     noise[IN_METRES] = 0.5 * max(noise[BEARING], EXACT) * _typical_range(smooth)
     noise[BEARING] *= 0.5
     free[IN_METRES] = True
-    return _fit(smooth, found._replace(noise=noise, free=free))
+    return _fit(smooth, found._replace(noise=noise, free=free), gain=ROUGH)
 
 
-def _coarse_start(
-    likelihood: LogLikelihood, start: Array, chosen: BoolArray
-) -> _NoiseFit:
+def _coarse_start(likelihood: LogLikelihood, before: Array) -> _NoiseFit:
     """Return the most likely of some multiples of motion and of sensor noise."""
+    start = positive_start(before, _typical_range(likelihood))
+    free = np.ones(len(ENTRIES), dtype=np.bool_)
+    free[IN_METRES] = start[IN_METRES] > 0  # otherwise only if it is worth it
     factors = np.array(list(product(FACTORS, FACTORS)))
     tried = start * np.repeat(factors, (3, len(start) - 3), axis=1)
     values = scoring.totals(likelihood.of(tried))
     if not np.isfinite(values).any():
         raise np.linalg.LinAlgError("the fit diverges: no noise explains the readings")
-    best = int(np.argmax(values))
-    return _NoiseFit(tried[best], chosen, float(values[best]), False, len(tried))
+    k = int(np.argmax(values))
+    return _NoiseFit(tried[k], free, float(values[k]), np.eye(0), False, len(tried))
 
 
 def _typical_range(likelihood: LogLikelihood) -> float:
     return max(float(np.median(np.abs(likelihood.events.readings[:, 1]))), 1e-3)
 
 
-def _fit(
-    smooth: LogLikelihood, found: _NoiseFit, *, most: int | None = None
-) -> _NoiseFit:
+def _fit(smooth: LogLikelihood, found: _NoiseFit, **ends: Any) -> _NoiseFit:
     """Fit the free entries, starting from their present values."""
     free = np.flatnonzero(found.free)
     along = scoring.restricted(smooth.of, found.noise, free)
-    fit = scoring.maximise(along, found.noise[None, free], most=most)
+    fit = scoring.maximise(along, found.noise[None, free], **ends)
     noise = found.noise.copy()
     noise[free] = fit.parameters
     passes = found.passes + fit.passes
-    return _NoiseFit(noise, found.free, fit.log_likelihood, fit.converged, passes)
+    return _NoiseFit(noise, found.free, *fit[1:-1], passes)
 
 
 def _fixed_at_zero(found: _NoiseFit, entry: int) -> _NoiseFit:
@@ -195,7 +195,7 @@ def _without_needless(smooth: LogLikelihood, found: _NoiseFit) -> _NoiseFit:
     for entry, instead in NEEDLESS:
         if not (found.free[entry] and (found.noise[[entry, instead]] > 0).all()):
             continue
-        if _is_plain(smooth, found, entry):
+        if _is_plain(found, entry):
             continue
         fewer = _fixed_at_zero(found, entry)
         away = _typical_range(smooth)
@@ -209,13 +209,11 @@ def _without_needless(smooth: LogLikelihood, found: _NoiseFit) -> _NoiseFit:
     return found
 
 
-def _is_plain(smooth: LogLikelihood, found: _NoiseFit, entry: int) -> bool:
+def _is_plain(found: _NoiseFit, entry: int) -> bool:
     """Return whether an entry is significantly above zero."""
-    free = np.flatnonzero(found.free)
-    along = scoring.restricted(smooth.of, found.noise, free)
-    information = scoring.scores(along, np.log(found.noise[free])).information
-    at = int(np.flatnonzero(free == entry)[0])
-    covariance = np.linalg.inv(information + scoring.FAINT * np.eye(len(free)))
+    at = int(np.count_nonzero(found.free[:entry]))
+    faint = scoring.FAINT * np.eye(len(found.information))
+    covariance = np.linalg.inv(found.information + faint)
     return bool(covariance[at, at] < PLAIN**2)
 
 
@@ -366,26 +364,21 @@ class LogLikelihood:
         events, chosen = scoring.sample_of(self.events, stretches, most_readings)
         return replace(self, events=events, stretches=chosen)
 
-    def of(self, noises: Array) -> Array:
-        """Return the log likelihoods of the steps (B, S) under noises (B, 7)."""
-        return self.record(noises, keep_beliefs=False).log_likelihoods
+    @cached_property
+    def _scans(self) -> tuple[DriveEvents, ...]:
+        return tuple(map(scoring.scans_of, self.parts))
 
-    def record(self, noises: Array, *, keep_beliefs: bool = True) -> DriveRecord:
+    def of(self, noises: Array) -> Array:
+        """Return the log likelihoods of the scans (B, S) under noises (B, 7)."""
+        passes = self._passes(self._scans, noises, keep_beliefs=False)
+        return np.concatenate([each.log_likelihoods for each in passes], axis=1)
+
+    def record(self, noises: Array) -> DriveRecord:
         """Return the records of the passes under noises (B, 7); see `drive_likelihood`.
 
         The poses of each part begin where the filter does.
         """
-        records = [
-            drive_likelihood(
-                self.filter,
-                part,
-                noises,
-                gate=self.gate,
-                keep_beliefs=keep_beliefs,
-                threads=self.threads,
-            )
-            for part in self.parts
-        ]
+        records = self._passes(self.parts, noises, keep_beliefs=True)
         if len(records) == 1:
             return records[0]
         rejected = np.sum([record.rejected for record in records], axis=0)
@@ -394,6 +387,22 @@ class LogLikelihood:
             for entries in zip(*records, strict=True)
         )
         return DriveRecord(*joined)._replace(rejected=rejected)
+
+    def _passes(
+        self, parts: Sequence[DriveEvents], noises: Array, *, keep_beliefs: bool
+    ) -> list[DriveRecord]:
+        """Filter each part under each noise."""
+        return [
+            drive_likelihood(
+                self.filter,
+                part,
+                noises,
+                gate=self.gate,
+                keep_beliefs=keep_beliefs,
+                threads=self.threads,
+            )
+            for part in parts
+        ]
 
     def rejected(self, noise: Array) -> BoolArray:
         """Return which readings the gate rejects under a noise (7,), shape (M,)."""

@@ -15,11 +15,20 @@ GATE = -2 * np.log1p(-GATE_PROBABILITY)
 
 
 def events(seed=5, steps=40):
-    """Return a drive with two motions a step, and one step without a scan."""
+    """Return a drive with two motions a step, and one step without a scan.
+
+    One of the two is a turn, and one of them has no noise; in step 10, both.
+    """
     rng = np.random.default_rng(seed)
     motions, scans = [], []
     for (d, alpha), readings, _ in drive(seed, steps):
-        motions += [(d / 2, alpha / 2, 0.5)] * 2
+        turn, move = (0.0, alpha / 2), (d, alpha / 2)
+        pairs = (
+            [(*turn, 0.0), (*move, 1.0)],
+            [(*move, 0.0), (*turn, 1.0)],
+            [(*move, 1.0), (*turn, 0.0)],
+        )
+        motions += [(*turn, 0.0)] * 2 if len(scans) == 10 else pairs[len(scans) % 3]
         seen = np.flatnonzero(rng.random(6) < 0.6)
         scans.append((readings[seen], seen))
     scans[7] = scans[7][0][:0], scans[7][1][:0]

@@ -419,6 +419,22 @@ def test_the_end_beside_a_jump_of_the_likelihood_is_found_in_few_steps():
     assert len(calls) < 20
 
 
+def test_a_climb_ends_beside_a_jump_of_the_likelihood():
+    best, calls = maximise(two_spreads, np.array([[1.0, 1.0]])), []
+    edge = 1.005 * best.parameters[0]
+
+    def jumping(parameters):
+        calls.append(parameters)
+        found = two_spreads(parameters)
+        found[:, 7] += 5.0 * (parameters[:, 0] < edge)
+        return found
+
+    found = maximise(jumping, np.array([[1.0, 1.0]]))
+    assert found.converged
+    np.testing.assert_allclose(found.parameters, best.parameters, rtol=0.02)
+    assert len(calls) < 16
+
+
 def test_the_whiteness_is_that_of_the_readings_used(example):
     assert all(white.p_value > 1e-3 for white in example.fitted.whiteness)
 
@@ -491,6 +507,19 @@ def test_a_drive_in_parts_has_the_likelihood_of_its_parts():
     np.testing.assert_array_equal(
         np.concatenate([part.readings for part in parts]), events.readings
     )
+
+
+def test_motions_without_a_scan_belong_to_the_next_one():
+    log = a_log(steps=40)
+    kept = [e for e in log.events if isinstance(e, OdometryRow) or e.t % 3 == 0]
+    events = events_of(replace(log, events=tuple(kept))).events
+    settings = settings_for(log, estimator="invariant")
+    likelihood = LogLikelihood(settings.make(log.start), events)
+    noise, is_read = noise_of(settings)[None], np.diff(events.first_readings) > 0
+    assert is_read.sum() == 14
+    by_step = likelihood.record(noise).log_likelihoods
+    np.testing.assert_array_equal(likelihood.of(noise), by_step[:, is_read])
+    np.testing.assert_array_equal(by_step[:, ~is_read], 0)
 
 
 def test_a_drive_past_few_landmarks_is_one_part():
