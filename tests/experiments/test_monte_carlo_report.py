@@ -19,7 +19,12 @@ from slamgym import experiments
 from slamgym.estimator import EkfSlam
 from slamgym.evaluation import diagnose
 from slamgym.evaluation.consistency_report import evaluate_consistency
-from slamgym.evaluation.hypothesis_tests import equivalence_test, family_band
+from slamgym.evaluation.hypothesis_tests import (
+    EquivalenceTest,
+    equivalence_test,
+    family_band,
+)
+from slamgym.evaluation.map_consistency import MapReport
 from slamgym.experiments import nees_figure
 from slamgym.experiments.command_line.commands import Reporter
 from slamgym.experiments.command_line.monte_carlo import show_study
@@ -790,3 +795,143 @@ def test_a_figure_needs_a_run_that_succeeded():
     ]
     with pytest.raises(ValueError, match="a successful run"):
         nees_figure(with_failures(typical(), failures))
+
+
+def a_map(ratios, *, alone=None, means=0.0, p_values=0.0, **changes):
+    """A report of a rejected map of 40 runs, of landmarks 3, 4, …."""
+    ratios, n = np.array(ratios, dtype=float), len(ratios)
+    means = np.broadcast_to(np.reshape(means, (-1, 1)) * [0.6, 0.8], (n, 2))
+    lone = np.broadcast_to(p_values, n).astype(float)
+    whole = EquivalenceTest(2.4, (2.2, 2.6), "not consistent", 0.05)
+    alone = ratios if alone is None else np.array(alone, dtype=float)
+    ones = np.ones(n)
+    report = MapReport(
+        40, 0, 0, 41, True, whole, 1e-20, np.arange(3, 3 + n),
+        ratios, lone, alone, ones, means, ones,
+    )  # fmt: skip
+    return report._replace(**changes)
+
+
+WHOLE = "those of the whole map 2.4 times"
+WRONGLY = "; the filter computes or reports these covariances wrongly."
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (
+            a_map([2, 2.5, 3]),
+            "scale: the covariances are too small; the squared errors of the landmarks "
+            f"are 2 to 3 times what they state, {WHOLE}{WRONGLY}",
+        ),
+        (
+            a_map([0.5, 0.5, 0.5]),
+            "scale: the covariances are too large; the squared errors of the landmarks "
+            f"are 0.5 times what they state, {WHOLE}{WRONGLY}",
+        ),
+        (
+            a_map([1.5, 1.6, 4], means=[1.3, 1.5, 0.26]),
+            "offset: the landmarks are off by 0.26 to 1.5 deviations on average, which "
+            "makes 56 % of their squared errors (median landmark).",
+        ),
+        (
+            a_map([1.0, 1.1, 3, 1.2], p_values=[1, 1, 1e-4, 1], means=[0, 0, 0.5, 0]),
+            "one landmark: the squared errors of 5 are 3 times what the covariances "
+            "state, with a mean error of 0.5 deviations; those of the other 3 are 1 to "
+            "1.2 times.",
+        ),
+        (
+            a_map(
+                [1.0] * 5 + [3, 4],
+                p_values=[1] * 5 + [1e-4, 1e-5],
+                alone=[1.1] * 5 + [5, 6],
+            ),
+            "some landmarks: the squared errors of 8, 9 are 5 to 6 times what the "
+            "covariances state, with a mean error of 0 deviations; those of the other "
+            "5 are 1.1 times.",
+        ),
+        (
+            a_map([1.0, 3.1, 1.2]),
+            "the squared errors of each landmark are 1 to 3.1 times what the "
+            "covariances state, those of the whole map 2.4 times: no single scale, "
+            "offset or landmark explains this.",
+        ),
+        (
+            a_map([1.0, 1.2, 0.9]),
+            "covariances between the landmarks: the squared errors of each landmark "
+            f"are 0.9 to 1.2 times what they state, {WHOLE}{WRONGLY}",
+        ),
+        (
+            a_map([1.0, 1.4, 1.3], alone=[1.0, 1.1, 1.2]),
+            "covariances between pose and map: the squared errors of each landmark are "
+            "1 to 1.2 times what they state, but seen from the robot, they are 1 to "
+            f"1.4 times{WRONGLY}",
+        ),
+        (
+            a_map([]),
+            "of the squared errors, those of the whole map 2.4 times what the "
+            "covariances state.",
+        ),
+        (
+            a_map([2.0], indefinite=2),
+            "the covariance has a negative eigenvalue in 2 of 41 runs.",
+        ),
+    ],
+)
+def test_the_cause_of_a_wrong_map_is_written_with_its_numbers(found, said):
+    assert verdict._map_cause(found) == said
+
+
+def test_a_refused_map_is_written_by_the_test_that_shows_it_best():
+    worst = a_map([2, 3], p_values=[1e-3, 1e-4], joint_p_value=0.5)
+    said = verdict.map_refusal(worst)
+    assert said == (
+        "the squared errors of landmark 4 seen from the robot are 3 times what its "
+        "covariances state, the worst of 2 landmarks (p = 0.0004)"
+    )
+    in_map = worst._replace(
+        map_p_values=np.array([1e-9, 1]), map_ratios=np.array([7, 8])
+    )
+    assert verdict.map_refusal(in_map, "sure").startswith(
+        "the squared errors of landmark 3 in the frame of the map are 7 times what"
+    )
+    off = worst._replace(
+        means=np.array([[3.0, 4], [0, 0]]), mean_p_values=np.array([0, 1])
+    )
+    assert verdict.map_refusal(off, "sure") == (
+        "landmark 3 is off by 5.00 deviations on average, the worst of 2 landmarks "
+        "(sure)"
+    )
+    assert verdict.map_refusal(a_map([2, 3])) == (
+        "the squared errors are 2.4 times what the covariances state (p < 1e-16)"
+    )
+    cautious = EquivalenceTest(0.4, (0.3, 0.5), "not consistent", 0.05)
+    assert verdict.map_refusal(a_map([0.4], equivalence=cautious)).endswith(
+        "(p < 1e-16): the map is too cautious"
+    )
+    few = EquivalenceTest(1.0, (0.7, 1.4), "not shown", 0.05)
+    assert verdict.map_not_shown(a_map([1.0], equivalence=few)) == (
+        "no test rejects the map, but the 90 % interval of its ratio, [0.700, 1.400], "
+        "is not inside [0.8, 1.25]: more runs are needed, about 410 in total if its "
+        "ratio is 1"
+    )
+    assert "at the end of 3 runs: its covariance" in verdict.map_not_shown(
+        a_map([1.0], undefined=3)
+    )
+
+
+@pytest.mark.parametrize(
+    ("ratio", "low", "high", "runs", "needed"),
+    [
+        (1.0, 0.7, 1.4, 40, 410),  # 40 (2 × max(0.3 / 0.2, 0.4 / 0.25))²
+        (1.0, 0.61, 1.1, 40, 610),
+        (2.0, 1.22, 2.2, 40, 610),
+        (1.0, 0.7, 1.4, 9, 0),
+        (1.0, 0.99, 1.01, 40, 41),
+    ],
+)
+def test_the_runs_needed_halve_the_interval_inside_the_margin(
+    ratio, low, high, runs, needed
+):
+    found = EquivalenceTest(ratio, (low, high), "not shown", 0.05)
+    assert verdict._runs_needed(found, runs) == needed
