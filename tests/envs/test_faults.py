@@ -8,7 +8,7 @@ from scipy.stats import norm, t
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.envs.noise_streams import heavy_tails, largest_noise
 from slamgym.envs.vector import WorldBatch
-from slamgym.sim_configs import action_sequence, load_scenario
+from slamgym.sim_configs import action_sequence, load_scenario, place_landmarks
 
 BASE = load_scenario("six_landmarks")
 ENCODERS = {"noise_in": "odometry", "std": [0.05, 0.0, 0.04]}
@@ -116,3 +116,49 @@ def test_the_observation_space_holds_the_reading_of_a_landmark_at_the_longest_ra
     ]
     assert ranges[0] >= 9
     assert ranges[1] == pytest.approx(ranges[0] + 3)
+
+
+@pytest.mark.parametrize("noise_in", ["motion", "odometry"])
+@pytest.mark.parametrize("kind", ["bearing_range", "range", "position", "bearing"])
+@pytest.mark.parametrize("reach", [9.0, None])
+def test_the_observation_space_is_that_of_the_largest_errors(noise_in, kind, reach):
+    stds = {"bearing_range": [0.2, 0.3], "position": [0.4, 0.3]}.get(kind, [0.3, 0])
+    is_of_range = kind in ("bearing_range", "range")
+    bias = 0.7 if is_of_range else 0.0
+    world = BASE.with_changes(
+        start={"pose": [1.0, -2.0, 0.3], "std": [0.3, 0.4, 0.1]},
+        motion={"std": [0.03, 0.04, 0.02], "noise_in": "motion"},
+        sensor={"kind": kind, "std": stds, "max_range": reach or np.inf},
+        faults={"odometry_scale": 0.1, "odometry_turn": -0.02, "range_bias": bias},
+        randomise={"start_x": [1.0, 2.0], "landmark_shift": 0.5},
+    )
+    if noise_in == "odometry":
+        world = world.with_changes(
+            motion={"std": [0.03, 0, 0.02], "noise_in": noise_in}
+        )
+    growth = 0.1 * (kind == "bearing_range")
+    world = world.with_changes(sensor={"range_std_per_metre": growth})
+    robot, dt, largest = world.robot, world.dt, largest_noise(np.inf)
+    away = place_landmarks(BASE.landmarks, None) - [2.0, -2.0]  # at the highest start
+    step = robot.max_speed * dt + largest * 0.05 * (noise_in == "motion")
+    drive = largest * 0.5 + world.steps * step
+    farthest = np.hypot(*away.T).max() + drive + 1.0 + np.sqrt(2) * 0.5
+    far = reach or farthest
+    far += largest * ((0.4 if kind == "position" else 0.3) + growth * far) + bias
+    space = LandmarkWorldEnv(world).observation_space
+    ends = {
+        "bearing_range": [(-np.pi, np.pi), (0, far)],
+        "range": [(0, far), (0, 1)],
+        "position": [(-far, far), (-far, far)],
+        "bearing": [(-np.pi, np.pi), (0, 1)],
+    }[kind]
+    for column, (low, high) in enumerate(ends):
+        assert space["landmarks"].low[:, column] == pytest.approx(low)
+        assert space["landmarks"].high[:, column] == pytest.approx(high)
+    errs = largest * (noise_in == "odometry")
+    odometry = (
+        1.1 * robot.max_speed * dt + errs * 0.03,
+        robot.max_turn_rate * dt + 0.02 + errs * 0.02,
+    )
+    assert space["odometry"].high == pytest.approx(odometry)
+    assert space["odometry"].low == pytest.approx(np.negative(odometry))

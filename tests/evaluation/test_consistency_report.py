@@ -233,6 +233,9 @@ def test_a_report_holds_the_tests_of_the_runs_that_succeeded():
     alone = map_test(errors[good], *(part[good] for part in of_maps))
     assert found.map.sentence() == alone.sentence()
     assert found.map.p_value == alone.p_value
+    for title, test in (("NIS over all scans, χ²: ratio", found.nis),
+                        ("NIS whiteness, Ljung-Box: Q", found.whiteness)):  # fmt: skip
+        assert f"\n{title} {test.statistic:.3f}, accepted within" in str(found)
     rate = (0.05 - 0.005) / 3
     assert found.deciding_rate == pytest.approx(rate)
     p_values = found.final_step.p_value, found.time_average.p_value, family.p_value

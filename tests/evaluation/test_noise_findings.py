@@ -10,6 +10,7 @@ from slamgym.evaluation.noise_findings import (
     HEAVY_TAILS,
     _growth,
     _size_beside_tails,
+    _spread_of_variance,
     noise_findings,
     noise_sums,
     significant_findings,
@@ -89,8 +90,8 @@ def test_a_twentieth_of_the_variance_matters(variance, matters):
     [
         ("along", 0.5, "odometry scale", "distances {:.2%} too short"),
         ("along", -0.5, "odometry scale", "distances {:.2%} too long"),
-        ("turn", 0.5, "odometry turn", "{d:.2g}° per step too far to the right"),
-        ("turn", -0.5, "odometry turn", "{d:.2g}° per step too far to the left"),
+        ("turn", 0.5, "odometry turn", "turns {d:.2g}° per step too far to the right"),
+        ("turn", -0.5, "odometry turn", "turns {d:.2g}° per step too far to the left"),
         ("bearing", 0.5, "bearing bias", "bearings are {d:.2g}° too large"),
         ("bearing", -0.5, "bearing bias", "bearings are {d:.2g}° too small"),
         ("range", 0.5, "range bias", "ranges are {:.2g} m too large"),
@@ -253,6 +254,8 @@ def test_the_impact_of_a_growth_is_that_of_a_line_through_the_squares(growth):
     p_value = 2 * stats.norm.sf(abs(rho) * np.sqrt(5000))
     assert seen.p_value == pytest.approx(p_value, rel=1e-6, abs=0)
     assert seen.matters == (abs(along[1] - along[0]) >= 0.2 * squares.mean())
+    share = (along[1] - along[0]) / 2 / squares.mean()
+    assert _spread_of_variance(found) == pytest.approx(share**2)
     sides = np.sign(along - 1)
     assert seen.sign == (sides[0] if sides[0] == sides[1] else 0)
     size = "too small" if along.max() > 1.05 else "too large"
