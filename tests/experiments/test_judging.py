@@ -849,12 +849,34 @@ def test_a_fit_turns_what_it_explains_most_of(noise, turn):
     turned = truth @ np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
     motion = judging._fitted(turned + noise * rng.normal(size=(200, 2)), truth)
     assert motion.angle == pytest.approx(turn, abs=0.1)
+    if not turn:
+        aside = judging._fitted(np.array([[1.0, 2], [3, 4]]), np.array([[7.0, 7]] * 2))
+        assert (aside.angle, aside.translation.tolist()) == (0, [5, 4])
 
 
 def test_a_start_that_is_certain_is_no_failure():
     claims = np.tile(np.eye(3), (2, 4, 1, 1))
     claims[0, 0], claims[1, 2, 1, 1] = 0.0, -1.0
     assert judging._invalid(claims, claims, {}) == {1: (2, "a variance is negative")}
+    claims = np.tile(np.eye(3), (7, 4, 1, 1))
+    claims[0, 2, 0, 1], claims[1] = np.nan, 0.0
+    claims[2, 1, 0, 1], claims[3, 0, 2, 2] = 2e-6, -1e-9
+    claims[4, 3, :2, :2] = [[4, 4.1], [4.1, 4]]  # the correlation is 1.025
+    claims[5, 1, 0, 1], claims[6, 3, 1, 1] = 0.9e-6, -5.0
+    assert judging._invalid(claims, claims, {6: "lost before"}) == {
+        0: (2, "an entry of the covariance is not finite"),
+        1: (0, "all entries of its covariances are 0"),
+        2: (1, "the covariance is not symmetric"),
+        3: (0, "a variance is negative"),
+        4: (3, "the covariance is indefinite: a correlation is too large"),
+    }
+
+
+def test_two_runs_are_enough_to_reject_and_one_is_not():
+    nees = np.full((2, 21), 99.0)
+    assert judging._is_rejected(nees)
+    assert not judging._is_rejected(nees[:1])
+    assert not judging._is_rejected(np.full((3, 21), 3.0))
 
 
 def test_an_indefinite_covariance_is_a_failed_run(elsewhere):
