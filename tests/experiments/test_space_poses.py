@@ -1,6 +1,7 @@
 """Poses in space: SE(3), the verdict on six coordinates, and its conventions."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -140,6 +141,10 @@ def test_honest_poses_in_space_are_not_rejected(kind, order, tmp_path):
     assert found["verdict"] != "not consistent"
     assert not found["cause"]
     assert all(0.8 < ratio < 1.25 for ratio in found["nees"].values())
+    low, high = map(
+        float, re.search(r"ratio, \[(.*?), (.*?)\]", found["reason"]).groups()
+    )
+    assert low < found["nees"]["pose"] < high
 
 
 def inverse(rows):
