@@ -250,7 +250,10 @@ class Watch:
 
 
 def verdict_of(
-    scores: EstimatorScores, frame: ErrorFrame, watch: Watch | None = None
+    scores: EstimatorScores,
+    frame: ErrorFrame,
+    watch: Watch | None = None,
+    report: ConsistencyReport | None = None,
 ) -> Verdict:
     """Return the verdict on one estimator, which holds 5 % over all looks together.
 
@@ -263,9 +266,12 @@ def verdict_of(
         Error coordinates of the NEES.
     watch : Watch, optional
         Result of :func:`watched`, if it is known.
+    report : ConsistencyReport, optional
+        Result of :func:`.verdict.report_of`, if it is known.
     """
     failed, runs = len(scores.failures), len(scores.good)
-    report = report_of(scores, frame) if scores.good.sum() > 1 else None
+    if report is None and scores.good.sum() > 1:
+        report = report_of(scores, frame)
     if report is None or not is_sequential(scores):
         return verdict_of_report(report, failed, runs)
     watch = watch or watched(scores, frame)

@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 
 
 Blocks = Iterable[tuple[range, list[run_measures.Block]]]
+#: Bytes of blocks that are written together, and of new blocks that stay in memory.
+_MOST_JOINED, _MOST_NEW = 2**24, 2**27
 
 _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pymunk", "xarray")
 _FROM_TRUTH = "for a consistent filter, NEES and NIS are χ² with the stated degrees"
@@ -220,7 +222,7 @@ def _write(
             made.long_name = variable.meaning
             if variable.kind == "?":
                 made.setncattr("dtype", "bool")  # xarray gives it back as such
-        _fill(file.variables, job, blocks, runs)
+        _fill(file.variables, job, _together(blocks), runs)
         file.setncatts(attributes(job, runs, command))
 
 
@@ -261,6 +263,31 @@ def _fill(
                 text = variables[name].kind == "U"
                 part = values.astype(object) if text else values
                 arrays[name][number, rows] = part
+
+
+def _together(blocks: Blocks) -> Blocks:
+    """Join successive blocks: a file takes few large parts in less time."""
+    held: list[tuple[range, list[run_measures.Block]]] = []
+    for runs, parts in blocks:
+        is_next = not held or runs.start == held[-1][0].stop
+        if not is_next or len(held) * _bytes_of(parts) > _MOST_JOINED:
+            yield _whole(held)
+            held = []
+        held.append((runs, parts))
+    if held:
+        yield _whole(held)
+
+
+def _whole(
+    held: Sequence[tuple[range, list[run_measures.Block]]],
+) -> tuple[range, list[run_measures.Block]]:
+    runs = range(held[0][0].start, held[-1][0].stop)
+    of_each = zip(*(parts for _, parts in held), strict=True)
+    return runs, [run_measures.joined(parts) for parts in of_each]
+
+
+def _bytes_of(parts: Iterable[run_measures.Block]) -> int:
+    return sum(array.nbytes for part in parts for array in part.values())
 
 
 def _stored(kind: str) -> Any:
@@ -309,6 +336,8 @@ class BlockFolder(NamedTuple):
     path: Path
     #: Of the job.
     digest: str
+    #: The first blocks that this process adds, so that they are not read again.
+    new: dict[range, list[run_measures.Block]]
 
     def missing(self, blocks: Iterable[range], variables: Iterable[str]) -> list[range]:
         """Return the blocks that are still to be computed; warn of a damaged one.
@@ -345,10 +374,15 @@ class BlockFolder(NamedTuple):
         for shorter in self._files_from(runs.start):
             if shorter != file:
                 shorter.unlink()
+        if len(self.new) * _bytes_of(parts) < _MOST_NEW:
+            self.new[runs] = parts
 
     def read(self, blocks: Iterable[range], job: MonteCarloJob) -> Blocks:
         """Yield blocks with their runs, one at a time."""
         for runs in blocks:
+            if runs in self.new:
+                yield runs, self.new[runs]
+                continue
             file = self._files_from(runs.start)[-1]  # the longest
             with np.load(file, allow_pickle=False) as arrays:
                 parts = [
@@ -417,7 +451,7 @@ def opened(
                 _clear(path, found)
             _write_job(path, identity, _looks_in(path) if found and not fresh else [])
             (path / BLOCKS).mkdir(exist_ok=True)
-        yield BlockFolder(path, digest_of(identity))
+        yield BlockFolder(path, digest_of(identity), {})
 
 
 def _write_job(

@@ -167,6 +167,13 @@ LARGER = "larger_"
 SMALL_NOISE |= {f"{LARGER}{name}": each for name, each in SMALL_NOISE.items()}
 
 
+def joined(parts: Sequence[Block]) -> Block:
+    """Return the measures of all runs of some blocks."""
+    if len(parts) == 1:
+        return parts[0]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
 def variables_of(scenario: Scenario) -> dict[str, Variable]:
     """Return the variables of the results in a world."""
     return VARIABLES if scenario.sensor.identities else HIDDEN_VARIABLES

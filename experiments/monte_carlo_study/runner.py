@@ -61,6 +61,7 @@ from .run_measures import (
     SMALL_NOISE,
     Block,
     explain_first_gap,
+    joined,
     measure_runs,
     oracle_of_runs,
     with_known_ids,
@@ -359,11 +360,13 @@ def _repeated(
     begun = perf_counter()
     shape = len(job.estimators), len(asked)
     found: dict[str, Array] = {name: np.full(shape, np.nan) for name in SMALL_NOISE}
-    for row, choice in enumerate(job.estimators):
+    for row, choice in enumerate(job.estimators if factors else ()):
+        scores = scores_of(results, choice.label, "invariant")
+        verdict = verdict_of(scores, "invariant")
         for factor in factors:
-            known = results.assign({k: (EACH_RUN, found[k]) for k in found})
-            scores = scores_of(known, choice.label, "invariant")
-            count = runs_to_repeat(scores, verdict_of(scores, "invariant"))
+            so_far = {name: ("run", values[row]) for name, values in found.items()}
+            known = scores._replace(results=scores.results.assign(so_far))
+            count = runs_to_repeat(known, verdict)
             if not count:
                 break
             with monte_carlo(
@@ -470,13 +473,6 @@ def runs_at_once(scenario: Scenario) -> int:
     """
     readings = (scenario.steps + 1) * count_rows(scenario)
     return max(usable_cores(), _MOST_BYTES // (readings * _BYTES_OF_READING))
-
-
-def joined(parts: Sequence[Block]) -> Block:
-    """Return the measures of all runs of some parts of a block."""
-    if len(parts) == 1:
-        return parts[0]
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _checked(choice: EstimatorChoice, scenario: Scenario) -> FilterSettings:

@@ -219,7 +219,7 @@ def summarise_estimator(
     decides = scores.good.sum() > 1 and not scores.is_fitted
     report = report_of(scores, frame) if decides else None
     watch = watched(scores, frame) if report and is_sequential(scores) else None
-    verdict = FITTED if scores.is_fitted else verdict_of(scores, frame, watch)
+    verdict = FITTED if scores.is_fitted else verdict_of(scores, frame, watch, report)
     accepted = report and report.accepted
     sequential: dict[str, Any] = {}
     if watch is not None:

@@ -18,7 +18,7 @@ from slamgym.experiments.command_line.app import main
 from slamgym.experiments.command_line.commands import Reporter
 from slamgym.experiments.command_line.run_files import warm_up
 from slamgym.experiments.job_folders import MANIFEST, WRITER, replace_own
-from slamgym.experiments.monte_carlo_study import merge_blocks, monte_carlo
+from slamgym.experiments.monte_carlo_study import merge_blocks, monte_carlo, results
 from slamgym.experiments.run_and_replay.filter_settings import FilterSettings
 
 RUNS = 12
@@ -297,6 +297,19 @@ def test_parts_of_two_machines_are_merged_without_their_rests(tmp_path, whole):
     ) as merged:
         xr.testing.assert_equal(merged.load(), whole)
     assert done == [RUNS]  # there was nothing left to do
+
+
+def test_blocks_written_together_are_those_read_and_written_one_by_one(
+    tmp_path, whole, monkeypatch
+):
+    job = JOB | {"estimators": "ekf,invariant", "runs": RUNS - 1}
+    together = monte_carlo(**job, out=tmp_path / "together")
+    for limit in ("_MOST_JOINED", "_MOST_NEW"):
+        monkeypatch.setattr(results, limit, 0)
+    one_by_one = monte_carlo(**job, out=tmp_path / "one by one")
+    xr.testing.assert_identical(together, one_by_one)
+    first = together.sel(estimator=["ekf"], run=range(RUNS - 1))
+    xr.testing.assert_equal(first, whole.isel(run=slice(RUNS - 1)))
 
 
 def test_a_damaged_block_is_not_merged(tmp_path):
