@@ -5,6 +5,7 @@ from itertools import combinations, permutations
 import networkx as nx
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from slamgym.estimator.association import constellations
 from slamgym.estimator.association import constellations as same_place
@@ -101,6 +102,45 @@ def test_pairs_agree_where_distance_and_direction_do():
             close = gap**2 <= 400.0 * 4 * STD**2 and abs(turn) <= 1.0
             assert agree[s, t] == (i != j and p != q and close)
     assert 20 < agree.sum() < 200
+
+
+def test_a_table_holds_lengths_their_variances_and_directions():
+    rng = np.random.default_rng(4)
+    points, root = rng.uniform(0, 6, (4, 2)), rng.standard_normal((16, 16))
+    P = root @ root.T
+    places = TwoPlaces(points, points + 1.0, P, 1.0)
+    for table, part in zip(constellations.tables(places), (P[:8, :8], P[8:, 8:])):
+        for i, j in permutations(range(4), 2):
+            d = points[j] - points[i]
+            unit, H = d / np.linalg.norm(d), np.zeros(8)
+            H[2 * j : 2 * j + 2], H[2 * i : 2 * i + 2] = unit, -unit
+            expected = np.linalg.norm(d), H @ part @ H, np.arctan2(*d[::-1])
+            np.testing.assert_allclose(table[:, i, j], expected, rtol=1e-9)
+
+
+def test_a_rival_may_match_nearly_as_many_landmarks_as_the_first(monkeypatch):
+    floors, search = [], constellations.largest_clique
+
+    def noted(pairs, agree, floor, nodes):
+        floors.append(floor)
+        return search(pairs, agree, floor, nodes)
+
+    monkeypatch.setattr(constellations, "largest_clique", noted)
+    here = np.concatenate([GROUP, [(-3.0, 4.0)]])
+    places, may = two_places(noisy(here), here), np.full((8, 8), True)
+    for margin, rival in ((1, 6), (3, 5), (9, 2)):
+        rules = Constellations(least=5, margin=margin)
+        found = constellations.agreeing_pairs(places, may, rules, most=2)
+        assert floors[-2:] == [4, rival]
+        assert len(found[0].local) == 8
+    twice = np.concatenate([here, shifted(here, 40.0)])
+    places, may = two_places(noisy(here), twice, drift=30.0), np.full((8, 16), True)
+    for most in (1, 2):
+        found = constellations.agreeing_pairs(places, may, rules, most)
+        assert [len(match.older) for match in found] == [8] * most
+    few = Constellations(least=5, search_nodes=1)
+    ((local, older),) = constellations.agreeing_pairs(places, may, few, most=2)
+    assert (len(local), len(older)) == (0, 0)  # the search has reached its limit
 
 
 def largest_by_trying_all(a, b, gate):
@@ -215,6 +255,96 @@ def test_the_order_of_the_landmarks_does_not_matter():
 # --- the statistics ---
 
 
+def random_places(seed):
+    """Return two maps, the local one turned, with correlated errors; and a match."""
+    rng = np.random.default_rng(seed)
+    older = rng.uniform(0, 9, (9, 2))
+    again = np.array([4, 0, 7, 2, 8, 1])  # of the local landmarks, in their order
+    local = shifted(turned(older[again], 0.4), 3.0, -1.0)
+    local = np.concatenate([local, rng.uniform(0, 9, (2, 2))])
+    root = 0.02 * rng.standard_normal((34, 34))
+    drift = np.zeros((34, 2))
+    drift[0:16:2, 0] = drift[1:16:2, 1] = 2.0
+    places = TwoPlaces(local, older, root @ root.T + drift @ drift.T, np.pi)
+    places.local[:] += rng.multivariate_normal(np.zeros(34), root @ root.T)[
+        :16
+    ].reshape(8, 2)
+    return places, Match(np.array([0, 2, 3, 5]), again[[0, 2, 3, 5]])
+
+
+def plain_offsets(places, match, phi):
+    """Return r and its covariance, entry by entry."""
+    V = (np.exp(-1j * phi) - 1) / (-1j * phi)
+    r, H = [], np.zeros((2 * len(match.local), 34))
+    for k, (i, p) in enumerate(zip(*match, strict=True)):
+        offset = complex(*(places.local[i] - places.older[p])) / V
+        r += [offset.real, offset.imag]
+        H[2 * k : 2 * k + 2, 16 + 2 * p : 18 + 2 * p] = np.eye(2)
+        H[2 * k : 2 * k + 2, 2 * i : 2 * i + 2] = -np.eye(2)
+    return np.array(r), H @ places.covariance @ H.T
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_match_moves_the_local_map_onto_its_partners(seed):
+    places, match = random_places(seed)
+    exact = places._replace(local=shifted(turned(places.older, 0.4), 3.0, -1.0))
+    some = Match(np.array([5, 1, 2]), np.array([5, 1, 2]))
+    assert same_place.turn_between(exact, some) == pytest.approx(-0.4)
+    found = same_place.moved(exact, some, exact.local)
+    np.testing.assert_allclose(found, exact.older, atol=1e-12)
+    away = np.linalg.norm(exact.older[:, None] - exact.older, axis=2)
+    np.testing.assert_allclose(same_place.moved_gaps(exact, some), away, atol=1e-12)
+    r, S = plain_offsets(places, match, same_place.turn_between(places, match))
+    b = places.older[match.older]
+    G = np.zeros((8, 3))
+    G[0::2, 0] = G[1::2, 1] = 1.0
+    G[0::2, 2], G[1::2, 2] = (b.mean(axis=0) - b).T[1], (b - b.mean(axis=0)).T[0]
+    W = np.linalg.inv(S)
+
+    def left(modes):
+        fit = np.linalg.solve(modes.T @ W @ modes, modes.T @ W @ r)
+        return (r - modes @ fit) @ W @ (r - modes @ fit)
+
+    shape, displacement = left(G), left(G[:, 2:]) - left(G)
+    expected = shape, displacement
+    np.testing.assert_allclose(same_place.misfit(places, match), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_pairs_are_added_that_fit_given_the_matched_ones(seed, monkeypatch):
+    places, match = random_places(seed)
+    phi = same_place.turn_between(places, match)
+    gaps = same_place.moved_gaps(places, match)
+    left = [i for i in range(8) if i not in match.local]
+    free = [p for p in range(9) if p not in match.older]
+    added, squares = [], []
+    for i in left:
+        p = min(free, key=lambda p: gaps[i, p])
+        if i != min(left, key=lambda i: gaps[i, p]):
+            continue
+        r, S = plain_offsets(places, Match([*match.local, i], [*match.older, p]), phi)
+        gain = S[8:, :8] @ np.linalg.inv(S[:8, :8])
+        nu, C = r[8:] - gain @ r[:8], S[8:, 8:] - gain @ S[:8, 8:]
+        squares.append(nu @ np.linalg.solve(C, nu))
+        added.append((i, p))
+    gate = np.median(squares)  # half of them pass
+    monkeypatch.setattr(same_place, "PAIR_GATE", 1.0001 * gate)
+    found = same_place.extended(places, match)
+    kept = [pair for pair, x in zip(added, squares, strict=True) if x <= gate]
+    expected = [*zip(*match, strict=True), *kept]
+    assert list(zip(*(each.tolist() for each in found), strict=True)) == expected
+    assert len(match.local) < len(expected) < len(match.local) + len(added)
+
+
+def test_a_match_is_plausible_up_to_the_tail_of_each_test(monkeypatch):
+    match = Match(np.arange(6), np.arange(6))
+    limits = np.array([chi2.isf(1e-4, 2 * 6 - 3), chi2.isf(1e-4, 2)])
+    for excess in ((0, 0), (1e-6, 0), (0, 1e-6)):
+        found = tuple(limits - 1e-9 + excess)
+        monkeypatch.setattr(same_place, "misfit", lambda *_, found=found: found)
+        assert same_place.is_plausible(None, match) == (not any(excess))
+
+
 def test_the_tests_have_the_chi_square_of_their_degrees_at_any_heading_error():
     """Estimates are drawn from the invariant error, whose heading has σ = 0.5 rad."""
     rng = np.random.default_rng(0)
@@ -275,14 +405,26 @@ def test_a_covariance_without_rank_recognises_no_place(others):
     assert match_constellations(certain, may, rules) is None
 
 
-@pytest.mark.parametrize("crowded", [None, "local", "older"])
-def test_a_place_is_filled_where_neither_map_has_many_landmarks_more(crowded):
+def test_rules_may_be_as_small_as_they_can_be():
+    assert Constellations(least=3, margin=1, search_nodes=1).least == 3
+
+
+@pytest.mark.parametrize("crowded", [None, "far", "local", "older"])
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_place_is_filled_where_neither_map_has_many_landmarks_more(crowded, count):
+    """Four of six landmarks have a partner, or four of seven."""
     square = np.array([[2.0, 2.0], [-2.0, 2.0], [-2.0, -2.0], [2.0, -2.0]])
-    more = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    maps = dict.fromkeys(("local", "older"), square)
-    if crowded:
-        maps[crowded] = np.concatenate([square, more])
-    size = 2 * sum(map(len, maps.values()))
-    places = TwoPlaces(**maps, covariance=np.eye(size), largest_turn=1.0)
+    more = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])[:count]
+    local, older = square, square
+    if crowded in ("local", "far"):
+        local = np.concatenate([square, more - [9.0 * (crowded == "far"), 0.0]])
+    if crowded == "older":
+        older = np.concatenate([square, more])
+    size = 2 * (len(local) + len(older))
+    places = TwoPlaces(shifted(local, 10.0, -3.0), older, np.eye(size), 1.0)
     match = Match(np.arange(4), np.arange(4))
-    assert same_place.is_filled(places, match) == (crowded is None)
+    is_filled = crowded in (None, "far") or count == 2
+    assert same_place.is_filled(places, match) == is_filled
+    five = np.concatenate([square[:3], [(-0.6, 0.6), (-0.7, 0.7)]])
+    edge = TwoPlaces(five, five, np.eye(20), 1.0)  # three of five are enough
+    assert same_place.is_filled(edge, Match(np.arange(3), np.arange(3)))

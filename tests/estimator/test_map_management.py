@@ -480,6 +480,8 @@ def test_a_scan_should_show_what_is_well_in_view_and_not_behind_a_reading():
     assert edge.expects(np.zeros(3), at, np.empty((0, 2))).all()
     (behind, before) = edge.expects(np.zeros(3), at, np.array([(-0.5, 1.5)]))
     assert (behind, before) == (False, True)  # on the edge of the shadow
+    for edge in (FieldOfView(5.0), FieldOfView(5.0, angle=1.0, bearing_margin=0.5)):
+        assert edge.expects(np.zeros(3), at, np.array([(0.0, 1.0)])).all()
 
 
 def test_landmarks_matter_as_far_as_a_scan_reads_and_as_they_may_be_missed():
@@ -506,8 +508,22 @@ def test_the_visibility_model_is_asked_in_the_frame_of_the_map():
     np.testing.assert_allclose(landmarks, [(5, 1), (4, -2)], atol=1e-9)
 
 
-def test_a_visibility_model_that_answers_nonsense_is_refused():
-    view = FieldOfView(30.0, visible=lambda *_: np.ones(1))
+def test_a_visibility_model_may_write_into_what_it_is_asked():
+    def visible(pose, landmarks):
+        pose[:] = landmarks[:] = np.nan
+        return np.ones(len(landmarks), dtype=bool)
+
+    pose, landmarks = np.zeros(3), np.array([(5.0, 1.0)])
+    view = FieldOfView(30.0, visible=visible)
+    assert view.expects(pose, landmarks, np.empty((0, 2))).all()
+    assert np.isfinite([*pose, *landmarks[0]]).all()
+
+
+@pytest.mark.parametrize(
+    "answer", [np.ones(1, bool), np.ones(2), np.ones((2, 1), bool)]
+)
+def test_a_visibility_model_that_answers_nonsense_is_refused(answer):
+    view = FieldOfView(30.0, visible=lambda *_: answer)
     slam = make(management={"view": view, "remove_after": 2})
     slam.update(polar([(5, 1), (4, -2)]), [0, 1])
     before = digest(slam)
@@ -625,9 +641,19 @@ def test_landmarks_seen_side_by_side_are_never_one():
 
 @pytest.mark.parametrize("name", ["ekf", "compressed"])
 def test_landmarks_seen_together_are_apart_up_to_twice_the_distance_of_a_merge(name):
-    slam = make(name, {"merge_within": 1.0})
-    slam.update(polar([(4, 0), (4, 1.5), (4, 4.5)]), [0, 1, 2])
-    assert slam.best.pruner.records.apart == {(0, 1)}
+    slam, other = (make(name, {"merge_within": 1.25}) for _ in range(2))
+    slam.update(polar([(4, 0), (4, 2.2), (4, 5.2)]), [0, 1, 2])
+    other.load_state_dict(slam.state_dict())
+    for each in (slam, other):
+        assert each.best.pruner.records.apart == {(0, 1)}
+
+
+def test_a_landmark_with_two_duplicates_is_one_after_a_scan_of_the_last():
+    apart, slam = make(management={}), make(management={"merge_within": 1.0})
+    for k in range(60):
+        apart.update(polar([(5, 1), (-3, 2)]), [k % 3, 9])
+    slam.load_state_dict(apart.state_dict())
+    assert slam.update(polar([(5, 1)]), [2]).merged_ids == ((0, 2), (0, 1))
 
 
 @pytest.mark.parametrize("name", MANAGEABLE)
@@ -638,9 +664,10 @@ def test_landmarks_are_merged_and_removed_by_hand_too(name):
         slam.update(polar(places), [0, 1, 2])
     slam.update(polar(places[2:]), [7])
     slam.merge(2, 7)
+    assert slam.best.pruner.records.ids == slam.landmark_ids
     assert slam.update(polar(places[2:]), [7]).row_ids == (2,)
     slam.remove([1])
-    assert slam.landmark_ids == (0, 2)
+    assert slam.landmark_ids == slam.best.pruner.records.ids == (0, 2)
     np.testing.assert_allclose(slam.belief([2]).landmarks, [(6, 2)], atol=0.01)
     for refused in (lambda: slam.remove([0, 1]), lambda: slam.merge(0, 7)):
         with pytest.raises(ValueError, match="mapped landmarks, got"):
@@ -674,8 +701,9 @@ def test_records_of_merged_landmarks_are_those_of_one_with_all_their_names():
     records.apart = {(9, 11)}
     records.join(7, 9)
     records.join(4, 7)
-    assert records.misses[0] == 1  # it was seen as 9
-    assert records.information[0].tolist() == [9, 12, 15]
+    assert records.misses.tolist() == [1, 1, 1, 0]  # it was seen as 9
+    expected = [[9, 12, 15], [9, 11, 13], [6, 7, 8], [9, 10, 11]]
+    assert records.information.tolist() == expected
     assert records.aliases == {7: 4, 9: 4}
     records.follow([4, 11])
     assert records.apart == {(4, 11)}
