@@ -87,15 +87,39 @@ def test_only_goals_too_near_to_walls_are_moved(grid):
     stays = (moved == goals).all(axis=1)
     assert 20 < np.count_nonzero(~stays) < 150
     assert grid.clearance(goals[~stays]).max() < grid.clearance(moved).min() + 1e-9
+    cells = np.column_stack([grid.cells.real, grid.cells.imag])
+    free = cells[grid.routes.reachable & (grid.clearance(cells) >= MARGIN)]
+    for goal, other in zip(goals[~stays], moved[~stays], strict=True):
+        nearest = np.argmin(np.hypot(*(free - goal).T))
+        np.testing.assert_array_equal(other, free[nearest])
+
+
+def test_goals_outside_the_floor_are_moved_onto_it():
+    """A floor of 10 m by 6 m with an inner wall."""
+    x, y = (-4, 6, 6, -4, -4), (2, 2, 8, 8, 2)
+    walls = [[x[k], y[k], x[k + 1], y[k + 1]] for k in range(4)] + [[0, 2, 0, 4]]
+    start = {"pose": [4.0, 5.0, 0.0]}
+    bounds = {"bounds": [-3, 3, 5, 7]}
+    world = ROOMS.with_changes(walls=walls, start=start, landmarks=bounds)
+    outside = [(-6.0, 5.0), (7.2, 5.0), (3.0, 0.0), (3.0, 10.0)]
+    goals = np.array([*outside, (3.0, 5.0), (3.0, 7.2)])
+    moved = CoverageGrid(world).routes.kept_clear(goals)
+    assert (moved > (-4, 2)).all()
+    assert (moved < (6, 8)).all()
+    np.testing.assert_array_equal(moved[4:], goals[4:])
+    plain = CoverageGrid(world.with_changes(walls=walls[:4])).routes
+    corners = plain.kept_clear(np.array([(-99.0, -99.0), (99.0, 99.0)]))
+    np.testing.assert_array_equal(corners, [(-3, 3), (5, 7)])
 
 
 def test_ways_on_a_floor_without_inner_walls_are_straight():
     grid = CoverageGrid(load_scenario("active_easy"))
-    start, goal = np.array([-3.0, 2.0]), np.array([[4.0, -1.0], [5.9, 6.0]])
+    start, goal = np.array([-3.0, 2.0]), np.array([[4.0, -1.0], [5.9, 6], [-5.9, -6]])
     np.testing.assert_array_equal(grid.routes.legs(start, goal[0]), goal[:1])
     expected = np.hypot(*(goal - start).T)
     np.testing.assert_allclose(grid.routes.distances(start[None], goal)[0], expected)
-    np.testing.assert_array_equal(grid.routes.kept_clear(goal), [[4, -1], [5, 5]])
+    kept = grid.routes.kept_clear(goal)
+    np.testing.assert_array_equal(kept, [[4, -1], [5, 5], [-5, -5]])
     assert grid.routes.reachable.all()
 
 

@@ -109,7 +109,8 @@ def test_a_table_holds_lengths_their_variances_and_directions():
     points, root = rng.uniform(0, 6, (4, 2)), rng.standard_normal((16, 16))
     P = root @ root.T
     places = TwoPlaces(points, points + 1.0, P, 1.0)
-    for table, part in zip(constellations.tables(places), (P[:8, :8], P[8:, 8:])):
+    parts = P[:8, :8], P[8:, 8:]
+    for table, part in zip(constellations.tables(places), parts, strict=True):
         for i, j in permutations(range(4), 2):
             d = points[j] - points[i]
             unit, H = d / np.linalg.norm(d), np.zeros(8)

@@ -9,11 +9,14 @@ import pytest
 from dense_smoother import DenseSmoother
 from drives import MEASUREMENT_STD, MOTION_STD, NOISE, SIX, drive
 from far_origins import far_origins, rounding, shifted
+from numeric_jacobian import numeric_jacobian
 from own_noise import OWN_NOISE, SHIPPED_NOISE
 
 from slamgym.estimator import EkfSlam, make_estimator
 from slamgym.estimator.map_management import ManagedSlam
 from slamgym.estimator.models.bearing_range import wrap_angle
+from slamgym.estimator.models.motions import MotionNoise, predict_pose
+from slamgym.estimator.models.rigid_motion import pose_rotation
 from slamgym.estimator.models.sensors import (
     BEARING,
     BEARING_RANGE,
@@ -28,7 +31,7 @@ from slamgym.estimator.smoother import (
     reassociate,
     smooth,
 )
-from slamgym.estimator.smoother.drive import Sightings, landmark_order
+from slamgym.estimator.smoother.drive import Sightings, landmark_order, path_between
 from slamgym.estimator.smoother.elimination import PART
 from slamgym.estimator.smoother.optimiser import (
     Estimate,
@@ -577,8 +580,49 @@ def test_a_refused_scan_leaves_the_drive_as_it_was(scan, ids):
 
 def test_readings_below_the_minimum_range_are_skipped():
     made = Drive(MOTION_STD, MEASUREMENT_STD, min_range=1.0)
-    made.update([(0.0, 0.5), (0.1, 2.0)], [0, 1])
-    assert made.landmark_ids == (1,)
+    made.update([(0.0, 0.99), (0.1, 2.0), (0.2, 1.0)], [0, 1, 2])
+    assert made.landmark_ids == (1, 2)
+
+
+def test_a_reading_of_a_pose_without_a_scan_has_a_pose_of_its_own():
+    made = Drive(**NOISE)
+    made.update([(0.0, 2.0)], [3])
+    made.predict((1.0, 0.0))
+    made.observe_pose(0.1, [0, 0, 1], 0.01)
+    assert made.poses == 2
+    assert [len(made.pose_readings(k)) for k in range(2)] == [0, 1]
+    other = made.with_scans([made.sightings(0)._replace(ids=np.array([8]))])
+    assert (made.landmark_ids, other.landmark_ids) == ((3,), (8,))
+
+
+def test_a_path_between_scans_is_what_is_expected_given_both_of_its_ends():
+    """The noise of all readings, conditioned on where they lead, to first order."""
+    noise = MotionNoise.checked((0.2, 0.1, 0.15), noise_at_rest=True)
+    steps = [(1.0, 0.5, 1.0), (0.7, -0.9, 2.0), (1.2, 0.4, 0.5)]
+
+    def path(slips):
+        pose, found = np.zeros(3), []
+        for (*odometry, _), slip in zip(steps, slips.reshape(-1, 3), strict=True):
+            moved = predict_pose(pose, odometry)
+            pose = moved.pose + moved.jacobian_noise @ slip
+            found.append(pose)
+        return np.concatenate(found)
+
+    made = Drive((0.2, 0.1, 0.15), MEASUREMENT_STD)
+    made.update([(0.0, 3.0)], [1])
+    for *odometry, dt in steps:
+        made.predict(odometry, dt)
+    made.update([(0.0, 3.0)], [1])
+    nominal, J = path(np.zeros(9)), numeric_jacobian(path, np.zeros(9))
+    variances = np.concatenate([noise.variance * dt for *_, dt in steps])
+    P = J @ np.diag(variances) @ J.T
+    gap, first = np.array([0.1, -0.2, 0.05]), np.array([1.0, 2.0, 0.6])
+    inside = (nominal + P[:, 6:] @ np.linalg.solve(P[6:, 6:], gap)).reshape(3, 3)
+    turn = pose_rotation(0.6)
+    ends = np.array([first, first + turn @ inside[-1]])
+    expected = [first, *(first + turn @ pose for pose in inside)]
+    found = path_between(ends, made.motions, noise)
+    np.testing.assert_allclose(found, expected, atol=1e-8)
 
 
 def test_a_drive_assumes_by_default_what_filters_assume():
