@@ -1,4 +1,4 @@
-"""The defaults of public names and of commands are those recorded in defaults.txt.
+"""Defaults of public names and of commands, and limits, are those that are recorded.
 
 Who changes one changes what others get, so the changelog must tell it.
 """
@@ -6,7 +6,9 @@ Who changes one changes what others get, so the changelog must tell it.
 import importlib
 import inspect
 import pkgutil
+from ast import literal_eval
 from dataclasses import fields, is_dataclass
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -86,3 +88,14 @@ def test_defaults_are_as_recorded():
         RECORDED.write_text("\n".join([*lines, ""]))
         pytest.fail(f"recorded {RECORDED}: read it, and run the test again")
     assert lines == RECORDED.read_text().splitlines()
+
+
+LIMITS = Path(__file__).with_name("limits.txt").read_text().splitlines()
+
+
+@pytest.mark.parametrize("line", LIMITS, ids=lambda line: line.split()[0])
+def test_limits_without_a_formula_are_as_recorded(line):
+    name, *limits = line.split()
+    module = importlib.import_module(f"slamgym.{name}")
+    for key, _, value in (limit.partition("=") for limit in limits):
+        assert attrgetter(key)(module) == literal_eval(value), key

@@ -8,6 +8,7 @@ from scipy.special import xlogy
 
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.motions import predict_pose
+from slamgym.estimator.models.rigid_motion import rotation
 from slamgym.estimator.smoother import Drive, reassociate, smooth
 from slamgym.estimator.smoother.drive import Sightings
 from slamgym.estimator.smoother.reassociation import (
@@ -16,6 +17,7 @@ from slamgym.estimator.smoother.reassociation import (
     _Association,
     _prices,
     _Search,
+    _surprise,
 )
 
 MOTION_STD, MEASUREMENT_STD = (0.02, 0.01, 0.01), (0.02, 0.1)
@@ -283,6 +285,171 @@ def test_a_landmark_dies_with_fewer_than_three_readings(readings, dies):
     labels = np.full(len(costs), NONE)
     labels[np.flatnonzero(costs[:, 0] < PRICE / 2)[:readings]] = 0
     assert search.death(labels, costs, price=1.0) == dies
+
+
+def scored(score, labels=(), places=(), covariance=()):
+    """Return an association of which only these parts count."""
+    parts = np.array(labels, dtype=int), np.zeros((1, 3)), np.array(places, dtype=float)
+    return _Association(*parts, score, 0.0, np.array(covariance))
+
+
+def test_a_drive_is_first_smoothed_from_the_mean_places_of_its_readings(monkeypatch):
+    path, right = two_laps(1)
+    search, given = _Search(right), []
+    for scores in ((1.0, 2.0), (2.0, 1.0), (None, 3.0), (3.0, None)):
+        one, other = (None if each is None else scored(each) for each in scores)
+        keep = lambda *args, one=one: given.append(args) or one  # noqa: E731
+        monkeypatch.setattr(search, "smoothed", keep)
+        monkeypatch.setattr(search, "begun", lambda _, other=other: other)
+        least = min(score for score in scores if score)
+        assert search.first(path).score == least
+    labels, _, places = given[0]
+    located = search.located(path)
+    for i in range(len(WORLD)):
+        np.testing.assert_allclose(places[i], located[labels == i].mean(axis=0))
+    sides = np.log(np.ptp(located, axis=0)).sum()
+    assert search.log_area == pytest.approx(sides)
+
+
+def test_small_changes_count_if_they_lower_the_score_significantly(monkeypatch):
+    search, scores = _Search(two_laps(1)[1]), iter([9.95, 9.8, 9.75, 9.0, 8.95, 8.91])
+    for name in ("joined", "rearranged"):
+        monkeypatch.setattr(search, name, lambda _: scored(next(scores)))
+    assert search.settled(scored(10.0)).score == 9.0
+    assert next(scores, None) is None
+    falling = iter(range(99))
+    monkeypatch.setattr(search, "joined", lambda _: scored(-next(falling)))
+    assert search.settled(scored(10.0)).score == -7.0  # after eight rounds
+
+
+def test_landmarks_are_born_then_die_and_readings_go_to_the_others(monkeypatch):
+    path, right = two_laps(1)
+    search = _Search(right)
+    state, given = search.first(path), []
+    fewer = state._replace(places=state.places[:-2], covariance=state.covariance)
+    fewer = fewer._replace(covariance=state.covariance[:-4, :-4])
+    fewer = fewer._replace(labels=np.where(state.labels < 12, state.labels, NONE))
+    births, deaths = iter([*state.places[-2:], None]), iter([1, 0, None])
+    monkeypatch.setattr(search, "birth", lambda *_: next(births))
+    monkeypatch.setattr(search, "death", lambda *_: next(deaths))
+    monkeypatch.setattr(search, "smoothed", lambda *args: given.append(args))
+    search.rearranged(fewer)
+    ((labels, poses, places),) = given
+    np.testing.assert_array_equal(places, state.places[2:])
+    assert poses is state.poses
+    costs = search.costs(state.poses, places)
+    np.testing.assert_array_equal(labels, search.assigned(costs))
+
+
+def test_the_landmark_dies_whose_readings_fit_others_best():
+    search, rng = _Search(two_laps(1)[1]), np.random.default_rng(3)
+    costs = rng.uniform(0, 1.5 * PRICE, (len(search.owners), 4))
+    labels = search.assigned(costs)
+    labels[rng.random(len(labels)) < 0.9] = NONE
+    losses = np.zeros(4)
+    for i in np.flatnonzero(labels != NONE):
+        shown = {*labels[search.owners == search.owners[i]].tolist()}
+        others = [costs[i, j] for j in range(4) if j not in shown]
+        losses[labels[i]] += min([PRICE, *others]) - costs[i, labels[i]]
+    worst = int(losses.argmin())
+    assert search.death(labels, costs, losses[worst] + 1e-9) == worst
+    assert search.death(labels, costs, losses[worst] - 1e-9) is None
+    labels[np.flatnonzero(labels == worst)[2:]] = NONE
+    assert search.death(labels, costs, -99.0) == worst  # with two readings
+
+
+def test_landmarks_are_joined_that_are_likely_one_and_never_seen_together(monkeypatch):
+    search, rng, given = _Search(two_laps(1)[1]), np.random.default_rng(5), []
+    places = np.repeat(rng.uniform(-9, 9, (4, 2)), 3, axis=0)
+    places += 0.05 * rng.standard_normal(places.shape)
+    root = 0.05 * rng.standard_normal((24, 24))
+    labels = np.full(len(search.owners), NONE)
+    labels[search.starts] = np.arange(len(search.starts)) % 12
+    first = search.starts[0]
+    labels[[first, first + 1]] = 0, 1  # in one scan
+    search.log_area, P, losses = 5.0, root @ root.T, []
+    for i in range(12):
+        for j in range(i + 1, 12):
+            H = np.zeros((2, 24))
+            H[:, 2 * i : 2 * i + 2], H[:, 2 * j : 2 * j + 2] = np.eye(2), -np.eye(2)
+            D, d = H @ P @ H.T, places[i] - places[j]
+            loss = d @ np.linalg.solve(D, d) / 2 - 5.0
+            loss += np.log(2 * np.pi * np.sqrt(np.linalg.det(D)))
+            losses.append((loss, i, j))
+    rename, free = np.arange(12), {*range(12)}
+    for loss, i, j in sorted(losses):
+        if loss < 0 and {i, j} <= free and (i, j) != (0, 1):
+            rename[j], free = i, free - {i, j}
+    assert 2 < len({*rename.tolist()}) < 12
+    monkeypatch.setattr(search, "smoothed", lambda *args: given.append(args))
+    search.joined(scored(0.0, labels, places, P))
+    np.testing.assert_array_equal(
+        given[0][0], np.where(labels == NONE, NONE, rename[labels])
+    )
+    apart = scored(0.0, labels, 99.0 * np.arange(24.0).reshape(12, 2), P)
+    assert search.joined(apart) is None
+
+
+def test_landmarks_of_a_later_part_are_matched_by_one_rigid_motion():
+    search, rng = _Search(two_laps(1)[1]), np.random.default_rng(6)
+    early = rng.uniform(-9, 9, (7, 2))
+    turn = rotation(0.3)
+    late = np.concatenate([early[[4, 1, 6, 2]] @ turn.T + 2.0, [(30.0, 1.0)]])
+    P = 1e-4 * np.eye(24)
+    P[:10, :10] += 4.0 * np.kron(np.ones((5, 5)), np.eye(2))
+    labels = np.full(len(search.owners), NONE)
+    labels[search.starts[:12]] = np.arange(12)  # none are seen together
+    state = scored(0.0, labels, np.concatenate([late, early]), P)
+    rows = np.arange(5), 5 + np.arange(7)
+    first, *_ = search.matches(state, *rows)
+    assert sorted(first.tolist()) == [[0, 9], [1, 6], [2, 11], [3, 7]]
+    two = scored(0.0, labels, np.concatenate([late[[0, 1, 4, 4, 4]], early]), P)
+    assert all(len(pairs) > 2 for pairs in search.matches(two, *rows))
+    assert not list(search.matches(state, rows[0][:2], rows[1]))
+    labels[search.starts[0] + 1] = 9  # seen together with 0
+    first, *_ = search.matches(state._replace(labels=labels), *rows)
+    assert sorted(first.tolist()) == [[1, 6], [2, 11], [3, 7]]
+
+
+def test_a_drive_is_rebuilt_part_by_part_where_matches_lower_the_score(monkeypatch):
+    search, seen, done = _Search(two_laps(1)[1]), [], []
+    first = np.arange(len(search.owners)) % 3 + 3 * (search.owners >= 13)
+    scores = iter([10.0, 12.0, 8.0, 9.0, *[20.0] * 50])
+
+    def begun(labels):
+        seen.append(labels)
+        return scored(next(scores), first, np.zeros((6, 2)))
+
+    pairs = [np.array([(4, 1)]), np.array([(3, 0), (5, 2)]), np.array([(4, 2)])]
+    given = []
+
+    def matches(state, late, early):
+        given.append((state.score, late.tolist(), early.tolist()))
+        return pairs
+
+    monkeypatch.setattr(search, "begun", begun)
+    monkeypatch.setattr(search, "matches", matches)
+    monkeypatch.setattr(search, "joined", lambda _: None)
+    monkeypatch.setattr(search, "settled", lambda state: state)
+    state = scored(0.0, first)
+    assert search.rebuilt(state, done.append).score == 8.0
+    np.testing.assert_array_equal(seen[0], search.visits(first))
+    renamed_ = [first.copy() for _ in pairs]
+    for labels, match in zip(renamed_, pairs, strict=True):
+        for gone, kept in match:
+            labels[first == gone] = kept
+    np.testing.assert_array_equal(seen[1:4], renamed_)
+    assert given[0] == (10.0, [3, 4, 5], [0, 1, 2])  # a part has 13 scans
+    assert [score for score, *_ in given[1:]] == [8.0] * (len(given) - 1)
+    assert done == list(range(1, 8))
+
+
+def test_detections_are_as_unlikely_as_their_rates_say():
+    for counts in np.array([[[4, 1], [2, 0]], [[0, 0], [3, 1]], [[1, 1], [0, 5]]]):
+        rates = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+        assert _surprise(counts) == pytest.approx(-xlogy(counts, rates).sum())
+        more = [(n + 0.5) / (sum(row) + 1) for row in counts for n in row]
+        np.testing.assert_allclose(_prices(counts).ravel(), -np.log(more))
 
 
 def test_progress_and_refusals():

@@ -267,31 +267,3 @@ def test_an_entry_is_a_copy_of_what_it_must_be(kind, shape, taken, refused):
     for value in refused:
         with pytest.raises(ValueError, match=r"state\['key'\] must|landmark_ids"):
             kind.checked("key", value, shape)
-
-
-def test_sizes_of_a_table_are_those_of_the_first_entry_with_their_letter():
-    table = {
-        "ids": (guard.IDS, "n"),
-        "mean": (guard.NUMBERS, "3+2n"),
-        "more": (guard.NUMBERS, "2n", "m"),
-        "rows": (guard.NUMBERS, "m", 2),
-    }
-    sizes = {"ids": 4, "mean": 11, "more": (8, 3), "rows": (3, 2)}
-    state = {key: np.arange(np.prod(size)).reshape(size) for key, size in sizes.items()}
-    found = guard.read(state, table, "of.")
-    assert {key: np.shape(found[key]) for key in sizes} == {
-        key: np.empty(size).shape for key, size in sizes.items()
-    }
-    for key in ("mean", "more", "rows"):
-        with pytest.raises(ValueError, match=rf"state\['of.{key}'\] must have shape"):
-            guard.read(state | {key: state[key][1:]}, table, "of.")
-    with pytest.raises(ValueError, match=r"'of.rows'\] must have shape \(5, 2\)"):
-        guard.read(state | {"more": np.zeros((8, 5))}, table, "of.")
-    saved = guard.write(
-        {"ids": {3, 1, 2, 0}, "mean": [], "more": {1: 2.0, 3: 4.0}, "rows": []},
-        {**table, "mean": (guard.NUMBERS, -1), "more": (guard.NUMBERS, -1, 2),
-         "rows": (guard.NUMBERS, -1, 2)},
-    )  # fmt: skip
-    assert saved["ids"].tolist() == [0, 1, 2, 3]
-    assert saved["more"].tolist() == [[1, 2], [3, 4]]
-    assert (saved["mean"].shape, saved["rows"].shape) == ((0,), (0, 2))
