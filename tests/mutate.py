@@ -49,9 +49,7 @@ class Tests(NamedTuple):
     slow: bool = False  # whether also those that carry this mark
 
 
-SCANS = (
-    "association decisions symmetries map_management hypotheses loop_closing defaults"
-)
+SCANS = "association decisions symmetries map_management hypotheses loop_closing"
 LARGE = "estimator/large_maps"
 STUDY = "experiments/monte_carlo_study"
 #: The first tests notice most; those of the longest beginning of a path count.
@@ -60,15 +58,13 @@ TESTS = {
     "agents/active_slam": (
         "active_slam active_slam_pass active_slam_hidden active_slam_honesty"
     ),
-    "agents/active_slam_baselines": "planners defaults wall_routes active_slam",
-    "agents/active_slam_scores": (
-        "active_slam active_slam_honesty active_slam_hidden defaults"
-    ),
-    "agents/active_slam_task": "active_slam active_slam_pass landmark_set defaults",
+    "agents/active_slam_baselines": "planners wall_routes active_slam",
+    "agents/active_slam_scores": "active_slam active_slam_honesty active_slam_hidden",
+    "agents/active_slam_task": "active_slam active_slam_pass landmark_set",
     "agents/belief_": "belief_observation information_reward state_and_restore",
-    "agents/belief_space_planner": "planners defaults wall_routes active_slam",
-    "agents/landmark_set": "landmark_set belief_observation defaults",
-    "agents/wall_routes": "planners defaults wall_routes active_slam",
+    "agents/belief_space_planner": "planners wall_routes active_slam",
+    "agents/landmark_set": "landmark_set belief_observation",
+    "agents/wall_routes": "planners wall_routes active_slam",
     "envs/": "landmark_world streams world_batch models_of_worlds",
     "envs/bearing_range": "bearing_range_sensor world_batch landmark_world",
     "envs/controllers": "controllers vector_controllers drawn_worlds",
@@ -86,7 +82,7 @@ TESTS = {
     "estimator/models/rigid_motion": "error_frames nees submaps joining ekf_slam",
     "estimator/models/motions": "motions ekf_slam",
     "estimator/models/model_checks": "sensors motions",
-    "estimator/models/sensor": "sensors defaults",
+    "estimator/models/sensor": "sensors",
     "estimator/beliefs": "representations relative_geometry map_editor saved_states",
     "estimator/check_estimator": "check_estimator",
     "estimator/covariance_checks": "check_estimator",
@@ -98,7 +94,7 @@ TESTS = {
         "ekf_slam filter_family association joint_assignment map_management"
     ),
     "estimator/filters/batch": "batch",
-    "estimator/filters/delayed_landmarks": "sensors saved_states defaults",
+    "estimator/filters/delayed_landmarks": "sensors saved_states",
     "estimator/filters/drive_likelihood": "drive_likelihood",
     "estimator/filters/imagine": "imagine",
     "estimator/filters/pose_readings": "pose_readings map_editor loop_closing",
@@ -106,26 +102,24 @@ TESTS = {
         "ekf_slam filter_family filter_memory map_management"
     ),
     "estimator/association": f"{SCANS} joint_assignment",
-    "estimator/association/constellations": "constellations loop_closing defaults",
-    "estimator/association/missed_landmarks": (
-        "missed_detections map_management defaults"
-    ),
+    "estimator/association/constellations": "constellations loop_closing",
+    "estimator/association/missed_landmarks": "missed_detections map_management",
     "estimator/guards": "saved_states errors_change_nothing magnitudes",
     "estimator/interface": "representations ekf_slam pose_readings check_estimator",
     "estimator/map_management": f"{SCANS} missed_detections map_editor",
     "estimator/map_management/clear_scans": "clear_scans map_management",
     "estimator/map_management/recent_scans": f"{SCANS} clear_scans",
     "estimator/map_management/map_editor": "map_editor map_management",
-    f"{LARGE}/compressed": "compressed large_maps errors_change_nothing defaults",
+    f"{LARGE}/compressed": "compressed large_maps errors_change_nothing",
     f"{LARGE}/elimination": "submaps sparse_information smoother",
     f"{LARGE}/multifrontal": "sparse_information",
-    f"{LARGE}/sparse_information": "sparse_information large_maps defaults",
-    f"{LARGE}/submaps": "submaps submap_editing joining large_maps defaults",
+    f"{LARGE}/sparse_information": "sparse_information large_maps",
+    f"{LARGE}/submaps": "submaps submap_editing joining large_maps",
     "estimator/peers": "peers",
     "estimator/registry": (
         "representations models_of_logs filter_family ekf_slam large_maps peers"
     ),
-    "estimator/smoother": "smoother reassociation symmetries defaults",
+    "estimator/smoother": "smoother reassociation symmetries",
     "evaluation/association_scores": "association_scores gospa",
     "evaluation/consistency_report": "consistency_report",
     "evaluation/diagnosis": "diagnosis noise_findings",
