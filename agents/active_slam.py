@@ -32,7 +32,6 @@ from .belief_observation import (
     Filters,
     SeparateFilters,
     choose_filters,
-    scan_of_one,
     update_filters,
 )
 from .estimator_choice import EstimatorChoice, choose_estimator
@@ -188,7 +187,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         """Start an episode with a new map, and take the first scan."""
         observation, info = super().reset(seed=seed, options=options)
         self._explorers.begin(self.start_estimate[None], ONE_WORLD)
-        self._scan(observation, info, moved=~ONE_WORLD)
+        self._scan(observation, info, moved=False)
         self.task.begin(self._filters.storage(), ONE_WORLD)
         return self._output(info, ~ONE_WORLD)
 
@@ -204,7 +203,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         """
         self._steps()  # refuses to step before `reset`
         observation, _, _, _, info = super().step(action)
-        self._scan(observation, info, moved=ONE_WORLD)
+        self._scan(observation, info, moved=True)
         beliefs, collision = self._filters.storage(), np.array([info["collision"]])
         actions = np.asarray(action, dtype=np.float64)[None]
         outcome = self.task.proceed(beliefs, ONE_WORLD, actions, collision)
@@ -234,14 +233,13 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         return int(self.task.episodes.steps[0])
 
     def _scan(
-        self, observation: Observation, info: Mapping[str, Any], *, moved: BoolArray
+        self, observation: Observation, info: Mapping[str, Any], *, moved: bool
     ) -> None:
         """Update the filter with one scan."""
-        true_ids = info.get("landmark_ids")
-        scan = scan_of_one(observation)
-        self._explorers.scan(
-            scan, ONE_WORLD, moved, None if true_ids is None else true_ids[None]
-        )
+        if "landmark_ids" in info:
+            ids, mask = info["landmark_ids"][None], observation["mask"][None]
+            self._explorers.note(ONE_WORLD, ids, mask)
+        self._filters.update_one(observation, moved=moved)
         if self.render_mode is not None:
             self.show_belief(self._filters.belief(0))
 
@@ -388,9 +386,14 @@ class Explorers(Restorable):
         true_ids: IntArray | None,
     ) -> None:
         """Update the filters of some worlds; see `SeparateFilters.update`."""
-        if self._record is not None and true_ids is not None:
-            self._record.add(worlds, true_ids, observations["mask"])
+        if true_ids is not None:
+            self.note(worlds, true_ids, observations["mask"])
         update_filters(self._filters, observations, worlds, moved=moved)
+
+    def note(self, worlds: BoolArray, true_ids: IntArray, mask: BoolArray) -> None:
+        """Note the true landmarks of one scan of some worlds, if scores need them."""
+        if self._record is not None:
+            self._record.add(worlds, true_ids, mask)
 
     def infos(self, landmarks: ComplexArray, ended: BoolArray) -> dict[str, AnyArray]:
         """Return the entries of `info` besides those of the world, each (B,).

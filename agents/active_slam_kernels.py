@@ -90,10 +90,29 @@ def advance(
     Of the chosen worlds, those that move take a step. The progress of the others starts
     from nothing, and they have no outcome. Worlds not chosen stay. The arrays come as
     plain tuples, the entries of `Worlds`, `Floor`, `TaskRules` and `Scratch`: numba
-    takes microseconds to recognise a NamedTuple.
+    takes microseconds to recognise a NamedTuple. All features of a `Worlds` that are
+    numbers come in one array, one feature of all worlds after another.
     """
-    beliefs, actions, collisions, episodes, outcome, counts, of_belief, more = worlds
+    beliefs, actions, collisions, episodes, outcome, counts, numbers, mapped = worlds
     now, result = Episodes(*episodes), StepOutcome(*outcome)
+    count, rows = mapped.shape
+    first, last = 2 * count * rows, 6 * count * rows
+    alone = numbers[:first].reshape(2, count, rows)
+    pairs = numbers[first:last].reshape(2, count, rows, 2)
+    rest = numbers[last:]
+    of_belief = (
+        *(alone[0], alone[1], pairs[0], pairs[1], mapped),
+        rest[: 4 * count].reshape(count, 4),
+        rest[4 * count : 7 * count].reshape(count, 3),
+        rest[7 * count : 10 * count].reshape(count, 3),
+    )
+    more = (
+        rest[10 * count : 19 * count].reshape(count, 9),
+        rest[19 * count : 23 * count].reshape(count, 4),
+        rest[23 * count : 39 * count].reshape(count, 2 * SECTORS),
+        rest[39 * count : 55 * count].reshape(count, 2 * SECTORS),
+        rest[55 * count :].reshape(count, SECTORS),
+    )
     everything = Worlds(
         beliefs, actions, collisions, now, result, counts, of_belief, more
     )

@@ -23,7 +23,7 @@ from ..restorable import Restorable
 from ..sim_configs import Scenario
 from ..sim_configs.scenario import refuse_unknown_keywords
 from .active_slam_kernels import Episodes, StepOutcome, advance
-from .belief_features import belief_space, empty_features
+from .belief_features import belief_space
 from .information_reward import CRITERIA, check_criterion, landmark_prior_std
 from .landmark_set import FEATURES, ObservationForm, write_landmark_sets
 from .wall_routes import SECTORS, CoverageGrid
@@ -35,6 +35,7 @@ _SIZES = {  # of the entries besides the belief
     "unexplored": 2 * SECTORS,
     "walls": SECTORS,
 }
+_OF_SETS = "landmarks", "mask"  # further entries of observations as sets
 
 
 @dataclass(frozen=True)
@@ -134,16 +135,13 @@ class ActiveSlamTask(Restorable):
             np.zeros(landmarks),
             np.zeros((2 * landmarks, 2 * landmarks)),
         )
-        self._forms = {
-            **{
-                key: (row.shape, row.dtype)
-                for key, row in empty_features(*self._shape).items()
-            },
-            **{key: ((count, size), np.dtype(float)) for key, size in _SIZES.items()},
-        }
-        if rows := self._form.rows:
-            self._forms["landmarks"] = (count, rows, len(FEATURES)), np.dtype(float)
-            self._forms["mask"] = (count, rows), np.dtype(np.bool_)
+        #: Where the numbers of each entry are in one array; ``belief_mask`` has none.
+        self._parts: dict[str, slice] = {}
+        self._length = 0
+        for key, box in flat.items():
+            size = count * (box.shape or (0,))[0] * (key != "belief_mask")
+            self._parts[key] = slice(self._length, self._length + size)
+            self._length += size
         self._all = np.ones(count, dtype=np.bool_)
         self._rows: tuple[AnyArray, ...] = ()
         self.episodes = Episodes(
@@ -187,19 +185,20 @@ class ActiveSlamTask(Restorable):
 
     def observations(self) -> dict[str, AnyArray]:
         """Return the observations of all worlds: arrays that no later step changes."""
-        count = self._shape[0]
+        numbers, mapped, *sets = self._rows
         flat = {
-            key: row if row.ndim == 2 or key == "landmarks" else row.reshape(count, -1)
-            for key, row in zip(self._forms, self._rows, strict=True)
+            key: numbers[part].reshape(len(mapped), -1)
+            for key, part in self._parts.items()
         }
-        return self._form.cast(flat)
+        flat["belief_mask"] = mapped
+        return self._form.cast(flat | dict(zip(_OF_SETS, sets, strict=False)))
 
     def observation(self) -> dict[str, AnyArray]:
         """Return the observation of a single world, which no later step changes."""
-        first = {
-            key: row[0] if row.ndim == 2 or key == "landmarks" else row.reshape(-1)
-            for key, row in zip(self._forms, self._rows, strict=True)
-        }
+        numbers, mapped, *sets = self._rows
+        first = {key: numbers[part] for key, part in self._parts.items()}
+        for key, rows in zip(("belief_mask", *_OF_SETS), (mapped, *sets), strict=False):
+            first[key] = rows[0]
         return self._form.cast(first)
 
     def _advance(
@@ -210,9 +209,7 @@ class ActiveSlamTask(Restorable):
         actions: ArrayLike = ((0.0, 0.0),),
         collisions: BoolArray | None = None,
     ) -> None:
-        rows = self._rows
-        last = len(rows) - 2 * bool(self._form.rows)
-        first = last - len(_SIZES)
+        numbers, mapped, *sets = self._rows
         worlds_now: tuple[Any, ...] = (  # a `Worlds`
             tuple(beliefs),
             np.asarray(actions, dtype=np.float64),
@@ -220,17 +217,20 @@ class ActiveSlamTask(Restorable):
             tuple(self.episodes),
             tuple(self.outcome),
             (self.mapped, self.known),
-            rows[:first],
-            rows[first:last],
+            numbers,
+            mapped,
         )
         advance(worlds, moving, worlds_now, self.grid.plan, self._rules, self._scratch)
-        if self._form.rows:
-            landmarks, mask = rows[last:]
-            known = self.episodes.known
-            write_landmark_sets(worlds, worlds_now[0], known, landmarks, mask)
+        if sets:
+            write_landmark_sets(worlds, worlds_now[0], self.episodes.known, *sets)
 
     def _empty_rows(self) -> tuple[AnyArray, ...]:
-        return tuple([np.empty(*form) for form in self._forms.values()])
+        rows = np.empty(self._length), np.empty(self._shape, dtype=np.bool_)
+        if not self._form.rows:
+            return rows
+        shape = self._shape[0], self._form.rows
+        landmarks = np.empty((*shape, len(FEATURES)))
+        return *rows, landmarks, np.empty(shape, dtype=np.bool_)
 
 
 def split_settings(

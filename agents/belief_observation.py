@@ -136,18 +136,18 @@ class BeliefObservation(
         observation, info = self.env.reset(seed=seed, options=options)
         estimate = self.env.get_wrapper_attr("start_estimate")
         self._filters.reset(estimate[None], self.scenario.start.std, runs=ONE_WORLD)
-        return self._update(observation, moved=~ONE_WORLD), info
+        return self._update(observation, moved=False), info
 
     def step(
         self, action: Any
     ) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step the world, then predict and update."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        seen = self._update(observation, moved=ONE_WORLD)
+        seen = self._update(observation, moved=True)
         return seen, reward, terminated, truncated, info
 
-    def _update(self, observation: Observation, *, moved: BoolArray) -> Observation:
-        self._filters.update(scan_of_one(observation), ONE_WORLD, moved=moved)
+    def _update(self, observation: Observation, *, moved: bool) -> Observation:
+        self._filters.update_one(observation, moved=moved)
         if self.env.render_mode is not None:
             self.env.get_wrapper_attr("show_belief")(self.belief)
         features = belief_features(self._filters.storage(), self._bounds)
@@ -413,22 +413,26 @@ class SeparateFilters(Restorable):
         moved : bool ndarray, shape (B,)
             Which of them have moved; the others take the scan from their start.
         """
-        odometry, masks = observed["odometry"], observed["mask"]
-        landmarks = observed["landmarks"]
-        for run, slam in enumerate(self.filters):
-            if not worlds[run]:
-                continue
-            if moved[run]:
-                slam.predict(odometry[run])
-                self._steps[run] += 1
-            (seen,) = masks[run].nonzero()
-            ids = seen.tolist() if self._by_id else None
-            slam.update(landmarks[run, seen], ids)
-            if self._live[run]:
-                self._show(run, cast("EkfSlam", slam))
-                continue
-            self._beliefs[run] = belief = checked_belief(slam, self._steps[run])
-            self._stored[run] = belief_storage(belief, self._rows, by_id=self._by_id)
+        for run in np.flatnonzero(worlds).tolist():
+            one = {key: observed[key][run] for key in ("landmarks", "mask", "odometry")}
+            self.update_one(one, run, moved=bool(moved[run]))
+
+    def update_one(
+        self, observation: Observation, run: int = 0, *, moved: bool = True
+    ) -> None:
+        """Update the filter of one world with the observation of that world."""
+        slam = self.filters[run]
+        if moved:
+            slam.predict(observation["odometry"])
+            self._steps[run] += 1
+        (seen,) = observation["mask"].nonzero()
+        ids = seen.tolist() if self._by_id else None
+        slam.update(observation["landmarks"][seen], ids)
+        if self._live[run]:
+            self._show(run, cast("EkfSlam", slam))
+            return
+        self._beliefs[run] = belief = checked_belief(slam, self._steps[run])
+        self._stored[run] = belief_storage(belief, self._rows, by_id=self._by_id)
 
     def _show(self, run: int, slam: EkfSlam) -> None:
         """Show the arrays of a filter; a map whose slots changed has a new dict."""
@@ -452,11 +456,6 @@ class SeparateFilters(Restorable):
     def beliefs(self) -> BatchBeliefs:
         """Return the beliefs of all worlds side by side, as a snapshot."""
         return self.storage().beliefs()
-
-
-def scan_of_one(observation: Observation) -> dict[str, AnyArray]:
-    """Return an observation of a landmark world as a batch of one."""
-    return {key: observation[key][None] for key in ("landmarks", "mask", "odometry")}
 
 
 Filters = BatchSlam | SeparateFilters
