@@ -151,7 +151,7 @@ def assign_jointly(
     partners = only_partners(feasible)
     if len(partners) == rows and not pairs_first:
         _fill_pairs(pairs, readings, of_map, of_sensor, True)
-        cost = cost_if_settled(problem, partners, most, BRANCH_SPREAD, ceiling)
+        cost = cost_if_settled(problem, partners, most, BRANCH_SPREAD, ceiling, SAME)
         if cost < np.inf:
             return np.full(1, cost), explained[partners].reshape((1, rows)), explained
     _fill_pairs(pairs, readings, of_map, of_sensor, False)

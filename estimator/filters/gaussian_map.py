@@ -268,7 +268,7 @@ class GaussianMap:
         """Grow the arrays where a scan of new landmarks could overflow them."""
         room, more = self.room, 0
         if len(self.slots) + readings > room:
-            room, more = len(self.slots) + readings, len(self.slots)
+            room, more = len(self.slots) + readings, len(self.slots) // 2
         elif readings <= len(self.parts.scan_ids):
             return
         self.hold(self.used, self.slots, block=self.blank(room, more, readings))

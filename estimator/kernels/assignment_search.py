@@ -306,8 +306,9 @@ def cost_if_settled(
     most: int,
     spread: float,
     ceiling: float,
+    same: float,
 ) -> float:
-    """Return the cost of pairing all readings, if the search returns this alone.
+    """Return the cost of pairing all readings, if no other assignment is of interest.
 
     The search finds this assignment first, with the same cost to the bit, if every pair
     costs less than its reading left out, given the pairs before it.  To leave out
@@ -316,12 +317,14 @@ def cost_if_settled(
         Σ λ − ln det S_U − ρᵀ (Q − C⁺)⁻¹ ρ
 
     where S_U is given all other pairs, and ρ and C⁺ are the innovations and C of U
-    after all pairs.  det S_U is at most the product of det S before any pair, and
-    C⁺ ⪯ τ Q with τ = Σ tr Q⁻¹ C⁺.  The last term is at most νᵀ S⁻¹ ν of all pairs.  So
-    u readings cost at least the larger one of ::
+    after all pairs.  To leave out one does not matter if that is too expensive, or if
+    the reading is then near its landmark, and hardly changes the belief (`_is_idle`).
+    To leave out several must be too expensive.  det S_U is at most the product of det S
+    before any pair, and C⁺ ⪯ τ Q with τ = Σ tr Q⁻¹ C⁺.  The last term is at most
+    νᵀ S⁻¹ ν of all pairs.  So u readings cost at least the larger one of ::
 
         u min (λ − ln det S) − νᵀ S⁻¹ ν
-        u min (λ − ln det S − ρᵀ Q⁻¹ ρ / (1 − τ))
+        sum of the u least of λ − ln det S − ρᵀ Q⁻¹ ρ / (1 − u max tr Q⁻¹ C⁺)
 
     Where C is larger than 10⁶ Q, rounding in ρ and C⁺ could hide another assignment.
 
@@ -333,6 +336,9 @@ def cost_if_settled(
         landmark.  ``limits`` are not read, and must be infinite.
     partners : ndarray of int64, shape (m,)
         The landmark of each reading, from :func:`only_partners`.
+    same : float
+        To leave out readings near their landmarks does not matter if it changes the
+        belief less, see :func:`largest_change`; at most 1.
 
     Returns
     -------
@@ -378,17 +384,69 @@ def cost_if_settled(
     for a in range(rows):
         own = C[here, 2 * a, 2 * a] / Q[a, a, 0]
         share = max(share, own + C[here, 2 * a + 1, 2 * a + 1] / Q[a, a, 1])
+    limits = margin, problem.gate, same
     for u in range(1, rows + 1):
         if u * saved.min() - squared >= margin:
             break
-        if not u * share < 1:
-            return np.inf
+        least, next_least = np.inf, np.inf
         for a in range(rows):
+            c, d = 2 * a, 2 * a + 1
             n0, n1 = nu[a, a, 0] - h[here, a, 0], nu[a, a, 1] - h[here, a, 1]
-            x = n0 * n0 / Q[a, a, 0] + n1 * n1 / Q[a, a, 1]
-            if not u * (saved[a] - x / (1 - u * share)) >= margin:
-                return np.inf
+            q0, q1 = Q[a, a, 0], Q[a, a, 1]
+            if u == 1:
+                left = q0 - C[here, c, c], -C[here, d, c], q1 - C[here, d, d]
+                if not _is_idle((n0, n1), left, (q0, q1), missing[a], limits):
+                    return np.inf
+                continue
+            x = n0 * n0 / q0 + n1 * n1 / q1
+            more = saved[a] - x / (1 - u * share)
+            next_least = min(next_least, max(least, more))
+            least = min(least, more)
+        if u > 1 and not (u * share < 1 and least + (u - 1) * next_least >= margin):
+            return np.inf
     return cost
+
+
+@njit_internal
+def _is_idle(
+    rho: tuple[float, float],
+    left: tuple[float, float, float],
+    q: tuple[float, float],
+    missing: float,
+    limits: tuple[float, float, float],
+) -> bool:
+    """Return whether to leave out one reading does not matter.
+
+    Given all other pairs, ::
+
+        S = Q M⁻¹ Q,    νᵀ S⁻¹ ν = ρᵀ M⁻¹ ρ,    M = Q − C⁺
+
+    and the smallest eigenvalue of S⁻¹ Q in :func:`largest_change` is that of Q⁻¹ M.
+
+    Parameters
+    ----------
+    rho, left, q : tuple of float
+        ρ, the lower half of M, and the diagonal of Q.
+    missing : float
+        λ of the reading.
+    limits : tuple of float
+        Cost that is too expensive, gate of an ambiguous reading, and change of a belief
+        that remains the same.
+    """
+    (m00, m10, m11), (q0, q1), (margin, gate, same) = left, q, limits
+    x, determinant = fit(rho[0], rho[1], m00, m10, m11)
+    share = determinant / (q0 * q1)  # det Q / det S
+    if not (m00 > 0 and share >= KNOWN):
+        return False
+    more = missing - x - np.log(q0 * q1 / share)
+    if more >= margin:
+        return True
+    half = (m00 / q0 + m11 / q1) / 2
+    least = half - np.sqrt(max(half * half - share, 0.0))
+    squared = (1 + x) * (1 - least) / least  # of the largest change
+    # Then 2 (1 − λ) > 1, and det S < 4 det Q: the place of the landmark is certain.
+    is_same = squared < same * same * (1 - ROUNDING)
+    return more >= ROUNDING and x <= gate * (1 - ROUNDING) and is_same
 
 
 # --------------------------------------------------------------------------------------
@@ -406,6 +464,9 @@ SURE = 9.0
 #: expected readings up to `WIDE` times those of the noise.
 ROUNDING = 1e-6
 WIDE = 1e6
+
+#: Least det Q / det S of a reading, given all others: with less, rounding counts.
+KNOWN = 0.01
 
 #: Cost that a pair saves where the number of pairs counts before all else.
 PAIR_BONUS = 1e6

@@ -208,15 +208,20 @@ def test_a_scan_is_assigned_as_step_by_step_in_numpy(method):
 def test_a_scan_with_one_landmark_for_each_reading_is_assigned_as_by_the_search(
     method, ceiling
 ):
-    """It is settled without the search where no other assignment is of interest."""
+    """It is settled without the search where no other assignment is of interest.
+
+    That is also so where leaving out a reading is cheap, but changes nothing.
+    """
     rng = np.random.default_rng(8)
     policy, noise = LandmarkPolicy(association=method), Noise(0.03, 0.1, 0.02, 0.01)
     most = policy.branches if method == "hypotheses" else 1
-    single, others = 0, 0
-    for _ in range(150):
+    single, others, cheap = 0, 0, 0
+    for _ in range(250):
         count = rng.integers(1, 9)
         mean = rng.normal(scale=6.0, size=3 + 2 * count)
-        root = rng.normal(scale=rng.choice([0.01, 0.05]), size=(len(mean), len(mean)))
+        root = rng.normal(
+            scale=rng.choice([0.001, 0.01, 0.05]), size=(len(mean), len(mean))
+        )
         view = MapView(mean, root @ root.T, tuple(range(count)))
         expected = predict_measurement(mean[:3], view.landmarks).measurement
         scale = rng.choice([1.0, 3.5]) * np.array([0.03, 0.1])
@@ -232,10 +237,14 @@ def test_a_scan_with_one_landmark_for_each_reading_is_assigned_as_by_the_search(
         np.testing.assert_array_equal(found.explained, explained)
         np.testing.assert_array_equal(found.costs, costs)
         np.testing.assert_array_equal(found.slots, slots)
+        nu = (readings - expected[seen]) / (0.03, 0.1)  # det Q is at least 9e-6
+        left_out = -2 * np.log(2 * np.pi * density) - np.log(9e-6) - (nu**2).sum(axis=1)
         is_single = len(slots) == 1 and slots[0].tolist() == seen.tolist()
         single, others = single + is_single, others + (not is_single)
+        cheap += is_single and bool((left_out < 10.0).any())
     assert single > 30
     assert others > 30
+    assert cheap > 5 or most == 1 or ceiling < np.inf
 
 
 @pytest.mark.parametrize("std", [(0.02, 0.0), (0.0, 0.05), (0.02, 1e-6)])
@@ -272,6 +281,37 @@ def test_readings_that_contradict_each_other_are_not_settled():
     np.testing.assert_array_equal(found.costs, costs)
     np.testing.assert_array_equal(found.slots, slots)
     assert (found.slots < 0).any()
+
+
+@pytest.mark.parametrize("few", [1, 4])
+def test_a_reading_that_the_others_contradict_is_assigned_as_by_the_search(few):
+    """Alone it is near its landmark; given the others, it is farther or costs more."""
+    policy, noise, found = (
+        LandmarkPolicy(association="hypotheses"),
+        Noise(0.03, 0.1),
+        [],
+    )
+    mean = np.array([0, 0, 0, *np.ravel([(4.0 + k, 0.0) for k in range(few + 1)])])
+    for v, a, b in product((0.01, 0.03, 0.06), np.arange(2.6, 3.9, 0.1), (1.0, 1.7)):
+        view = MapView(
+            mean,
+            np.diag(1e-9 + v * 0.03**2 * (np.arange(len(mean)) == 2)),
+            range(few + 1),
+        )
+        for sign, more, rest in product((-1, 1), (-0.1, 0.05, 0.2, 4.0), (4.0, 30.0)):
+            nu = sign * np.array([a, *np.full(few, -b)])
+            readings = np.column_stack([0.03 * nu, mean[3::2]])
+            # λ is that of the innovation alone, and some more.
+            left_out = np.log((1 + v) * 9e-6) + nu**2 / (1 + v) + [more, *[rest] * few]
+            density = np.exp(-left_out / 2) / (2 * np.pi)
+            scan = policy, view, readings, noise, density
+            limits = np.full(few + 2, np.inf)
+            costs, slots, _ = assign_plainly(*scan, limits=limits, most=policy.branches)
+            assigned = assign_scan(*scan)
+            np.testing.assert_array_equal(assigned.costs, costs)
+            np.testing.assert_array_equal(assigned.slots, slots)
+            found.append(len(slots) == 1 and min(slots[0]) >= 0)
+    assert 0.1 < np.mean(found) < 0.9
 
 
 def test_unpaired_readings_are_compared_with_free_landmarks_given_the_pairs():
