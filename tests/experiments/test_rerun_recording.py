@@ -1,13 +1,17 @@
 """The recording for rerun, written by the library itself."""
 
 import sys
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 
 from slamgym.estimator import make_estimator
+from slamgym.experiments.figures import style
 from slamgym.experiments.logs import OdometryRow, Scan, SlamLog
+from slamgym.experiments.monte_carlo_study import figures
 from slamgym.experiments.run_and_replay import replay
 from slamgym.experiments.run_and_replay.summary import pose_nees
 from slamgym.experiments.viewers import (
@@ -93,29 +97,37 @@ def test_a_missing_library_is_named(monkeypatch):
         import_rerun()
 
 
-class Noted(SimpleNamespace):
-    """A module rerun whose recordings are lists of time, place, and what is there."""
+class Stream(SimpleNamespace):
+    """A recording as a list of time, place, and what is there."""
 
-    def __init__(self):
-        self.logged, self.now = [], {}
-        super().__init__(
-            ViewCoordinates=SimpleNamespace(RIGHT_HAND_Z_UP="z up"),
-            RecordingStream=lambda name: self,
-            escape_entity_path_part=lambda name: f"<{name}>",
-            save=lambda path: path.write_text("saved"),
-            send_recording_name=lambda name: None,
-            flush=lambda: None,
-            disconnect=lambda: None,
-        )
-
-    def __getattr__(self, kind):
-        return lambda *given, **named: (kind, given, named)
+    def __init__(self, name):
+        super().__init__(logged=[], now={}, ended=[], name=name)
+        self.save = lambda path: path.write_text("saved")
+        self.send_recording_name = self.ended.append
+        self.flush = partial(self.ended.append, "flushed")
+        self.disconnect = partial(self.ended.append, "disconnected")
 
     def set_time(self, name, **value):
         self.now[name] = value
 
     def log(self, place, thing, static=False):
         self.logged.append((None if static else dict(self.now), place, thing))
+
+
+class Library:
+    """A module rerun whose things are tuples of their arguments."""
+
+    ViewCoordinates = SimpleNamespace(RIGHT_HAND_Z_UP="z up")
+
+    def __getattr__(self, kind):
+        return lambda *given, **named: (kind, given, named)
+
+    def RecordingStream(self, name):  # noqa: N802
+        self.stream = Stream(name)
+        return self.stream
+
+    def escape_entity_path_part(self, name):
+        return f"<{name}>"
 
 
 def flat(*points):
@@ -125,8 +137,8 @@ def flat(*points):
 
 
 def test_a_recording_holds_each_step_of_each_filter_in_place(tmp_path, monkeypatch):
-    noted = Noted()
-    monkeypatch.setattr(rerun_recording, "import_rerun", lambda: noted)
+    library = Library()
+    monkeypatch.setattr(rerun_recording, "import_rerun", lambda: library)
     log = SlamLog(
         "little",
         landmark_ids=LOG.landmark_ids,
@@ -138,24 +150,28 @@ def test_a_recording_holds_each_step_of_each_filter_in_place(tmp_path, monkeypat
     noise = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.05, 0.1)}
     slam = make_estimator("ekf", gate_probability=0.2, **noise)
     trace = replay(log, slam, name="a", watch=frames.watch).trace
-    runs = [ViewedRun(trace, frames)] * 2
+    runs = [ViewedRun(trace, frames)] * 5
     write_rerun(tmp_path / "run.rrd", log, runs, walls=[(0, 1, 3, 4)])
     assert (tmp_path / "run.rrd").read_text() == "saved"
+    noted = library.stream
+    assert noted.ended == ["little", "flushed", "disconnected"]
     still = {place: thing for now, place, thing in noted.logged if now is None}
     grey = [128, 128, 128]
-    kind, (strips,), style = still["world/walls"]
-    assert (kind, style) == ("LineStrips3D", {"colors": grey})
+    kind, (strips,), looks = still["world/walls"]
+    assert (kind, looks) == ("LineStrips3D", {"colors": grey})
     np.testing.assert_array_equal(strips, [flat((0, 1), (3, 4))])
-    kind, (points,), style = still["world/truth/landmarks"]
-    assert (kind, style["labels"]) == ("Points3D", ["4", "9"])
+    kind, (points,), looks = still["world/truth/landmarks"]
+    assert (kind, looks["labels"]) == ("Points3D", ["4", "9"])
     np.testing.assert_array_equal(points, flat(*LOG.landmarks))
     (path,) = still["world/truth/path"][1][0]
     np.testing.assert_array_equal(path, flat((0, 0), (1, 0.5)))
     assert still["world"] == "z up"
     moving = [each for each in noted.logged if each[0] is not None]
-    half = len(moving) // 2
-    colours = [0, 114, 178], [230, 159, 0]
-    for colour, part in zip(colours, (moving[:half], moving[half:]), strict=True):
+    palette = (style.BLUE, style.ORANGE, style.TEAL, figures.PURPLE, style.BLUE)
+    colours = [np.multiply(to_rgb(hue), 255).round().tolist() for hue in palette]
+    fifth = len(moving) // 5
+    parts = [moving[k : k + fifth] for k in range(0, len(moving), fifth)]
+    for colour, part in zip(colours, parts, strict=True):
         assert {now["step"]["sequence"] for now, *_ in part} == {0, 1, 2}
         for step in range(3):
             own = {
