@@ -200,6 +200,8 @@ def test_scenario_and_drive_have_the_same_label():
     for name in ("differential", "bicycle"):
         label = load_scenario(name).models["motion"]
         assert find_motion(label).name == label
+    car = load_scenario("bicycle").with_changes(robot={"reference": None})
+    assert car.models["motion"] == f"bicycle[wheelbase={car.robot.wheelbase}]"
 
 
 @pytest.mark.parametrize("name", list_presets())

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from slamgym.arrays import LARGEST_EPISODE
 from slamgym.sim_configs import (
     Scenario,
     ScenarioError,
@@ -202,6 +203,10 @@ NO_CLUTTER = "sensor.clutter must be 0 unless"
          r"controls must stay within robot.max_speed = 0.5 m/s, got 1 m/s$"),
         ({"robot": {"max_turn_rate": 0.1}},
          r"controls must stay within robot.max_turn_rate = 0.1 rad/s"),
+        ({"steps": LARGEST_EPISODE + 1},
+         rf"steps must be at most {LARGEST_EPISODE}, got {LARGEST_EPISODE + 1}$"),
+        ({"walls": [(0, 0, 1, 1), (2, 3, 2, 3)]},
+         r"walls\[1\] must have a length > 0, got \(2.0, 3.0, 2.0, 3.0\)$"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_together_is_refused(changes, message):
