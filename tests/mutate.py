@@ -68,6 +68,9 @@ TESTS = {
     "envs/": "landmark_world streams world_batch models_of_worlds",
     "envs/bearing_range": "bearing_range_sensor world_batch landmark_world",
     "envs/controllers": "controllers vector_controllers drawn_worlds",
+    "envs/landmark_world": (
+        "landmark_world streams models_of_worlds drawn_worlds pose_sensors"
+    ),
     "envs/noise_streams": "bearing_range_sensor streams pose_sensors faults",
     "envs/random_numbers": "streams bearing_range_sensor drawn_worlds",
     "envs/rendering": "rendering ellipses",

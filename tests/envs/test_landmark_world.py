@@ -487,6 +487,21 @@ def test_wrong_options_are_refused_and_leave_the_episode_alone(options, message)
     assert_same(episode(env, seed=None), episode(twin, seed=None))
 
 
+def test_a_start_is_allowed_as_far_as_its_readings_fit_the_observation_space():
+    world = load_scenario("six_landmarks").with_changes(start={"pose": (1.0, 2.0, 0.0)})
+    env = LandmarkWorldEnv(world)
+    places = place_landmarks(world.landmarks, np.random.default_rng(0))
+    longest = env.observation_space["landmarks"].high[0, 1]
+    least, most = 0.0, 1000.0  # to the left of the map
+    for _ in range(50):
+        middle = (least + most) / 2
+        reach = np.hypot(*(places - [-middle, 2.0]).T).max() + 10 * world.sensor.std[1]
+        least, most = (middle, most) if reach < longest else (least, middle)
+    env.reset(options={"pose": (-least + 0.01, 2.0, 0.0)})
+    with pytest.raises(ValueError, match="keep 'landmarks' in the observation space"):
+        env.reset(options={"pose": (-least - 0.01, 2.0, 0.0)})
+
+
 def test_an_option_of_reset_equals_the_setting_for_one_episode():
     places = np.random.default_rng(1).uniform(-8, 8, (30, 2))
     walled = load_scenario("six_landmarks").with_changes(**ROAMING, walls=WALLS)

@@ -2,6 +2,9 @@ import numpy as np
 import pytest
 from run_traces import make_trace
 
+from slamgym.estimator.models.rigid_motion import invariant_covariance, invariant_error
+from slamgym.experiments.run_and_replay.summary import pose_nees
+
 
 def test_first_steps_are_those_at_which_landmarks_enter():
     np.testing.assert_array_equal(make_trace(count=5).first_steps(), [0, 1, 2, 0, 1])
@@ -42,3 +45,14 @@ def test_arrays_that_do_not_fit_together_are_refused(name, value, message):
 
 def test_unknown_truth_may_be_missing():
     assert make_trace(true_poses=None, true_landmarks=None).true_poses is None
+
+
+@pytest.mark.parametrize("frame", ["additive", "invariant"])
+def test_the_nees_is_that_of_the_error_of_the_truth_in_the_frame_of_the_filter(frame):
+    trace = make_trace(frame=frame)
+    for step, found in enumerate(pose_nees(trace)):
+        true, mean = trace.true_poses[step], trace.poses[step]
+        error, P = true - mean, trace.pose_covariances[step]
+        if frame == "invariant":
+            error, P = invariant_error(true, mean), invariant_covariance(mean, P)
+        assert found == pytest.approx(error @ np.linalg.solve(P, error))
