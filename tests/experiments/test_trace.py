@@ -2,8 +2,19 @@ import numpy as np
 import pytest
 from run_traces import make_trace
 
+from slamgym.estimator.interface import ScanDecisions, UpdateReport
 from slamgym.estimator.models.rigid_motion import invariant_covariance, invariant_error
+from slamgym.evaluation.association_scores import CUTOFF, gospa, score_association
+from slamgym.experiments.logs.ground_truth import TrueLandmarks
 from slamgym.experiments.run_and_replay.summary import pose_nees
+from slamgym.experiments.run_and_replay.trace import (
+    DecisionRecorder,
+    RunDecisions,
+    accuracy_of,
+    compare_association,
+    quotient,
+    root_mean_square,
+)
 
 
 def test_first_steps_are_those_at_which_landmarks_enter():
@@ -56,3 +67,56 @@ def test_the_nees_is_that_of_the_error_of_the_truth_in_the_frame_of_the_filter(f
         if frame == "invariant":
             error, P = invariant_error(true, mean), invariant_covariance(mean, P)
         assert found == pytest.approx(error @ np.linalg.solve(P, error))
+
+
+def test_an_association_is_compared_as_it_stands_and_aligned():
+    truth = TrueLandmarks(np.array([4, 7, 9]), np.array([[0.0, 0], [4, 0], [0, 3]]))
+    landmarks = truth.positions[:2] + np.array([0.4, -0.2])
+    decisions = [ScanDecisions((1, 2), (1, 2)), ScanDecisions((1, 1), ())]
+    ids = [np.array([4, 7]), np.array([4, 7])]
+    run = RunDecisions(decisions, ids, (1, 1))
+    found = compare_association(run, truth, landmarks, truth.positions[:2])
+    assert found.resolution == 0
+    scores = score_association(
+        decisions, ids, places={4: 0, 7: 1, 9: 2}, confirm=(1, 1)
+    )
+    assert found.scores == scores
+    seen = truth.positions[:2]
+    assert found.raw == gospa(landmarks, seen)
+    np.testing.assert_allclose(found.aligned, gospa(seen, seen), atol=1e-9)
+    table = found.as_dict()
+    assert table["gospa"] == {
+        "raw": found.raw._asdict(), "aligned": found.aligned._asdict(), "cutoff": CUTOFF
+    }  # fmt: skip
+    assert (table["wrong"], table["precision"]) == (scores.wrong, scores.precision)
+    unknown = compare_association(None, truth, landmarks, None, resolution=3.5)
+    assert (
+        unknown.raw
+        == unknown.aligned
+        == gospa(landmarks, truth.positions, places=[0, 1, 0])
+    )
+    assert unknown.as_dict()["wrong"] is None
+
+
+def test_landmarks_are_compared_where_both_coordinates_are_known():
+    truth = np.array([[0.0, 0], [4, 0], [np.nan, 3], [0, 3]])
+    found = accuracy_of(truth + np.array([0.5, 0.0]), truth)
+    assert found.raw_rmse == pytest.approx(0.5)
+    assert accuracy_of(truth, None) is None
+
+
+def test_decisions_of_a_filter_are_those_of_its_reports():
+    recorder = DecisionRecorder(object())
+    report = UpdateReport(row_ids=(3, None, 5, 8), added_ids=(5,), confirmed_ids=(3,))
+    recorder.add(report, np.array([1, -1, 2, 2]))
+    recorder.add(UpdateReport(), None)
+    assert recorder._reported[0] == ScanDecisions((3, None, 5, 8), (3, 5))
+
+
+def test_statistics_leave_out_what_is_not_finite():
+    assert root_mean_square([3.0, np.nan, 4.0, np.inf]) == pytest.approx(np.sqrt(12.5))
+    assert root_mean_square([np.nan]) is None
+    assert root_mean_square([1e200]) is None
+    values, freedom = np.array([3.0, np.nan, 9.0]), np.array([2, 100, 4])
+    assert quotient(values, freedom) == 2.0
+    assert quotient(values[1:2], freedom[1:2]) is None
