@@ -9,8 +9,10 @@ from slamgym.evaluation.nees import (
     is_indefinite,
     landmark_nees,
     normalised_squared_error,
+    parts_of_landmarks,
     pose_nees,
     position_nees,
+    relative_landmark_deviations,
     relative_map_nees,
     state_nees,
 )
@@ -167,3 +169,28 @@ def test_a_singular_covariance_is_not_indefinite_by_rounding():
         P = scale * rows @ rows.T
         assert not is_indefinite(P)
         assert is_indefinite(P - 1e-3 * scale * np.eye(40))
+
+
+def test_deviations_of_landmarks_are_whitened_in_the_axes_of_the_map():
+    rng = np.random.default_rng(11)
+    means = rng.normal(0, 3, (4, 7))
+    roots = rng.normal(0, 0.1, (4, 7, 7))
+    P, truth = roots @ roots.swapaxes(1, 2), means + rng.normal(0, 0.1, (4, 7))
+    found = relative_landmark_deviations(truth, means, P)
+    errors, blocks = parts_of_landmarks(truth - means, P)
+    for b, k in np.ndindex(4, 2):
+        rows = slice(3 + 2 * k, 5 + 2 * k)
+        np.testing.assert_array_equal(errors[b, k], (truth - means)[b, rows])
+        np.testing.assert_array_equal(blocks[b, k], P[b, rows, rows])
+
+        def seen(state, rows=rows):
+            gap = (state[rows] - state[:2]) @ [1, 1j] * np.exp(-1j * state[2])
+            return np.array([gap.real, gap.imag])
+
+        steps = 1e-6 * np.eye(7)
+        slopes = [(seen(means[b] + h) - seen(means[b] - h)) / 2e-6 for h in steps]
+        J, c, s = np.transpose(slopes), *np.exp(1j * means[b, 2]).view((float, 2))
+        R = np.array([[c, -s], [s, c]])
+        L = np.linalg.cholesky(R @ J @ P[b] @ J.T @ R.T)
+        expected = np.linalg.solve(L, R @ (seen(truth[b]) - seen(means[b])))
+        np.testing.assert_allclose(found[b, k], expected, rtol=1e-5)
