@@ -275,3 +275,44 @@ def test_the_bootstrap_never_reports_an_impossible_mean(factor):
 def test_equivalence_is_accepted_where_it_is_shown(factor, accepted):
     averages = factor * DOF * np.linspace(0.9, 1.1, 10)
     assert equivalence_test(averages, DOF).accepted is accepted
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.0, 1.3])
+def test_pooled_tests_are_those_of_scipy(scale):
+    rng = np.random.default_rng(12)
+    nis, freedom = scale * rng.chisquare(4, (9, 30)), np.full((9, 30), 4)
+    freedom[:, ::5] = 0  # these NIS do not count
+    used, n = freedom > 0, freedom.sum()
+    total, found = nis[used].sum(), nis_test(nis, freedom)
+    assert found.statistic == pytest.approx(total / n)
+    tails = chi2.cdf(total, n), chi2.sf(total, n)
+    assert found.p_value == pytest.approx(min(1, 2 * min(tails)))
+    assert found.interval == pytest.approx(chi2.ppf([0.025, 0.975], n) / n)
+    scores = np.where(used, np.cbrt(nis), 0.0)  # nearly normal
+    scores[used] -= scores[used].mean()
+    white, statistic = whiteness_test(nis, freedom, lags=5), 0.0
+    for k in range(1, 6):
+        pairs = (used[:, k:] & used[:, :-k]).sum()
+        r = (scores[:, k:] * scores[:, :-k]).sum() / pairs / scores[used].var()
+        statistic += pairs * r**2
+    assert white.statistic == pytest.approx(statistic)
+    assert white.p_value == pytest.approx(chi2.sf(statistic, 5))
+    assert white.interval == pytest.approx((0, chi2.ppf(0.95, 5)))
+    assert (found.error_rate, white.error_rate) == (0.05, 0.05)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.25, 1.5, 2.0])
+def test_steps_are_rejected_by_holms_method(scale):
+    rng = np.random.default_rng(13)
+    nees = np.linspace(1, scale, 6) * rng.chisquare(3, (20, 6))
+    totals, found = nees.sum(axis=0), family_test(nees, 3)
+    p_values = 2 * np.minimum(chi2.cdf(totals, 60), chi2.sf(totals, 60))
+    expected, order = np.zeros(6, dtype=bool), np.argsort(p_values)
+    for place, step in enumerate(order):
+        if p_values[step] * (6 - place) >= 0.05:
+            break
+        expected[step] = True
+    np.testing.assert_array_equal(found.rejected, expected)
+    assert found.p_value == pytest.approx(min(1, 6 * p_values.min()))
+    np.testing.assert_allclose(found.statistic, totals / 60)
+    assert found.interval == pytest.approx(np.array(family_band(20, 3, 6)) / 3)
