@@ -20,6 +20,7 @@ from slamgym.estimator.large_maps.elimination import (
 from slamgym.estimator.large_maps.submaps import (
     closed_submaps as closed_submaps_chapter,
 )
+from slamgym.estimator.large_maps.submaps import closed_submaps as closing
 from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.large_maps.submaps.closed_submaps import Neighbourhood, Region
 from slamgym.estimator.large_maps.submaps.factor import (
@@ -303,6 +304,33 @@ def test_a_whole_map_is_the_same_however_often_it_is_asked_for():
     for _ in range(3):
         assert_same_bits(slam.belief(), first)
     assert before < asked_once < slam.nbytes  # it keeps what is asked for again
+
+
+@pytest.mark.parametrize("base", ["ekf", "invariant"])
+def test_initial_frames_need_no_look_at_their_last_step(base, monkeypatch):
+    slams, counts = [], []
+    linearise = gauss_newton.JoinedMap._linearise
+    for trusted in (0.0, closing.NEARLY_CONVERGED):
+        monkeypatch.setattr(closing, "NEARLY_CONVERGED", trusted)
+        counts.append(0)
+
+        def counted(*arguments):
+            counts[-1] += 1
+            return linearise(*arguments)
+
+        monkeypatch.setattr(gauss_newton.JoinedMap, "_linearise", counted)
+        slams.append(run(made(base=base, extent_limit=4.0), laps(90)))
+        slams[-1].belief()
+    assert_close_beliefs(slams[0].belief(), slams[1].belief(), 1e-9, 1e-11)
+    assert counts[1] < counts[0]
+
+    def linear(x):
+        step = 3.0 - x
+        return gauss_newton.Iterate(x, 1.0 + step @ step, step @ step, step)
+
+    for trusted in (0.0, 15.0, 17.0):
+        found = gauss_newton.minimise(linear, np.array([-1.0]), 0.1, trusted)
+        assert found.tolist() == [3.0]
 
 
 def test_joining_halfway_changes_nothing_in_the_end():

@@ -29,7 +29,9 @@ from .factor import Gaussian, retract
 from .store import LostSubmapError, Submap, SubmapStore
 
 NO_SLOTS: IntArray = np.empty(0, dtype=np.int64)
-ROUGHLY_CONVERGED = 0.1  # decrement at which to stop while computing initial frames
+# Decrements at which to stop while computing initial frames: now, and after a step.
+# A step of ten standard deviations leads to within 0.1 of the solution.
+ROUGHLY_CONVERGED, NEARLY_CONVERGED = 0.1, 100.0
 
 
 class ClosedSubmaps:
@@ -190,6 +192,7 @@ class ClosedSubmaps:
             self._frame,
             frames,
             ROUGHLY_CONVERGED,
+            NEARLY_CONVERGED,
         ).frames
 
 

@@ -56,6 +56,8 @@ class JoinedMap:
         submap begins at the last frame.
     converged : float
         The decrement, in squared standard deviations, at which to stop.
+    trusted : float
+        The decrement at which one more step leads to the frames, and to nothing else.
 
     Raises
     ------
@@ -70,6 +72,7 @@ class JoinedMap:
         error_frame: ErrorFrame,
         frames: Array,
         converged: float = CONVERGED,
+        trusted: float = 0.0,
     ) -> None:
         self._load, self._error_frame = load, error_frame
         slots = [summary.slots for summary in summaries]
@@ -95,12 +98,14 @@ class JoinedMap:
         self._elimination: SubmapElimination | None = None
         self._kept: dict[int, tuple[Array, Array, Array]] = {}
         values = np.concatenate([frames[1:].ravel(), self._points.ravel()])
-        if not minimise(self._linearise, values, converged):
+        found = minimise(self._linearise, values, converged, trusted)
+        if found is None:
             raise np.linalg.LinAlgError(
                 f"the joined map did not converge in "
                 f"{ITERATIONS} iterations: the submaps contradict each "
                 "other, as after a wrong landmark_id, or drifted too far"
             )
+        self._move(found)
         self._kept.clear()
 
     @property
@@ -185,13 +190,16 @@ class JoinedMap:
 
     def _linearise(self, values: Array) -> Iterate:
         """Set the unknowns to these values, and factorise the normal equations."""
-        cut = 3 * self._count
-        self.frames = np.vstack([self.frames[:1], values[:cut].reshape(-1, 3)])
-        self._points = values[cut:].reshape(-1, 2)
+        self._move(values)
         self._elimination = None  # frees the memory of the old factor first
         done = SubmapElimination(self._parts, len(values), self._normal_equations)
         self._elimination = done
         return Iterate(values, done.cost, done.decrement(), done.solution())
+
+    def _move(self, values: Array) -> None:
+        cut = 3 * self._count
+        self.frames = np.vstack([self.frames[:1], values[:cut].reshape(-1, 3)])
+        self._points = values[cut:].reshape(-1, 2)
 
     def _normal_equations(self, index: int) -> Quadratic:
         """Return the squared error of a submap as a function of its unknowns."""
@@ -512,9 +520,12 @@ class Iterate(NamedTuple):
 
 
 def minimise(
-    evaluate: Callable[[Array], Iterate], values: Array, converged: float
-) -> bool:
-    """Iterate until the decrement is small; return whether that succeeded.
+    evaluate: Callable[[Array], Iterate],
+    values: Array,
+    converged: float,
+    trusted: float = 0.0,
+) -> Array | None:
+    """Iterate until the decrement is small; return the values, None without success.
 
     Parameters
     ----------
@@ -524,17 +535,21 @@ def minimise(
         Where to begin.
     converged : float
         The decrement at which to stop.
+    trusted : float
+        The decrement at which to stop after another step, which is not evaluated.
     """
     now = evaluate(values)
     past: list[Iterate] = []
     for iteration in range(ITERATIONS):
         if now.decrement <= converged:
-            return True
+            return now.values
+        if now.decrement <= trusted:
+            return now.values + now.step
         past = [*past[-MEMORY:], now] if now.decrement < 1 else []
         largest = np.inf if iteration >= PATIENCE else now.decrement
         trial = _accelerated(evaluate, past, largest)
         now = _descend(evaluate, now) if trial is None else trial
-    return False
+    return None
 
 
 def _accelerated(
