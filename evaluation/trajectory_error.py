@@ -265,11 +265,13 @@ def exchanged_positions(estimate: ArrayLike, truth: ArrayLike) -> Exchange:
 
 def _best_order(e: Array, g: Array) -> IntArray:
     """Assign the positions that are far from their truths to these truths, (n,)."""
-    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 (slow to import)
-
     moved = _median_aligned(e, g)
     errors = np.linalg.norm(moved - g, axis=1)
     (far,) = np.nonzero(errors > _FAR * np.median(errors))
+    if len(far) < 2:
+        return np.arange(len(e))
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 (slow to import)
+
     gaps = np.linalg.norm(moved[far, None] - g[far], axis=2)
     order = np.arange(len(e))
     order[far] = far[linear_sum_assignment(np.minimum(gaps, errors[far, None]))[1]]

@@ -257,7 +257,7 @@ class ReadingCounts(NamedTuple):
     waiting: int = 0
 
 
-_PREDICTED, _UPDATED = 0, 1
+_PREDICTED, _UPDATED, _BOTH = 0, 1, slice(None)
 
 
 class RunRecorder:
@@ -284,10 +284,10 @@ class RunRecorder:
     ) -> None:
         """Record one step, after the scan at its end, which names some landmarks."""
         step = len(self._history)
-        self._put(_PREDICTED, step, predicted)
-        updated = predicted
+        self._put(_BOTH if report is None else _PREDICTED, step, predicted)
         if report is not None:
             updated = interface.marginal_without_joining(self._slam, ())
+            self._put(_UPDATED, step, updated)
             self._nis[step] = report.nis
             self._dof[step] = report.degrees_of_freedom
             self._count(report)
@@ -297,7 +297,6 @@ class RunRecorder:
             if waiting := set(named).difference(seen, report.rejected_ids):
                 waiting -= {*report.skipped_ids, *self._ids}
                 self.readings["waiting"] += len(waiting)
-        self._put(_UPDATED, step, updated)
         is_last = step == self._steps - 1
         if is_last:
             self.belief = self._slam.belief()
@@ -305,7 +304,7 @@ class RunRecorder:
         is_due = is_last or self._history.is_due(step, self._ids)
         self._history.append(interface.view_map(self._slam) if is_due else None)
 
-    def _put(self, track: int, step: int, belief: Belief) -> None:
+    def _put(self, track: int | slice, step: int, belief: Belief) -> None:
         if not is_finite(belief):
             raise np.linalg.LinAlgError("the belief is not finite")
         self._poses[track, step] = belief.pose

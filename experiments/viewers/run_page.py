@@ -11,6 +11,7 @@ import hashlib
 import json
 import zlib
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -406,15 +407,19 @@ def correlations_of(view: MapView) -> Array:
     ndarray, shape (n (n + 1) / 2,)
         As in `CorrelationFrame`; 0 where a position is certain.
     """
-    columns = np.r_[0, 1, 3 : 3 + 2 * len(view.ids)]
-    P = np.asarray(view.covariance)[np.ix_(columns, columns)]
-    count = len(columns) // 2
-    one, other = np.tril_indices(count, -1)
-    blocks = P.reshape(count, 2, count, 2)
-    own = np.arange(count)
+    count = 1 + len(view.ids)
+    at, own, one, other = _places_of(count)
+    blocks = np.asarray(view.covariance)[at].reshape(count, 2, count, 2)
     whiten = _inverse_factors(blocks[own, :, own, :])
     white = whiten[one] @ blocks[one, :, other, :] @ whiten[other].transpose(0, 2, 1)
     return np.minimum(_largest_singular_values(white), 1.0)
+
+
+@lru_cache(maxsize=8)
+def _places_of(count: int) -> tuple[Any, IntArray, IntArray, IntArray]:
+    """Return where positions are in P, their numbers, and those of all pairs."""
+    columns = np.r_[0, 1, 3 : 1 + 2 * count]
+    return np.ix_(columns, columns), np.arange(count), *np.tril_indices(count, -1)
 
 
 def _landmark_of_rows(scan: Scan, report: UpdateReport) -> Sequence[int | None]:

@@ -188,6 +188,8 @@ def asked_identities(ids: LandmarkIds | None, mapped: Mapping[int, int]) -> list
 
 def mapped_identities(asked: LandmarkIds, mapped: Collection[int]) -> list[int]:
     """Return ids of mapped landmarks, without repetition."""
+    if isinstance(asked, tuple) and not asked:
+        return []
     try:
         count = np.size(asked)
     except ValueError:
