@@ -55,9 +55,11 @@ def _lines(artist):
         inside = [line for each in artist.get_children()[:-1] for line in _lines(each)]
         return [f"{name} {_fields(place)}", *inside]
     if isinstance(artist, Axis):
-        ticks, locator = artist.get_tick_params(), artist.get_major_locator()
+        ticks = {_side(key): is_on for key, is_on in artist.get_tick_params().items()}
+        locator = artist.get_major_locator()
         if not isinstance(locator, AutoLocator):
-            ticks = ticks | {"at": locator()}
+            least, most = sorted(artist.get_view_interval())
+            ticks |= {"at": [at for at in locator() if least <= at <= most]}
         return [f"{name} {_fields(ticks)}", *_lines(artist.label)]
     if isinstance(artist, Legend):
         looks = _fields({name: getattr(artist, name) for name in _LEGEND})
@@ -67,6 +69,13 @@ def _lines(artist):
         named = " | ".join(text.get_text() for text in texts)
         return [f"{name} {looks} | {named}", *_lines(texts[-1])]
     return _plain(artist, name)
+
+
+def _side(name):
+    """Name the sides of both axes alike, which versions of matplotlib do not."""
+    for side, like in (("left", "bottom"), ("right", "top")):
+        name = name.replace(side, like)
+    return name
 
 
 def _cell(spec):
