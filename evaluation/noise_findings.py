@@ -459,12 +459,13 @@ def _summed(noise: _Noise, count: int, exact: float) -> Array:
         return np.zeros((count, len(MOMENTS)))
     std = np.where(std > 0, std, _LEAST_STD)
     w, g = noise.values / std, noise.lever / std
-    terms = [np.ones_like(w), w, w**2, w**3, w**4, g * w, g**2]
+    square = w * w  # w**3 takes a hundred times as long as a product
+    terms = [np.ones_like(w), w, square, square * w, square * square, g * w, g * g]
     terms += [
         np.append(of, 0.0) for of in (noise.follows, noise.follows * w[1:] * w[:-1])
     ]
     r = np.broadcast_to(noise.distance, w.shape)
-    terms += [r, r**2, r * w**2]
+    terms += [r, r * r, r * square]
     return np.column_stack(
         [np.bincount(noise.runs, term[: len(w)], minlength=count) for term in terms]
     )
