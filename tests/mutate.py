@@ -75,7 +75,7 @@ TESTS = {
     "envs/random_numbers": "streams bearing_range_sensor drawn_worlds",
     "envs/rendering": "rendering ellipses",
     "envs/rendering/video": "video",
-    "envs/spaces": "faults landmark_world drawn_worlds",
+    "envs/spaces": "faults landmark_world drawn_worlds models_of_worlds",
     "envs/specs": "gymnasium_contract every_environment",
     "envs/robot": "unicycle_body world_batch landmark_world models_of_worlds",
     "envs/vector": "landmark_world_vector world_batch vector_controllers",

@@ -7,6 +7,7 @@ from scipy.stats import norm, t
 
 from slamgym.envs import LandmarkWorldEnv
 from slamgym.envs.noise_streams import heavy_tails, largest_noise
+from slamgym.envs.spaces import clipped_action
 from slamgym.envs.vector import WorldBatch
 from slamgym.sim_configs import action_sequence, load_scenario, place_landmarks
 
@@ -118,6 +119,9 @@ def test_the_observation_space_holds_the_reading_of_a_landmark_at_the_longest_ra
     assert ranges[1] == pytest.approx(ranges[0] + 3)
 
 
+RANGES = {"start_x": [1.0, 2.0], "start_y": [-3.0, -2.5], "landmark_shift": 0.5}
+
+
 @pytest.mark.parametrize("noise_in", ["motion", "odometry"])
 @pytest.mark.parametrize("kind", ["bearing_range", "range", "position", "bearing"])
 @pytest.mark.parametrize("reach", [9.0, None])
@@ -130,7 +134,7 @@ def test_the_observation_space_is_that_of_the_largest_errors(noise_in, kind, rea
         motion={"std": [0.03, 0.04, 0.02], "noise_in": "motion"},
         sensor={"kind": kind, "std": stds, "max_range": reach or np.inf},
         faults={"odometry_scale": 0.1, "odometry_turn": -0.02, "range_bias": bias},
-        randomise={"start_x": [1.0, 2.0], "landmark_shift": 0.5},
+        randomise=None if kind == "range" else RANGES,
     )
     if noise_in == "odometry":
         world = world.with_changes(
@@ -139,10 +143,13 @@ def test_the_observation_space_is_that_of_the_largest_errors(noise_in, kind, rea
     growth = 0.1 * (kind == "bearing_range")
     world = world.with_changes(sensor={"range_std_per_metre": growth})
     robot, dt, largest = world.robot, world.dt, largest_noise(np.inf)
-    away = place_landmarks(BASE.landmarks, None) - [2.0, -2.0]  # at the highest start
+    start, moved = [2.0, -2.5], np.hypot(1.0, 0.5) + np.sqrt(2) * 0.5  # the highest
+    if kind == "range":
+        start, moved = [1.0, -2.0], 0.0
+    away = place_landmarks(BASE.landmarks, None) - start
     step = robot.max_speed * dt + largest * 0.05 * (noise_in == "motion")
     drive = largest * 0.5 + world.steps * step
-    farthest = np.hypot(*away.T).max() + drive + 1.0 + np.sqrt(2) * 0.5
+    farthest = np.hypot(*away.T).max() + drive + moved
     far = reach or farthest
     far += largest * ((0.4 if kind == "position" else 0.3) + growth * far) + bias
     space = LandmarkWorldEnv(world).observation_space
@@ -162,3 +169,31 @@ def test_the_observation_space_is_that_of_the_largest_errors(noise_in, kind, rea
     )
     assert space["odometry"].high == pytest.approx(odometry)
     assert space["odometry"].low == pytest.approx(np.negative(odometry))
+
+
+@pytest.mark.parametrize("drive", ["differential", "bicycle"])
+def test_the_largest_odometry_is_that_of_the_drive(drive):
+    world = load_scenario(drive)
+    distance, turn = (
+        getattr(world.robot, name) * world.dt for name in ("max_speed", "max_turn_rate")
+    )
+    expected = distance, np.pi / 2
+    if drive == "differential":
+        expected = (distance + turn * world.robot.track_width / 2,) * 2
+    space = LandmarkWorldEnv(world).observation_space["odometry"]
+    assert space.high == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("action", "clipped"),
+    [
+        ((3.0, -5.0), (2.0, -0.5)),
+        ((-3.0, 5.0), (-2.0, 0.5)),
+        ((1.5, -0.4), (1.5, -0.4)),
+        ((1.5, 1.5), (1.5, 0.5)),
+        ((-2.5, 0.4), (-2.0, 0.4)),
+        ((-1.9, -0.6), (-1.9, -0.5)),
+    ],
+)
+def test_each_part_of_an_action_is_clipped_to_its_own_limit(action, clipped):
+    assert clipped_action(action, (2.0, 0.5)) == clipped
