@@ -686,6 +686,24 @@ def test_thinned_lines_keep_ends_and_peaks():
     assert kept_x[kept_y == -7].tolist() == [3777]
 
 
+def test_dots_of_many_runs_are_quantiles():
+    values = np.random.default_rng(0).chisquare(3, 1000)
+    np.testing.assert_array_equal(figures._dots(values[:300]), values[:300])
+    expected = np.quantile(values, np.linspace(0.5, 299.5, 300) / 300)
+    np.testing.assert_allclose(figures._dots(values), expected)
+
+
+@pytest.mark.parametrize(
+    ("ratios", "scale"),
+    [([0.26, 3.9], "linear"), ([0.24, 3.9], "log"), ([0.26, 4.1], "log")],
+)
+def test_ratios_far_from_one_are_drawn_on_a_logarithmic_scale(ratios, scale):
+    axes = Figure().subplots()
+    axes.set_ylim(0.2, 5)
+    figures.scale_ratios(axes, np.array(ratios))
+    assert axes.get_yscale() == scale
+
+
 def test_no_two_of_many_estimators_look_alike():
     looks = [figures.look_of(place) for place in range(30)]
     assert len({(look.colour, str(look.dashes)) for look in looks}) == 30
