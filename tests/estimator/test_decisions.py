@@ -111,3 +111,44 @@ def test_a_filter_told_the_decisions_has_the_same_belief(method, backdate, slipp
     expected = told.belief(slam.landmark_ids)
     np.testing.assert_allclose(slam.belief().mean, expected.mean, atol=1e-9)
     np.testing.assert_allclose(slam.belief().covariance, expected.covariance, atol=1e-9)
+
+
+def test_all_that_happened_between_sightings_happens_again_in_its_order():
+    """Two landmarks are confirmed one after the other, so that scans repeat twice."""
+    world = {1: (6, 3), 2: (8, -4), 3: (8.9, -4), 4: (9, 1), "N": (5, 8), "M": (4, -9)}
+    world["C"] = (-5, -5)
+
+    def rows(x, names):
+        east, north = np.array([world[name] for name in names], dtype=float).T
+        return np.column_stack((np.arctan2(north, east - x), np.hypot(east - x, north)))
+
+    def tell(slam, ids):
+        slam.update(rows(0.0, [1, 2, 3, 4]), [1, 2, 3, 4])
+        reports = []
+        for k in range(5):
+            slam.observe_pose([0.5 * k, 0.0], np.eye(2, 3), 0.01 * np.eye(2))
+            slam.predict((0.5, 0.0), abs(k - 1) / 2)
+            shown = [4, "N", *["M"][:k], *["C"][: k // 4 * (ids is None)]]
+            readings = rows(0.52 + 0.5 * k, shown)
+            reports.append(slam.update(readings, ids and [ids[name] for name in shown]))
+            readings[:] = np.nan  # as a caller may who reuses it
+            if k == 0:
+                slam.remove([1])
+            if k == 1:
+                slam.merge(2, 3)
+        return reports
+
+    policy = {"association": "joint", "confirm": (3, 8)}
+    slam = managed(**policy)
+    slam.predict((0.0, 0.0))
+    reports = tell(slam, None)
+    assert [report.confirmed_ids for report in reports] == [(), (), (5,), (6,), ()]
+    told = make_estimator("invariant", **NOISE)
+    told.predict((0.0, 0.0))
+    expected = tell(told, {4: 4, "N": 5, "M": 6})
+    assert [made.row_ids for made in slam.decisions][2:5] == [(4, 5, 6)] * 3
+    assert slam.landmark_ids == told.landmark_ids == (2, 4, 5, 6)
+    np.testing.assert_allclose(slam.belief().mean, told.belief().mean, atol=1e-9)
+    for key in ("nis", "innovation"):
+        values = getattr(reports[3], key), getattr(expected[3], key)
+        np.testing.assert_allclose(*values, atol=1e-9)
