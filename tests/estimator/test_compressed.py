@@ -366,6 +366,7 @@ def test_a_landmark_counts_as_near_up_to_five_deviations():
     std = sum(np.sqrt(np.trace(part)) for part in parts)
     near = {*map_of(slam).ids_near(pose, away - 4.99 * std)}
     assert {whole.landmark_ids[k], *slam.local_ids} <= near < {*slam.landmark_ids}
+    assert whole.landmark_ids[k] not in map_of(slam).ids_near(pose, away - 5.9 * std)
 
 
 @pytest.mark.slow
@@ -618,6 +619,7 @@ def test_bad_arguments_are_named(call, message):
         ({"base": np.array("EkfSlam")}, "state is of EkfSlam, not of InvariantEkfSlam"),
         ({"strip": np.zeros((3, 3))}, r"state\['strip'\] must have shape"),
         ({"slots": np.zeros(3, dtype=int)}, r"state\['slots'\] must have one entry"),
+        ({"counts": np.array([99, 0, 0, 0, 0])}, r"state\['counts'\] must be at least"),
         ({"scale": np.eye(3)}, r"state\['scale'\] must have shape"),
         ({"points": np.zeros(3)}, r"state\['points'\] must have shape"),
         ({"far_covariance": np.zeros(7)}, "must be whole blocks of rows"),

@@ -1,9 +1,15 @@
 """Submaps are joined from any drive whose readings belong to one world."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from slamgym.estimator import make_estimator
+from slamgym.estimator.large_maps.submaps.joining import (
+    FrameInitialisation,
+    SubmapSummary,
+)
 from slamgym.estimator.models.bearing_range import wrap_angle
 
 
@@ -45,3 +51,46 @@ def test_submaps_with_large_errors_are_joined(seed):
     for belief in drive_around(seed):
         assert np.isfinite(belief.mean).all()
         assert np.linalg.eigvalsh(belief.covariance).min() > -1e-9
+
+
+def test_frames_begin_with_blocks_of_powers_of_two_that_common_landmarks_align():
+    """Composed, the frames drift; common landmarks move whole blocks."""
+    rng = np.random.default_rng(3)
+    frames = np.cumsum(rng.uniform(-1, 1, (12, 3)), axis=0)
+    frames -= frames[0]
+    world = rng.uniform(-9, 9, (6, 2))
+
+    def seen(origin, points):
+        cos, sin = np.cos(origin[2]), np.sin(origin[2])
+        return (points - origin[:2]) @ np.array([[cos, -sin], [sin, cos]])
+
+    summaries, asked = [], []
+    for before, after in pairwise(frames):
+        slots = rng.permutation(6)
+        pose = [*seen(before, after[:2]), after[2] - before[2]]
+        mean = np.concatenate([pose, seen(before, world[slots]).ravel()])
+        summaries.append(SubmapSummary(slots, mean, 0.04 * np.eye(3)))
+
+    def refine(a, b, rough):
+        asked.append((a, b))
+        true = np.column_stack([seen(frames[a], frames[:, :2]), frames[:, 2]])[
+            a : b + 1
+        ]
+        true[:, 2] -= true[0, 2]
+        np.testing.assert_allclose(rough, true, atol=1e-9)
+        return rough
+
+    initial = FrameInitialisation()
+    found = initial.frames(summaries, frames[:1], refine)
+    np.testing.assert_allclose(found, frames, atol=1e-9)
+    assert asked == [(0, 4), (4, 8), (0, 8), (8, 10), (10, 11)]
+    assert {*initial.blocks} == {(0, 8), (8, 10), (10, 11)}
+    more = FrameInitialisation(initial.blocks)
+    asked.clear()
+    more.frames(summaries, frames[:9], refine)
+    assert asked == []
+    off = frames[:9].copy()
+    off[8] += (0.3, -0.2, 0.1)  # only the last: landmarks put most of it right
+    found = more.frames(summaries, off, refine)
+    assert np.abs(found[8:] - frames[8:]).max() < 0.15
+    assert {*initial.blocks} == {*more.blocks}

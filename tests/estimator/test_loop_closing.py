@@ -348,6 +348,8 @@ def test_places_are_sought_only_where_no_landmark_is_known_accurately():
     for seen in (view._replace(covariance=certain), view._replace(ids=range(2))):
         assert not is_astray(seen, rules)
     assert places_of_scan(view, readings[:2], noise, rules) == []
+    with pytest.raises(ValueError, match="must be finite"):
+        places_of_scan(view, np.append(readings, [[np.nan, 3.0]], axis=0), noise, rules)
     mean, P = np.append(view.mean, 9.0), np.pad(view.covariance, (0, 1))
     roomy = places_of_scan(MapView(mean, P, range(7)), readings, noise, rules)
     np.testing.assert_array_equal(roomy[0][0], found)

@@ -28,6 +28,7 @@ from slamgym.estimator.large_maps.sparse_information.local_information import (
     relocate,
 )
 from slamgym.estimator.large_maps.sparse_information.scan_update import BASES
+from slamgym.estimator.large_maps.sparse_information.sparse_belief import SparseBelief
 from slamgym.estimator.large_maps.sparse_information.sparse_information_slam import (
     SparseInformationSlam,
 )
@@ -685,3 +686,64 @@ def test_a_local_map_holds_what_is_required_and_the_nearest_others():
     assert {*found[2:]} < {*order[:9].tolist()}
     assert len(choose_local(mapped, points, centre, order[:12], 9)) == 12
     assert {*choose_local(mapped, points, centre, far, 99)} == {*mapped.tolist()}
+
+
+def test_a_dense_belief_is_taken_over_as_conditional_and_marginal():
+    dense = EkfSlam(*NOISE, initial_pose_std=(0.1, 0.2, 0.1))
+    for _ in range(2):
+        dense.predict((0.5, 0.1))
+        dense.update([(0.1, 4.0), (1.0, 6.0), (-0.7, 3.0)], [5, 3, 8])
+    (mean, P, reference), n = dense.map.arrays, dense.map.size
+    taken = SparseBelief.of(dense)
+    gain = P[:3, 3:n] @ np.linalg.inv(P[3:n, 3:n])
+    for found, expected in (
+        (taken.pose.mean, mean[:3]),
+        (taken.pose.gain, gain),
+        (taken.pose.covariance, P[:3, :3] - gain @ P[3:n, :3]),
+        (taken.pose.reference, reference[:2]),
+        (taken.origin, mean[:2]),
+        (taken.local.points, mean[3:n]),
+        (taken.local.first, reference[3:n]),
+        (np.linalg.inv(taken.local.information), P[3:n, 3:n]),
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-12)
+        assert not any(np.shares_memory(found, own) for own in dense.map.arrays)
+    assert (taken.slots, taken.steps) == ({5: 0, 3: 1, 8: 2}, dense.steps)
+    arrays = taken.map_.points, taken.map_.first, taken.local.information
+    parts = taken.map_.information, taken.map_.elimination, *arrays
+    assert taken.nbytes == sum(part.nbytes for part in parts)
+
+
+def test_free_slots_are_used_again_from_the_last_and_a_new_local_map_lies_ahead():
+    rng = np.random.default_rng(4)
+    start = np.array([1.0, -2.0, 0.5])
+    belief = SparseBelief.empty(start, np.array([0.1, 0.2, 0.3]))
+    assert [part.shape for part in belief.pose] == [(3,), (3, 0), (3, 3), (2,)]
+    np.testing.assert_allclose(belief.pose.covariance, np.diag([0.01, 0.04, 0.09]))
+    start += 5.0
+    for place in (belief.pose.mean, belief.pose.reference, belief.origin):
+        assert place[:2].tolist() == [1.0, -2.0]
+    belief.add(range(300))
+    for i in (40, 7, 9):
+        belief.free.append(belief.slots.pop(i))
+    assert belief.free_slots(5).tolist() == [9, 7, 40, 300, 301]
+    belief.add([500, 501])
+    assert (belief.free, belief.slots[500], belief.slots[501]) == ([40], 9, 7)
+    belief.map_.points[:] = rng.uniform(-9, 9, belief.map_.points.shape)
+    belief.pose.mean[:2] += (4.0, 2.0)
+    seen = [*belief.slots][:3]
+    found = belief.new_local_map([*seen, 999])
+    mapped, points = np.array([*belief.slots.values()]), belief.map_.points
+    expected = choose_local(
+        mapped, points.reshape(-1, 2), np.array([7.0, 1.0]),
+        np.array([belief.slots[i] for i in seen]), local_map_size(299, 4, 3),
+    )  # fmt: skip
+    assert {*found.tolist()} == {*expected.tolist()}
+    most = 3 * local_map_size(299, 3, 3) // 2
+    for count, is_adequate in ((most + 1, False), (most, True)):
+        belief.change_local_map(np.union1d(expected[:3], mapped[3:count]))
+        assert (belief.new_local_map(seen) is None) == is_adequate
+    (other, *_) = (i for i, k in belief.slots.items() if k not in belief.local.slots)
+    assert belief.new_local_map([*seen[1:], other]) is not None
+    belief.add([502])
+    assert (belief.free, belief.slots[502]) == ([], 40)
