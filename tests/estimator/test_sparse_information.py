@@ -323,6 +323,11 @@ def test_a_map_of_separate_parts_can_be_asked_for_any_part():
         slam.update(scan, range(first, first + 50))
         whole, ids = slam.belief(), slam.landmark_ids[::7]
         assert_close_beliefs(slam.belief(ids), part_of(whole, ids), 1e-12)
+    state = slam.state_dict()
+    slots = dict(zip(state["landmark_ids"].tolist(), state["slots"], strict=True))
+    places = np.array([slots[i] for i in whole.landmark_ids])
+    P = np.linalg.inv(matrix_of(state).dense(places))
+    np.testing.assert_allclose(whole.covariance[3:, 3:], P, atol=1e-9 * P.max())
 
 
 def test_removing_landmarks_changes_nothing_about_the_others():
