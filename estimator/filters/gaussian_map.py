@@ -57,7 +57,7 @@ VALUES = 24
 UpdateKernel = Callable[..., int]
 
 #: Attributes of a map that follow from its block.
-_FROM_BLOCK = {"parts", "_slots", "_last"}
+_FROM_BLOCK = {"parts", "_slots", "newest"}
 
 
 class GaussianMap:
@@ -90,7 +90,7 @@ class GaussianMap:
     #: Its parts by name.
     parts: Parts
     _slots: dict[int, int]
-    _last: Callable[[], Any]  # the last report: a `ScanReport`, or one like it
+    newest: Callable[[], Any]  # the last report, if in use: a `ScanReport`, or alike
     _anew: ClassVar[Mapping[str, Any]] = {}  # attributes to reset with a new block
 
     def __init__(self, values: Sequence[float]) -> None:
@@ -105,7 +105,7 @@ class GaussianMap:
         def newest() -> Any:  # `last`, and None after the next scan
             return None if parts.numbers[SCANNED] else last
 
-        named = {**self._anew, **named, "_slots": {}, "_last": newest}
+        named = {**self._anew, **named, "_slots": {}, "newest": newest}
         vars(self).update(named, block=block, parts=parts)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -127,7 +127,7 @@ class GaussianMap:
         self.detach_report()
         memory, starts = snapshot["block"], slice(STARTS, NUMBERS)
         if memory[starts].tobytes() == self.block[starts].tobytes():
-            self._slots, self._last = {}, type(None)
+            self._slots, self.newest = {}, type(None)
             copy_memory(memory, self.block)
             vars(self).update(_without_block(snapshot))
         else:
@@ -275,7 +275,7 @@ class GaussianMap:
 
     def take_in(self, update: UpdateKernel, readings: Array, ids: IntArray) -> int:
         """Update the map with a scan, as `update_map`; return the status."""
-        if (last := self._last()) is not None:  # `detach_report`, inlined
+        if (last := self.newest()) is not None:  # `detach_report`, inlined
             last.detach()
         status = update(self.block, readings, ids)
         if status == NO_ROOM:
@@ -287,17 +287,17 @@ class GaussianMap:
         """Return the report of the scan that has just been taken in."""
         report = ScanReport.__new__(ScanReport)  # in half the time of an __init__
         report.__dict__["_parts"] = self.parts  # a frozen dataclass refuses setattr
-        self._last = ref(report)
+        self.newest = ref(report)
         return report
 
     def detach_report(self) -> None:
         """Copy the results of the last report, if it is still in use."""
-        if (last := self._last()) is not None:
+        if (last := self.newest()) is not None:
             last.detach()
 
     def last_report(self) -> UpdateReport:
         """Return the report of the last scan or reading of the pose once more."""
-        last = self._last()
+        last = self.newest()
         return self.report() if last is None or last.is_detached else last
 
     def rename(self, names: Mapping[int, int]) -> None:
