@@ -33,13 +33,14 @@ collect_ignore = ["support", "mutate.py", "on_rllib.py"]
 # The many objects of modules and tests live to the end: the search for garbage need not
 # go through them again and again.
 gc.disable()
+_USUAL, _SELDOM = gc.get_threshold(), (50_000, 20, 20)
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtestloop():
     """Search for garbage from here on, seldom, in what is made from here on."""
     gc.freeze()
-    gc.set_threshold(50_000, 20, 20)  # a compilation makes millions of objects
+    gc.set_threshold(*_SELDOM)  # a compilation makes millions of objects
     gc.enable()
 
 
@@ -159,6 +160,14 @@ def here(tmp_path, monkeypatch):
     """Run a test in an empty folder, and return it."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture
+def usual_collector():
+    """Search for garbage as often as a program does, where memory is measured."""
+    gc.set_threshold(*_USUAL)
+    yield
+    gc.set_threshold(*_SELDOM)
 
 
 @pytest.fixture

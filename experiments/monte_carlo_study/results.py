@@ -44,8 +44,7 @@ if TYPE_CHECKING:
 
 
 Blocks = Iterable[tuple[range, list[run_measures.Block]]]
-#: Bytes of blocks that are written together, and of new blocks that stay in memory.
-_MOST_JOINED, _MOST_NEW = 2**24, 2**27
+_MOST_JOINED = 2**24  # bytes of blocks that are written together
 
 _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pymunk", "xarray")
 _FROM_TRUTH = "for a consistent filter, NEES and NIS are χ² with the stated degrees"
@@ -336,8 +335,6 @@ class BlockFolder(NamedTuple):
     path: Path
     #: Of the job.
     digest: str
-    #: The first blocks that this process adds, so that they are not read again.
-    new: dict[range, list[run_measures.Block]]
 
     def missing(self, blocks: Iterable[range], variables: Iterable[str]) -> list[range]:
         """Return the blocks that are still to be computed; warn of a damaged one.
@@ -374,15 +371,10 @@ class BlockFolder(NamedTuple):
         for shorter in self._files_from(runs.start):
             if shorter != file:
                 shorter.unlink()
-        if len(self.new) * _bytes_of(parts) < _MOST_NEW:
-            self.new[runs] = parts
 
     def read(self, blocks: Iterable[range], job: MonteCarloJob) -> Blocks:
         """Yield blocks with their runs, one at a time."""
         for runs in blocks:
-            if runs in self.new:
-                yield runs, self.new[runs]
-                continue
             file = self._files_from(runs.start)[-1]  # the longest
             with np.load(file, allow_pickle=False) as arrays:
                 parts = [
@@ -451,7 +443,7 @@ def opened(
                 _clear(path, found)
             _write_job(path, identity, _looks_in(path) if found and not fresh else [])
             (path / BLOCKS).mkdir(exist_ok=True)
-        yield BlockFolder(path, digest_of(identity), {})
+        yield BlockFolder(path, digest_of(identity))
 
 
 def _write_job(

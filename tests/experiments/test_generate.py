@@ -556,6 +556,7 @@ def test_a_folder_without_a_right_manifest_is_named(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("usual_collector")
 def test_memory_stays_flat(tmp_path):
     def peak(shards):
         tracemalloc.start()

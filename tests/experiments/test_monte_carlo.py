@@ -585,7 +585,7 @@ def test_a_disk_that_is_full_leaves_the_blocks_before(whole, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("_figures_in_reports_are_blank")
+@pytest.mark.usefixtures("_figures_in_reports_are_blank", "usual_collector")
 def test_memory_grows_with_the_block_and_not_with_the_runs(tmp_path, monkeypatch):
     monkeypatch.setattr(verdict, "_AT_ONCE", 8 * 251)
     world = load_scenario("coarse_loop").with_changes(steps=250)
