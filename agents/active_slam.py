@@ -391,7 +391,7 @@ class Explorers(Restorable):
         update_filters(self._filters, observations, worlds, moved=moved)
 
     def note(self, worlds: BoolArray, true_ids: IntArray, mask: BoolArray) -> None:
-        """Note the true landmarks of one scan of some worlds, if scores need them."""
+        """Record the true landmarks of a scan of some worlds, if scores need them."""
         if self._record is not None:
             self._record.add(worlds, true_ids, mask)
 

@@ -90,8 +90,9 @@ def advance(
     Of the chosen worlds, those that move take a step. The progress of the others starts
     from nothing, and they have no outcome. Worlds not chosen stay. The arrays come as
     plain tuples, the entries of `Worlds`, `Floor`, `TaskRules` and `Scratch`: numba
-    takes microseconds to recognise a NamedTuple. All features of a `Worlds` that are
-    numbers come in one array, one feature of all worlds after another.
+    takes microseconds to recognise a NamedTuple. The numeric features of a `Worlds`
+    come in one array: the values of the first feature for all worlds, then those of the
+    next one. The boolean feature, which landmarks are mapped, is an array of its own.
     """
     beliefs, actions, collisions, episodes, outcome, counts, numbers, mapped = worlds
     now, result = Episodes(*episodes), StepOutcome(*outcome)

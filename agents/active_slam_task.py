@@ -35,7 +35,7 @@ _SIZES = {  # of the entries besides the belief
     "unexplored": 2 * SECTORS,
     "walls": SECTORS,
 }
-_OF_SETS = "landmarks", "mask"  # further entries of observations as sets
+_OF_SETS = "landmarks", "mask"  # entries that only observations as sets have
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class ActiveSlamTask(Restorable):
             np.zeros(landmarks),
             np.zeros((2 * landmarks, 2 * landmarks)),
         )
-        #: Where the numbers of each entry are in one array; ``belief_mask`` has none.
+        #: Place of each entry in the array of all numbers; ``belief_mask`` has none.
         self._parts: dict[str, slice] = {}
         self._length = 0
         for key, box in flat.items():

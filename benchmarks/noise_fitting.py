@@ -59,7 +59,7 @@ def coverage(world: str, runs: int, seed: int) -> None:
             verdicts[noise.name][noise.verdict] += 1
             if true:
                 errors[noise.name].append(noise.value / true)
-        held.update(truth.keys() - {noise.name for noise in result.noise})  # left out
+        held.update(truth.keys() - {noise.name for noise in result.noise})  # they are 0
         inflated += result.suggested.settings != result.fitted.settings
     seconds = (time.process_time() - started) / runs
     for name, true in truth.items():

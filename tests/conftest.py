@@ -38,7 +38,7 @@ _USUAL, _SELDOM = gc.get_threshold(), (50_000, 20, 20)
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtestloop():
-    """Search for garbage from here on, seldom, in what is made from here on."""
+    """Collect garbage from here on, seldom, and only among objects made later."""
     gc.freeze()
     gc.set_threshold(*_SELDOM)  # a compilation makes millions of objects
     gc.enable()

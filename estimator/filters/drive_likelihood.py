@@ -218,7 +218,10 @@ def _follow(
     record: DriveRecord,
     part: slice,
 ) -> None:
-    """Fill a part of a record, with room of its own; the motions are displacements."""
+    """Fill a part of a record, in memory of its own.
+
+    The motions of the events are displacements here, rows (dx, dy, α, dt).
+    """
     landmarks = int(events.landmarks.max(initial=-1)) + 1
     capacity = GaussianMap.capacity_for(landmarks)
     most = int(np.diff(events.first_readings).max(initial=0))
@@ -342,14 +345,17 @@ def move(
     noise_at_rest: bool,
     rules: Rules,
 ) -> None:
-    """Predict the pose through the motions of a step; `carry` moves the rest later."""
+    """Predict the pose through the motions of step s.
+
+    `carry` later applies them to the covariance of the pose and the landmarks.
+    """
     for k in range(drive.first_motions[s], drive.first_motions[s + 1]):
         dx, dy, turn = drive.motions[k, 0], drive.motions[k, 1], drive.motions[k, 2]
         moves = noise_at_rest or dx != 0 or dy != 0 or turn != 0
         dt = drive.motions[k, 3] * moves
         at_estimate = rules.linearisation == scan.AT_ESTIMATE
         if at_estimate and dx == 0 and dy == 0 and dt == 0:
-            belief.mean[2] += turn  # as half of a midpoint motion, or at rest
+            belief.mean[2] += turn  # a turn without noise, or a robot at rest
             continue
         for i in range(3):
             variance[i] = noise[i] * noise[i] * dt

@@ -90,7 +90,7 @@ class GaussianMap:
     #: Its parts by name.
     parts: Parts
     _slots: dict[int, int]
-    newest: Callable[[], Any]  # the last report, if in use: a `ScanReport`, or alike
+    newest: Callable[[], Any]  # returns the last report, or None if it is not in use
     _anew: ClassVar[Mapping[str, Any]] = {}  # attributes to reset with a new block
 
     def __init__(self, values: Sequence[float]) -> None:
@@ -102,7 +102,7 @@ class GaussianMap:
     ) -> None:
         parts = parts or parts_of(block)
 
-        def newest() -> Any:  # `last`, and None after the next scan
+        def newest() -> Any:  # `last`, but None after the next scan
             return None if parts.numbers[SCANNED] else last
 
         named = {**self._anew, **named, "_slots": {}, "newest": newest}

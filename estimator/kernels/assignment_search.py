@@ -311,17 +311,17 @@ def cost_if_settled(
     """Return the cost of pairing all readings, if no other assignment is of interest.
 
     The search finds this assignment first, with the same cost to the bit, if every pair
-    costs less than its reading left out, given the pairs before it.  To leave out
+    costs less than its reading left out, given the pairs before it.  Leaving out the
     readings U costs in addition ::
 
         Σ λ − ln det S_U − ρᵀ (Q − C⁺)⁻¹ ρ
 
     where S_U is given all other pairs, and ρ and C⁺ are the innovations and C of U
-    after all pairs.  To leave out one does not matter if that is too expensive, or if
-    the reading is then near its landmark, and hardly changes the belief (`_is_idle`).
-    To leave out several must be too expensive.  det S_U is at most the product of det S
-    before any pair, and C⁺ ⪯ τ Q with τ = Σ tr Q⁻¹ C⁺.  The last term is at most
-    νᵀ S⁻¹ ν of all pairs.  So u readings cost at least the larger one of ::
+    after all pairs.  Leaving out one reading does not matter if it is too expensive, or
+    if the reading is then near its landmark and hardly changes the belief (`_is_idle`).
+    Leaving out several must be too expensive.  det S_U is at most the product of det S
+    before any pair, and C⁺ ⪯ τ Q with τ = Σ tr Q⁻¹ C⁺ over U.  The last term is at most
+    νᵀ S⁻¹ ν of all pairs.  So leaving out u readings costs at least the larger of ::
 
         u min (λ − ln det S) − νᵀ S⁻¹ ν
         sum of the u least of λ − ln det S − ρᵀ Q⁻¹ ρ / (1 − u max tr Q⁻¹ C⁺)
@@ -337,8 +337,8 @@ def cost_if_settled(
     partners : ndarray of int64, shape (m,)
         The landmark of each reading, from :func:`only_partners`.
     same : float
-        To leave out readings near their landmarks does not matter if it changes the
-        belief less, see :func:`largest_change`; at most 1.
+        Leaving out a reading near its landmark does not matter if it changes the belief
+        by less than this, see :func:`largest_change`; at most 1.
 
     Returns
     -------
@@ -415,7 +415,7 @@ def _is_idle(
     missing: float,
     limits: tuple[float, float, float],
 ) -> bool:
-    """Return whether to leave out one reading does not matter.
+    """Return whether it does not matter if one reading is left out.
 
     Given all other pairs, ::
 
@@ -430,8 +430,8 @@ def _is_idle(
     missing : float
         λ of the reading.
     limits : tuple of float
-        Cost that is too expensive, gate of an ambiguous reading, and change of a belief
-        that remains the same.
+        Additional cost that is too expensive, gate of an ambiguous reading, and change
+        below which a belief counts as the same.
     """
     (m00, m10, m11), (q0, q1), (margin, gate, same) = left, q, limits
     x, determinant = fit(rho[0], rho[1], m00, m10, m11)
@@ -444,7 +444,7 @@ def _is_idle(
     half = (m00 / q0 + m11 / q1) / 2
     least = half - np.sqrt(max(half * half - share, 0.0))
     squared = (1 + x) * (1 - least) / least  # of the largest change
-    # Then 2 (1 − λ) > 1, and det S < 4 det Q: the place of the landmark is certain.
+    # Then λ < ½ and det S < 4 det Q, which is below `SURE`: its place is certain.
     is_same = squared < same * same * (1 - ROUNDING)
     return more >= ROUNDING and x <= gate * (1 - ROUNDING) and is_same
 
@@ -465,7 +465,7 @@ SURE = 9.0
 ROUNDING = 1e-6
 WIDE = 1e6
 
-#: Least det Q / det S of a reading, given all others: with less, rounding counts.
+#: Smallest det Q / det S of a reading, given all others, that rounding cannot spoil.
 KNOWN = 0.01
 
 #: Cost that a pair saves where the number of pairs counts before all else.

@@ -437,7 +437,7 @@ class SubmapElimination:
         return marginal_covariance(self._nodes, rows)[0]
 
     def inverse(self, rows: IntArray, size: int) -> GrowingCovariance:
-        """Return H⁻¹ with the row of each unknown, and room up to a size."""
+        """Return H⁻¹ with each unknown in a given row, and room for more variables."""
         return inverse(self._nodes, rows, size)
 
     @property

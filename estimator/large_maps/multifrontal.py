@@ -163,8 +163,8 @@ def marginal_covariance(
 class GrowingCovariance:
     """Covariance of variables that are added one group after another.
 
-    A variable's row is its number, and its column its place in the order of adding:
-    products then read whole blocks, and the rows are in the order that is wanted.
+    The caller numbers the variables. The row of a variable is its number. The columns
+    are in the order in which the variables are added, so products read whole blocks.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ def inverse(nodes: Sequence[Node], rows: IntArray, size: int) -> GrowingCovarian
     rows : ndarray, shape (N,)
         The row of each unknown.
     size : int
-        Number of unknowns, and of the variables that the caller will add.
+        Number of unknowns plus number of variables that the caller will add.
     """
     found = GrowingCovariance(size)
     for node in reversed(nodes):

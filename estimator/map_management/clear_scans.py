@@ -201,7 +201,7 @@ class ClearScans:
         gaussian, known = self._filter.map, candidates.tentative
         is_given, count = ids is not None, len(readings)
         at_once = alone and self._filter is self._slam and not len(known.seen)
-        if at_once and (last := gaussian.newest()) is not None:  # `detach_report`
+        if at_once and (last := gaussian.newest()) is not None:  # inlined
             last.detach()
         names = np.empty(count, np.int64) if ids is None else ids
         tentative = known.mean, known.covariance, known.seen

@@ -370,9 +370,9 @@ class SmoothedDrive:
         return self.covariances_of(range(len(self.poses)))
 
     def covariances_of(self, poses: Sequence[int] | IntArray) -> Array:
-        """Return the marginal covariance of some poses, shape (p, 3, 3).
+        """Return the marginal covariances of some poses, shape (p, 3, 3).
 
-        Negative ones count from the end.
+        Negative indices count from the end.
         """
         chosen = np.array([self._pose(pose) for pose in poses], dtype=np.int64)
         sensitivity, factor, _ = self._marginals

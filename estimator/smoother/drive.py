@@ -479,7 +479,8 @@ def _between(
 ) -> Array:
     """Return the poses after the readings of one motion, shape (P, 3).
 
-    ``ends`` are its first and last pose, (2, 3), and ``inverse`` is Σ⁻¹.
+    ``ends`` are its first and last pose, (2, 3), and ``inverse`` is Σ⁻¹ in the formula
+    of `path_between`.
     """
     first, last = ends
     if len(motion.steps) == 1:

@@ -15,12 +15,13 @@ q = G δ_{k−1} + s, with noise w ~ N(0, I), is eliminated by minimising over w
 and pose k by writing q in terms of pose k − 1.  E is never inverted: directions
 without noise, and a start that is known, are exact.  What remains, C and η, is the
 Schur complement of the landmarks.  Once δ_l is known, a second pass with λ − B δ_l in
-place of λ needs no B, and :func:`substitute` goes back, forwards in time.  This is the
-backward information filter of a two-pass smoother [1]_ with the landmarks as
-parameters.
+place of λ needs no B.  Then :func:`substitute` computes the poses, forwards in time.
+This is the backward information filter of a two-pass smoother [1]_ with the landmarks
+as parameters.
 
-The rows W of all poses would be the largest arrays of a smoother.  So the drive is
-eliminated in parts of `PART` poses, and each part can be eliminated once more.
+The rows W of all poses would need the most memory of a smoother.  The drive is
+therefore eliminated in parts of `PART` poses, and only the rows of one part are kept.
+Eliminating a part once more restores its rows.
 
 References
 ----------
@@ -49,7 +50,7 @@ from ..models.bearing_range import (
 from ..models.rigid_motion import composed_jit
 from .drive import DriveArrays
 
-#: Poses of a part.
+#: Number of poses in a part.
 PART = 256
 
 
@@ -62,20 +63,20 @@ class System(NamedTuple):
 
 
 class Elimination(NamedTuple):
-    """What eliminating N poses in p parts leaves, for the way back."""
+    """What eliminating N poses in p parts leaves, for computing the poses."""
 
     curvatures: Array  # (N, 3, 3) Λ
     slopes: Array  # (N, 3) λ
     gains: Array  # (N, 3, 3) U
     shifts: Array  # (N, 3) s
-    rows: Array  # (PART, 3, 2n) W of the last part taken
+    rows: Array  # (PART, 3, 2n) W of the part eliminated last
     blocks: Array  # (n, 2, 2) C before Wᵀ W is subtracted
     right: Array  # (2n,) η
-    ends: System  # of the poses behind each part, one after the other along axis 0
+    ends: System  # of the poses after each part, with the parts along axis 0
 
 
 def new_elimination(poses: int, landmarks: int) -> Elimination:
-    """Allocate room."""
+    """Return an elimination whose arrays are zero."""
     parts, size = -(-poses // PART), 2 * landmarks
     return Elimination(
         np.zeros((poses, 3, 3)),
@@ -104,14 +105,14 @@ def eliminate(
 ) -> None:
     """Linearise at poses (N, 3) and landmarks (2n,), and eliminate a part of the poses.
 
-    The parts are taken from the last one to the first.  A part may be taken again.
+    The last part comes first.  A part may be eliminated again later.
 
     Parameters
     ----------
     part : int
-        Poses part · `PART` and the next ones.
+        Index of the part, whose first pose is part · `PART`.
     landmark_step : ndarray, shape (2n,)
-        δ_l, where it is known, else zeros.  ``drive`` has the widths 0 then.
+        δ_l in the second pass, where ``drive`` has the widths 0; else zeros.
     stds : ndarray, shape (M, 2)
         Those of each reading.
     robust
@@ -119,7 +120,7 @@ def eliminate(
     damping : float
         Levenberg-Marquardt's: the part by which readings count more against a step.
     out
-        Filled; C and η are added to.
+        Filled.  The part adds to C and η.
     """
     poses, first, ends = estimate[0], part * PART, out.ends
     curvature, slope = ends.curvature[part].copy(), ends.slope[part].copy()
@@ -167,7 +168,7 @@ def _absorb(
 ) -> None:
     """Add reading j of pose k: Hᵀ Q⁻¹ H and Hᵀ Q⁻¹ ν, weighted by a robust kernel.
 
-    ν is what the step of the landmarks leaves of the innovation.
+    ν is the innovation after the step of the landmarks, to first order.
     """
     (k, j), (poses, landmarks) = where, estimate
     curvature, slope, coupling = system
@@ -323,7 +324,7 @@ def _change_pose(system: System, width: int, turned: tuple[float, float]) -> Non
 
 
 # --------------------------------------------------------------------------------------
-# Go back over the eliminated poses, forwards in time.  With the λ of the second pass::
+# Compute the eliminated poses, forwards in time.  With the λ of the second pass::
 #
 #     δ_k = q − U Uᵀ (Λ q − λ),    q = G δ_{k−1} + s
 #
@@ -332,7 +333,7 @@ def _change_pose(system: System, width: int, turned: tuple[float, float]) -> Non
 
 @jit
 def substitute(poses: Array, drive: DriveArrays, out: Elimination) -> Array:
-    """Return the new poses, shape (N, 3), after the pass with the landmarks' step.
+    """Return the new poses, shape (N, 3), after the second pass.
 
     They are driven: q is taken from the new pose k − 1, and the noise found acts in its
     frame.  A direction without noise therefore has none, whatever the step.
@@ -421,16 +422,16 @@ def fill_sensitivity(
 
 
 class Sensitivity:
-    """Ψ of any poses, computed for one part after the other.
+    """Sensitivity Ψ of poses to errors of the landmarks, computed part by part.
 
     Parameters
     ----------
     poses : ndarray, shape (N, 3)
-        Where they were eliminated.
+        Where the drive was linearised.
     out : Elimination
-        What that has left.
+        The result of eliminating them.
     again : callable
-        Eliminates one part once more.
+        Eliminates the part with a given index once more.
     """
 
     def __init__(
@@ -440,7 +441,7 @@ class Sensitivity:
         self.given_map, self.transitions = conditionals(poses, out)
         self._out, self._again = out, again
         self._before = [np.zeros_like(out.rows[0])]  # Ψ of the pose before each part
-        self._part = -1  # whose Ψ the rows hold
+        self._part = -1  # the part whose Ψ the rows hold
 
     def of(self, poses: IntArray) -> Array:
         """Return Ψ of some poses, shape (p, 3, 2n)."""
@@ -453,7 +454,7 @@ class Sensitivity:
         return found
 
     def _fill(self, part: int) -> None:
-        """Fill the rows with Ψ of a part; that of the pose before it is known."""
+        """Fill the rows with Ψ of a part; Ψ of the pose before it must be known."""
         if part == self._part:
             return
         self._part = -1

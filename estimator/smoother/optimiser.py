@@ -107,7 +107,7 @@ class Optimiser:
         poses, landmarks = len(drive.increments), int(drive.widths[0]) // 2
         self._room = elimination.new_elimination(poses, landmarks)
         self._parts = range(len(self._room.ends.slope))[::-1]
-        self._still = np.zeros(2 * landmarks)  # a step of the landmarks
+        self._still = np.zeros(2 * landmarks)  # a zero step of the landmarks
         rules = noise.rules
         self._rule_values = np.array(rules)
         self._robust = noise.kind, noise.scale
@@ -185,7 +185,7 @@ class Optimiser:
         return self._linearise(solution.estimate, stds, 0.0)
 
     def sensitivity(self, solution: Solution) -> elimination.Sensitivity:
-        """Return that of the poses to the landmarks, after :meth:`linearised`."""
+        """Return the sensitivity of the poses to the landmarks, after `linearised`."""
         estimate, room = solution.estimate, self._room
         stds = self.reading_stds(estimate)
         again = partial(self._eliminate, self._drive, estimate, stds, 0.0, self._still)

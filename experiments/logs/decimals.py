@@ -1,8 +1,9 @@
-"""Write many floats at once as `repr` does: with the fewest digits that read back.
+"""Write many floats at once as `repr` does: with the fewest digits that identify them.
 
-Of the decimal numbers that are rounded to a float x = c 2^q, those with the fewest
-digits are taken, and of these the nearest [1]_. With 10^k <= 2^q < 10^(k+1), the
-interval of these numbers contains a multiple of 10^k, and at most one of 10^(k+1).
+Of the decimal numbers that are rounded to a float x = c 2^q, with integers c and q,
+`repr` takes those with the fewest digits, and of these the nearest to x [1]_. With
+10^k <= 2^q < 10^(k+1), the interval of the numbers that are rounded to x contains a
+multiple of 10^k, and at most one multiple of 10^(k+1).
 
 References
 ----------
@@ -14,14 +15,14 @@ import numpy as np
 from ...arrays import AnyArray, Array, IntArray, WordArray
 from ...jit import jit_in_place, multiply_words, njit_internal
 
-#: Sizes between which `repr` writes no exponent, and 10^-k and c are exact below.
+#: In this range of sizes, `repr` writes no exponent, and 5^-k fits into 64 bits.
 _SMALLEST, _END = 1e-4, 2.0**53
 _FIVES = np.array([5**m for m in range(21)], dtype=np.uint64)
-_MOST = 25  # bytes of a text: sign, 0.000, 17 digits, line feed
+_MOST = 25  # bytes of the longest text: sign, 0.000, 17 digits, line feed
 
 
 def texts(values: Array) -> list[str]:
-    """Write numbers, shape (n,), so that reading gives the same bits; nan as nothing.
+    """Write numbers, shape (n,), so that reading gives the same bits; nan as "".
 
     Examples
     --------
@@ -43,7 +44,7 @@ def texts(values: Array) -> list[str]:
 def _write(
     words: IntArray, is_plain: AnyArray, fives: WordArray, text: AnyArray
 ) -> int:
-    """Write plain floats, given as bits, each with a line feed; return the end."""
+    """Write plain floats from their bits, and others as empty lines; return the end."""
     end = 0
     for i in range(len(words)):
         if is_plain[i]:
@@ -61,11 +62,11 @@ def _write(
 
 @njit_internal
 def _shortest(word: int, fives: WordArray) -> tuple[int, int]:
-    """Return the digits d and the power p of d 10^p, as which a float is written.
+    """Return the integers d and p of the number d 10^p that represents a float.
 
     Sizes are compared exactly, in multiples of 10^k / 4. An end of the interval is an
-    odd multiple of 2^(q - 1), and so none of 10^k. Below a power of two, the interval
-    is shorter; that changes no text.
+    odd multiple of 2^(q - 1), and therefore not a multiple of 10^k. If the float is a
+    power of two, the interval is shorter at its lower end, but this changes no text.
     """
     c, q = word & (2**52 - 1) | 2**52, ((word >> 52) & 0x7FF) - 1075
     k = 1262611 * q >> 22  # ⌊q log₁₀ 2⌋
@@ -83,9 +84,10 @@ def _shortest(word: int, fives: WordArray) -> tuple[int, int]:
 
 @njit_internal
 def _scaled(size: int, k: int, q: int, fives: WordArray) -> int:
-    """Return size 2^(q - 4) in multiples of 10^k / 4; a fraction as an odd number.
+    """Return size 2^(q - 4) in multiples of 10^k / 4.
 
-    It is size 5^-k / 2^(k - q + 2).
+    It is size 5^-k / 2^(k - q + 2), rounded down. The last bit is set if there was a
+    fraction.
     """
     high, low = multiply_words(np.uint64(size), fives[-k])
     down = np.uint64(k - q + 2)
@@ -96,7 +98,7 @@ def _scaled(size: int, k: int, q: int, fives: WordArray) -> int:
 
 @njit_internal
 def _write_digits(digits: int, power: int, text: AnyArray, end: int) -> int:
-    """Write d 10^p with a point, from the last digit on; return the new end."""
+    """Write d 10^p with a decimal point, the last digit first; return the new end."""
     while power < -1 and digits % 10 == 0:
         digits, power = digits // 10, power + 1
     while power > -1:

@@ -280,12 +280,12 @@ def columns_of(
 ) -> list[list[str]]:
     """Return the columns of the rows that begin with a tag, without the tag.
 
-    It is the inverse of `rows_of`, for files that this package wrote.
+    It is the inverse of `rows_of`, for files that this package has written.
 
     Raises
     ------
     ValueError
-        If such a row has not ``count`` fields.
+        If such a row does not have ``count`` fields.
 
     Examples
     --------

@@ -341,7 +341,7 @@ def format_line_of(lines: list[LogLine]) -> int | None:
 
 
 def parsed(lines: list[LogLine], default_name: str) -> SlamLog:
-    """Return the log that the lines of a file hold; errors as `read_slamlog`."""
+    """Return the log in the lines of a file; raise errors as `read_slamlog` does."""
     place = format_line_of(lines)
     if place is None:
         raise lines[0].error(FORMAT_LINE, shown(lines[0].text))

@@ -60,7 +60,7 @@ def intervals(
     log_likelihood : float
         The maximum.
     information : ndarray, shape (k, k)
-        About the logarithms of those > 0.
+        About the logarithms of the parameters > 0.
     """
     free = np.flatnonzero(parameters > 0)
     whole = np.zeros((len(parameters), len(parameters)))

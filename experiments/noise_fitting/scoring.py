@@ -40,7 +40,7 @@ FARTHEST = 2.0  # the most that an iteration changes one θ
 SHARES = (8.0, 3.0, 1.5, 1.0, 0.5, 0.15)  # of the step that are tried at once
 FAINT = 0.05  # information on θ beside which that of the readings is none
 LITTLE = 16.0  # information on θ, that of a standard deviation of ¼
-GAIN = 1e-3  # in ℓ, below which an iteration ends a climb: .04 standard deviations
+GAIN = 1e-3  # in ℓ, below which a climb ends: a step of .04 standard deviations
 BETTER = 1e-2  # in ℓ, from which on one value is more likely than another
 MOST = 60  # iterations of a climb
 CLIMBS = 8
@@ -104,8 +104,8 @@ def maximise(
     most : int
         Iterations of a climb.
     gain : float
-        A climb ends where an iteration should increase ℓ by less, or has changed it by
-        less, as beside a jump of ℓ.
+        A climb ends where the next step is expected to raise ℓ by less than this, or
+        where the last trial has changed it by less, as beside a jump of ℓ.
 
     Raises
     ------
@@ -218,7 +218,7 @@ def curvature(likelihoods: Likelihoods, theta: Array, widths: Array) -> Array:
     both = np.vstack([steps, steps[rows] + steps[columns]])
     around = np.exp(theta + np.vstack([np.zeros(p), both, -both]))
     here, *values = totals(likelihoods(around))
-    rises = np.reshape(values, (2, -1)).sum(axis=0) - 2 * here  # to either side
+    rises = np.reshape(values, (2, -1)).sum(axis=0) - 2 * here  # of both sides
     result = np.empty((p, p))
     products = rises[p:] - rises[rows] - rises[columns]
     result[rows, columns] = -products / (2 * widths[rows] * widths[columns])
@@ -368,7 +368,7 @@ def without_readings(events: DriveEvents, dropped: BoolArray) -> DriveEvents:
 
 
 def scans_of(events: DriveEvents) -> DriveEvents:
-    """Return the events with one step for each scan, without motions after the last."""
+    """Return the events with one step per scan, without motions after the last scan."""
     ends = np.append(0, np.flatnonzero(np.diff(events.first_readings)) + 1)
     motions, readings = events.first_motions[ends], events.first_readings[ends]
     return events._replace(

@@ -30,7 +30,7 @@ from .intervals import NOT_ZERO, Verdict, intervals
 
 ROUNDS = 12  # of rejecting readings and fitting the others
 COARSE = 6  # iterations of a round after which readings are rejected anew
-ROUGH = 0.1  # gain in ℓ that ends a climb while it is open what is fitted
+ROUGH = 0.1  # gain in ℓ that ends a climb until the fitted entries are decided
 FACTORS = 4.0 ** np.arange(-3, 3)  # of motion and of sensor noise, tried at the start
 
 
@@ -67,7 +67,7 @@ class _NoiseFit(NamedTuple):
     free: BoolArray
     #: Its logarithm.
     likelihood: float
-    #: About the logarithms of the fitted entries; nothing at the start.
+    #: Information about the logarithms of the fitted entries; empty at the start.
     information: Array
     converged: bool
     passes: int
@@ -159,7 +159,7 @@ def _coarse_start(likelihood: LogLikelihood, before: Array) -> _NoiseFit:
     """Return the most likely of some multiples of motion and of sensor noise."""
     start = positive_start(before, _typical_range(likelihood))
     free = np.ones(len(ENTRIES), dtype=np.bool_)
-    free[IN_METRES] = start[IN_METRES] > 0  # otherwise only if it is worth it
+    free[IN_METRES] = start[IN_METRES] > 0  # otherwise only if ℓ rises by `WORTH`
     factors = np.array(list(product(FACTORS, FACTORS)))
     tried = start * np.repeat(factors, (3, len(start) - 3), axis=1)
     values = scoring.totals(likelihood.of(tried))

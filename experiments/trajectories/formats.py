@@ -399,7 +399,7 @@ def _from_columns(text: str, about: dict[str, Any]) -> Trajectory:
     Raises
     ------
     ValueError, LookupError
-        If the text has another form, which `read_slamlog` reads or refuses.
+        If the text has another form; `read_slamlog` then reads or refuses it.
     """
     hides = not about["scenario"].sensor.identities
     lines = text.removesuffix("\n").split("\n")

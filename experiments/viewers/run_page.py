@@ -417,7 +417,7 @@ def correlations_of(view: MapView) -> Array:
 
 @lru_cache(maxsize=8)
 def _places_of(count: int) -> tuple[Any, IntArray, IntArray, IntArray]:
-    """Return where positions are in P, their numbers, and those of all pairs."""
+    """Return the indices of positions in P, their numbers, and those of all pairs."""
     columns = np.r_[0, 1, 3 : 1 + 2 * count]
     return np.ix_(columns, columns), np.arange(count), *np.tril_indices(count, -1)
 

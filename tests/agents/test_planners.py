@@ -1,4 +1,4 @@
-"""Planners and baselines against their formulas, plan by plan and goal by goal."""
+"""Compare planners and baselines with their formulas, plan by plan, goal by goal."""
 
 import math
 
@@ -23,7 +23,7 @@ TURNS = (-1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0)
 
 @pytest.fixture(scope="module")
 def knowledge():
-    """Of a robot in rooms; landmarks are known, or only mapped, or missing."""
+    """Return what a robot in rooms knows of known, mapped and missing landmarks."""
     robot = {"radius": 0.2, "max_speed": 0.8, "max_turn_rate": 1.2}
     env = ActiveSlamEnv("active_rooms", accuracy=0.049, dt=0.5, robot=robot)
     env.reset(seed=3)
@@ -40,7 +40,7 @@ def points_of(numbers):
 
 
 def some_chance(now):
-    """Return how likely a missing landmark is in each cell: some hardly, some not."""
+    """Return how likely a missing landmark is in each cell: in some not at all."""
     rng = np.random.default_rng(0)
     cells = len(now.explored)
     return rng.uniform(size=cells) ** 3 * rng.choice([0.0, 0.01, 1.0], cells)
@@ -85,7 +85,7 @@ def value_of(now, plan, chance, settings):
 
 
 @pytest.mark.parametrize("is_complete", [False, True])
-def test_the_value_of_a_plan_is_what_it_is_expected_to_gain(knowledge, is_complete):
+def test_the_value_of_a_plan_is_its_expected_gain(knowledge, is_complete):
     now, chance = knowledge, some_chance(knowledge)
     if is_complete:  # no landmark is missing, and no cell can hold one
         known = knowledge.known[list(now.belief.landmark_ids)]
@@ -128,7 +128,7 @@ def test_a_landmark_is_less_likely_where_the_robot_has_looked(knowledge):
     assert planner._tour is None
 
 
-def test_tours_lead_to_what_is_worth_a_visit_and_on(knowledge):
+def test_tours_lead_to_a_goal_and_then_to_a_second_one(knowledge):
     belief, chance = knowledge.belief, 0.8 * (some_chance(knowledge) > 0.3)
     position = belief.pose[:2]
     unknown = belief.landmarks[~knowledge.known[list(belief.landmark_ids)]]
@@ -160,7 +160,7 @@ def test_a_goal_within_half_a_step_is_reached(knowledge, ahead, left):
 
 
 @pytest.mark.parametrize(("persistence", "goes_on"), [(0.3, True), (0.1, False)])
-def test_the_rest_of_a_tour_is_preferred_to_what_is_worth_little_more(
+def test_the_rest_of_a_tour_is_preferred_to_a_plan_worth_little_more(
     knowledge, monkeypatch, persistence, goes_on
 ):
     given, worth = [], {10: 1.0}
@@ -173,7 +173,7 @@ def test_the_rest_of_a_tour_is_preferred_to_what_is_worth_little_more(
     planner = BeliefSpacePlanner(MPC._replace(persistence=persistence))
     arcs = len(planning._arcs(ROBOT, 0.5, MPC))
     first = planner.act(knowledge)
-    assert planner._tour is None  # an arc has none
+    assert planner._tour is None  # an arc has no tour
     np.testing.assert_array_equal(first, given[0][10, 0] / 0.5)
     worth = {arcs + 3: 1.0}
     planner.act(knowledge)
@@ -199,7 +199,7 @@ def test_a_planner_without_goals_considers_arcs_alone(knowledge, monkeypatch):
     assert sizes == [len(planning._arcs(ROBOT, 0.5, GREEDY))]
 
 
-def test_plans_to_goals_keep_to_the_robot_and_its_step(knowledge):
+def test_plans_to_goals_keep_to_the_limits_of_the_robot(knowledge):
     tours = planning._tours(knowledge, some_chance(knowledge), 4)
     plans, pose = np.empty((len(tours), 30, 2)), knowledge.belief.pose
     routes = knowledge.grid.routes.tours(pose[:2], tours)
@@ -239,7 +239,7 @@ def test_cells_fill_the_floor_row_by_row(right, top, columns, rows):
 
 
 def test_lanes_run_up_and_down_then_across():
-    """A sensor that sees 2 m to each side; lanes are at most 2.8 m apart."""
+    """The sensor sees 2 m to each side, and lanes are at most 2.8 m apart."""
     narrow = {"max_range": 4.0, "field_of_view": np.pi / 3}
     lanes = coverage_lanes(floor(-4.0, 2.0, 6.0, 8.0, sensor=narrow))
     x, y = np.linspace(-2.56, 4.56, 4), np.linspace(3.44, 6.56, 3)
@@ -250,7 +250,7 @@ def test_lanes_run_up_and_down_then_across():
     assert (far == (6.0, 10.0)).all()  # from where all of the floor is in view
 
 
-def test_a_coverage_turns_to_its_next_lane_half_a_step_before_the_end():
+def test_the_coverage_baseline_leaves_a_lane_half_a_step_before_its_end():
     scenario = floor(-4.0, 2.0, 6.0, 8.0, dt=0.5, robot={"max_speed": 3.0})
     baseline = make_baseline("coverage", scenario, np.random.default_rng(0))
     assert baseline._waypoints.tolerance == 0.5 * 3.0 * 0.5
@@ -263,7 +263,7 @@ def test_random_actions_are_uniform_within_both_limits(knowledge):
     np.testing.assert_array_equal(drawn, expected)
 
 
-def test_the_nearest_goal_is_that_of_the_shortest_way(knowledge):
+def test_the_nearest_goal_is_the_one_with_the_shortest_path(knowledge):
     here, routes = knowledge.belief.pose[None, :2], knowledge.grid.routes
     cells = points_of(knowledge.grid.cells)
     unknown = knowledge.belief.landmarks[~knowledge.known_in_map]

@@ -1,6 +1,6 @@
-"""Defaults of public names and of commands, and limits, are those that are recorded.
+"""Compare the defaults of public names and commands, and some limits, with records.
 
-Who changes one changes what others get, so the changelog must tell it.
+A changed default changes the results of users, so the changelog must mention it.
 """
 
 import importlib
@@ -16,8 +16,8 @@ import pytest
 from slamgym.experiments import command_line
 
 RECORDED = Path(__file__).with_name("defaults.txt")
-ROOMS = ("", ".agents", ".envs", ".estimator", ".evaluation", ".experiments")
-ROOMS += (".sim_configs",)
+PACKAGES = ("", ".agents", ".envs", ".estimator", ".evaluation", ".experiments")
+PACKAGES += (".sim_configs",)
 
 
 def written(value):
@@ -37,7 +37,7 @@ def defaults_of(function):
     """Return the parameters of a call that have a default, as text."""
     try:
         parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):  # of C
+    except (TypeError, ValueError):  # a function written in C
         return []
     found = {each.name: each.default for each in parameters}
     if is_dataclass(function):
@@ -63,8 +63,8 @@ def calls_of(name, thing):
 
 
 def public_things():
-    for room in ROOMS:
-        module = importlib.import_module(f"slamgym{room}")
+    for package in PACKAGES:
+        module = importlib.import_module(f"slamgym{package}")
         for name in module.__all__:
             yield name, getattr(module, name)
     for each in pkgutil.iter_modules(command_line.__path__):
@@ -86,7 +86,7 @@ def test_defaults_are_as_recorded():
     ]
     if not RECORDED.exists():
         RECORDED.write_text("\n".join([*lines, ""]))
-        pytest.fail(f"recorded {RECORDED}: read it, and run the test again")
+        pytest.fail(f"wrote {RECORDED}: check it, and run the test again")
     assert lines == RECORDED.read_text().splitlines()
 
 

@@ -723,7 +723,7 @@ def test_no_estimator_loses_an_array(options):
     slam = make_estimator(motion_std=(0.1,) * 3, measurement_std=(0.1,) * 2, **options)
     readings = np.array([[0.5, 2.0], [-1.0, 3.0]])
     _nrt_python.memsys_enable_stats()
-    gc.freeze()  # what other tests have left need not be searched each time
+    gc.freeze()  # so that the objects of other tests are not searched each time
     alive = []
     for _ in range(6):
         slam.predict((0.0, 0.0))

@@ -121,7 +121,7 @@ main(["estimators", "--json"])
 
 @pytest.mark.slow
 def test_the_tests_of_the_filter_pass_in_plain_python():
-    """By the command of the page on kernels, but for what takes many steps."""
+    """By the command in docs/kernels.md, without the tests that take many steps."""
     text = (ROOT / "docs" / "kernels.md").read_text()
     (path,) = re.findall(r"`NUMBA_DISABLE_JIT=1 pytest (\S+)`", text)
     long = "nees_and_nis or over_1000_steps or keeps_its_share or of_its_own_prior"

@@ -125,7 +125,7 @@ RANGES = {"start_x": [1.0, 2.0], "start_y": [-3.0, -2.5], "landmark_shift": 0.5}
 @pytest.mark.parametrize("noise_in", ["motion", "odometry"])
 @pytest.mark.parametrize("kind", ["bearing_range", "range", "position", "bearing"])
 @pytest.mark.parametrize("reach", [9.0, None])
-def test_the_observation_space_is_that_of_the_largest_errors(noise_in, kind, reach):
+def test_observation_bounds_follow_from_the_largest_errors(noise_in, kind, reach):
     stds = {"bearing_range": [0.2, 0.3], "position": [0.4, 0.3]}.get(kind, [0.3, 0])
     is_of_range = kind in ("bearing_range", "range")
     bias = 0.7 if is_of_range else 0.0
@@ -143,7 +143,7 @@ def test_the_observation_space_is_that_of_the_largest_errors(noise_in, kind, rea
     growth = 0.1 * (kind == "bearing_range")
     world = world.with_changes(sensor={"range_std_per_metre": growth})
     robot, dt, largest = world.robot, world.dt, largest_noise(np.inf)
-    start, moved = [2.0, -2.5], np.hypot(1.0, 0.5) + np.sqrt(2) * 0.5  # the highest
+    start, moved = [2.0, -2.5], np.hypot(1.0, 0.5) + np.sqrt(2) * 0.5  # the largest
     if kind == "range":
         start, moved = [1.0, -2.0], 0.0
     away = place_landmarks(BASE.landmarks, None) - start

@@ -295,7 +295,7 @@ def test_view_follows_a_robot_that_leaves_it_and_returns_with_the_episode():
 
 
 def fitted(low, high, aspect):
-    """A rectangle about the same centre, widened to an aspect; both ends per axis."""
+    """Return the corners of a rectangle, enlarged about its centre to an aspect."""
     width = max(high[0] - low[0], (high[1] - low[1]) * aspect)
     half, centre = np.array([width, width / aspect]) / 2, (low + high) / 2
     return np.stack([centre - half, centre + half])
@@ -322,7 +322,7 @@ def test_the_view_grows_where_the_robot_comes_near_its_border(aspect, axis, side
     np.testing.assert_allclose([limits.x, limits.y], expected.T)
     again = AxesLimits(SIX, LANDMARKS, aspect)
     middle = (*box.mean(axis=0), 0.0)
-    assert again.follow(snapshot(middle, path=place[None]))  # as where it has been
+    assert again.follow(snapshot(middle, path=place[None]))  # the path counts, too
     np.testing.assert_allclose([again.x, again.y], expected.T)
 
 

@@ -257,10 +257,10 @@ def test_the_order_of_the_landmarks_does_not_matter():
 
 
 def random_places(seed):
-    """Return two maps, the local one turned, with correlated errors; and a match."""
+    """Return two maps with correlated errors, the local one turned, and a match."""
     rng = np.random.default_rng(seed)
     older = rng.uniform(0, 9, (9, 2))
-    again = np.array([4, 0, 7, 2, 8, 1])  # of the local landmarks, in their order
+    again = np.array([4, 0, 7, 2, 8, 1])  # the partners of the local landmarks
     local = shifted(turned(older[again], 0.4), 3.0, -1.0)
     local = np.concatenate([local, rng.uniform(0, 9, (2, 2))])
     root = 0.02 * rng.standard_normal((34, 34))
@@ -274,7 +274,7 @@ def random_places(seed):
 
 
 def plain_offsets(places, match, phi):
-    """Return r and its covariance, entry by entry."""
+    """Return the offsets r of matched landmarks, and their covariance, by entries."""
     V = (np.exp(-1j * phi) - 1) / (-1j * phi)
     r, H = [], np.zeros((2 * len(match.local), 34))
     for k, (i, p) in enumerate(zip(*match, strict=True)):
@@ -406,7 +406,7 @@ def test_a_covariance_without_rank_recognises_no_place(others):
     assert match_constellations(certain, may, rules) is None
 
 
-def test_rules_may_be_as_small_as_they_can_be():
+def test_the_smallest_rules_are_accepted():
     assert Constellations(least=3, margin=1, search_nodes=1).least == 3
 
 

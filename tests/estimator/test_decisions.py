@@ -114,7 +114,7 @@ def test_a_filter_told_the_decisions_has_the_same_belief(method, backdate, slipp
 
 
 def test_all_that_happened_between_sightings_happens_again_in_its_order():
-    """Two landmarks are confirmed one after the other, so that scans repeat twice."""
+    """Two landmarks are confirmed one after the other, so scans are repeated twice."""
     world = {1: (6, 3), 2: (8, -4), 3: (8.9, -4), 4: (9, 1), "N": (5, 8), "M": (4, -9)}
     world["C"] = (-5, -5)
 
@@ -131,7 +131,7 @@ def test_all_that_happened_between_sightings_happens_again_in_its_order():
             shown = [4, "N", *["M"][:k], *["C"][: k // 4 * (ids is None)]]
             readings = rows(0.52 + 0.5 * k, shown)
             reports.append(slam.update(readings, ids and [ids[name] for name in shown]))
-            readings[:] = np.nan  # as a caller may who reuses it
+            readings[:] = np.nan  # as if the caller reused the array
             if k == 0:
                 slam.remove([1])
             if k == 1:

@@ -15,9 +15,10 @@ GATE = -2 * np.log1p(-GATE_PROBABILITY)
 
 
 def events(seed=5, steps=40):
-    """Return a drive with two motions a step, and one step without a scan.
+    """Return a drive with two motions per step, and one step without a scan.
 
-    One of the two is a turn, and one of them has no noise; in step 10, both.
+    One of the two motions is a turn, and one has no noise. In step 10, both are turns
+    without noise.
     """
     rng = np.random.default_rng(seed)
     motions, scans = [], []

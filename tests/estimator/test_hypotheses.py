@@ -581,11 +581,11 @@ def test_poses_overlap_only_where_every_coordinate_does(k):
         other[k + 3] *= ratio**2
         expected = bhattacharyya(0.0, 1.0, gap, ratio) <= OVERLAP
         assert _overlap(one, other) == _overlap(other, one) == expected
-        other[k] -= 2 * np.pi  # only a heading is the same again
+        other[k] -= 2 * np.pi  # only a heading is periodic
         assert _overlap(one, other) == (expected and k == 2)
 
 
-def test_a_reading_of_the_pose_costs_what_it_is_unlikely():
+def test_a_reading_of_the_pose_costs_twice_its_negative_log_likelihood():
     noise = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}
     policy = {"management": {"association": "hypotheses"}}
     slam = make_estimator("ekf", **noise, initial_pose_std=(0.5, 0.2, 0.1), **policy)
@@ -604,7 +604,7 @@ def test_a_reading_of_the_pose_costs_what_it_is_unlikely():
     found = [h.cost for h in slam.hypotheses]
     np.testing.assert_allclose(found, [0.0, costs[0] - costs[1]])
     assert cost_of(report) == pytest.approx(costs[1] - 1.0)
-    assert cost_of(UpdateReport()) == 40.0  # of a rejected one: e²⁰ times less likely
+    assert cost_of(UpdateReport()) == 40.0  # rejected: e²⁰ times less likely
 
 
 @pytest.mark.parametrize("association", ["nearest", "hypotheses"])

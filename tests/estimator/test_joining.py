@@ -54,7 +54,7 @@ def test_submaps_with_large_errors_are_joined(seed):
 
 
 def test_frames_begin_with_blocks_of_powers_of_two_that_common_landmarks_align():
-    """Composed, the frames drift; common landmarks move whole blocks."""
+    """Frames that are only composed drift; common landmarks correct whole blocks."""
     rng = np.random.default_rng(3)
     frames = np.cumsum(rng.uniform(-1, 1, (12, 3)), axis=0)
     frames -= frames[0]
@@ -90,7 +90,7 @@ def test_frames_begin_with_blocks_of_powers_of_two_that_common_landmarks_align()
     more.frames(summaries, frames[:9], refine)
     assert asked == []
     off = frames[:9].copy()
-    off[8] += (0.3, -0.2, 0.1)  # only the last: landmarks put most of it right
+    off[8] += (0.3, -0.2, 0.1)  # the last one only: landmarks correct most of it
     found = more.frames(summaries, off, refine)
     assert np.abs(found[8:] - frames[8:]).max() < 0.15
     assert {*initial.blocks} == {*more.blocks}

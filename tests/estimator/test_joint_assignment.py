@@ -165,7 +165,7 @@ def test_the_limit_of_nodes_returns_the_best_so_far_and_says_so():
 
 
 @pytest.mark.parametrize("pairs_first", [False, True])
-def test_a_pair_exactly_at_its_limits_is_one(pairs_first):
+def test_a_pair_exactly_at_its_limits_is_accepted(pairs_first):
     nu, one = np.array([[[3.0, 0.0]]]), np.ones((1, 1), dtype=bool)
     given = nu, np.zeros((2, 2)), np.ones((1, 1, 2)), one, np.full(1, 99.0)
     at = Problem(*given, 9.0, np.array([np.inf, 9.0]), pairs_first)
@@ -208,9 +208,9 @@ def test_a_scan_is_assigned_as_step_by_step_in_numpy(method):
 def test_a_scan_with_one_landmark_for_each_reading_is_assigned_as_by_the_search(
     method, ceiling
 ):
-    """It is settled without the search where no other assignment is of interest.
+    """It is settled without the search if no other assignment is of interest.
 
-    That is also so where leaving out a reading is cheap, but changes nothing.
+    This includes scans where leaving out a reading is cheap, but changes nothing.
     """
     rng = np.random.default_rng(8)
     policy, noise = LandmarkPolicy(association=method), Noise(0.03, 0.1, 0.02, 0.01)
@@ -301,7 +301,7 @@ def test_a_reading_that_the_others_contradict_is_assigned_as_by_the_search(few):
         for sign, more, rest in product((-1, 1), (-0.1, 0.05, 0.2, 4.0), (4.0, 30.0)):
             nu = sign * np.array([a, *np.full(few, -b)])
             readings = np.column_stack([0.03 * nu, mean[3::2]])
-            # λ is that of the innovation alone, and some more.
+            # The cost of the innovation alone, plus ``more`` or ``rest``.
             left_out = np.log((1 + v) * 9e-6) + nu**2 / (1 + v) + [more, *[rest] * few]
             density = np.exp(-left_out / 2) / (2 * np.pi)
             scan = policy, view, readings, noise, density

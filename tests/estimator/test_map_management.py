@@ -442,7 +442,7 @@ def test_who_may_stand_behind_another_is_not_missed():
 
 
 def is_expected(view, pose, place, scan):
-    """Whether a scan should show a place, one condition after the other."""
+    """Return whether a scan should show a place, one condition after the other."""
     away = math.dist(place, pose[:2])
     bearing = math.atan2(place[1] - pose[1], place[0] - pose[0]) - pose[2]
     if away > view.max_range - view.range_margin:
@@ -484,7 +484,7 @@ def test_a_scan_should_show_what_is_well_in_view_and_not_behind_a_reading():
         assert edge.expects(np.zeros(3), at, np.array([(0.0, 1.0)])).all()
 
 
-def test_landmarks_matter_as_far_as_a_scan_reads_and_as_they_may_be_missed():
+def test_a_scan_reaches_as_far_as_landmarks_may_be_read_missed_or_merged():
     scan = np.array([(0.0, 3.0), (1.0, np.inf), (2.0, 7.0)])
     missing = {"view": FieldOfView(9.0), "remove_after": 3}
     assert LandmarkPolicy().reach(scan) == 7.0
@@ -508,7 +508,7 @@ def test_the_visibility_model_is_asked_in_the_frame_of_the_map():
     np.testing.assert_allclose(landmarks, [(5, 1), (4, -2)], atol=1e-9)
 
 
-def test_a_visibility_model_may_write_into_what_it_is_asked():
+def test_a_visibility_model_may_write_into_its_arguments():
     def visible(pose, landmarks):
         pose[:] = landmarks[:] = np.nan
         return np.ones(len(landmarks), dtype=bool)
@@ -648,7 +648,7 @@ def test_landmarks_seen_together_are_apart_up_to_twice_the_distance_of_a_merge(n
         assert each.best.pruner.records.apart == {(0, 1)}
 
 
-def test_a_landmark_with_two_duplicates_is_one_after_a_scan_of_the_last():
+def test_two_duplicates_of_a_landmark_are_merged_after_a_scan_of_one():
     apart, slam = make(management={}), make(management={"merge_within": 1.0})
     for k in range(60):
         apart.update(polar([(5, 1), (-3, 2)]), [k % 3, 9])

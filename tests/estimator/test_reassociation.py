@@ -231,12 +231,12 @@ def test_only_a_landmark_that_most_scans_show_is_born():
         np.testing.assert_allclose(born, place, atol=0.5)
 
 
-def test_each_scan_gives_its_readings_to_landmarks_at_the_least_cost():
+def test_the_readings_of_each_scan_are_assigned_at_the_least_cost():
     search = _Search(two_laps(1)[1])
     rng = np.random.default_rng(0)
     costs = rng.uniform(0, 2 * PRICE, (len(search.owners), 4))
     rank = np.arange(len(search.owners)) - search.data.firsts[search.owners]
-    costs[rank >= 4] = PRICE  # more would be too many for a search
+    costs[rank >= 4] = PRICE  # so that all permutations can be tried
     labels, together = search.assigned(costs), np.zeros((4, 4), dtype=bool)
     for scan in range(0, search.count, 7):
         rows = np.flatnonzero(search.owners == scan)[:4]
@@ -288,7 +288,7 @@ def test_a_landmark_dies_with_fewer_than_three_readings(readings, dies):
 
 
 def scored(score, labels=(), places=(), covariance=()):
-    """Return an association of which only these parts count."""
+    """Return an association with these parts; the others do not matter."""
     parts = np.array(labels, dtype=int), np.zeros((1, 3)), np.array(places, dtype=float)
     return _Association(*parts, score, 0.0, np.array(covariance))
 
@@ -341,7 +341,7 @@ def test_landmarks_are_born_then_die_and_readings_go_to_the_others(monkeypatch):
     np.testing.assert_array_equal(labels, search.assigned(costs))
 
 
-def test_the_landmark_dies_whose_readings_fit_others_best():
+def test_the_landmark_whose_readings_fit_others_best_is_removed():
     search, rng = _Search(two_laps(1)[1]), np.random.default_rng(3)
     costs = rng.uniform(0, 1.5 * PRICE, (len(search.owners), 4))
     labels = search.assigned(costs)
@@ -355,10 +355,10 @@ def test_the_landmark_dies_whose_readings_fit_others_best():
     assert search.death(labels, costs, losses[worst] + 1e-9) == worst
     assert search.death(labels, costs, losses[worst] - 1e-9) is None
     labels[np.flatnonzero(labels == worst)[2:]] = NONE
-    assert search.death(labels, costs, -99.0) == worst  # with two readings
+    assert search.death(labels, costs, -99.0) == worst  # two readings are too few
 
 
-def test_landmarks_are_joined_that_are_likely_one_and_never_seen_together(monkeypatch):
+def test_landmarks_that_are_probably_one_are_joined_unless_seen_together(monkeypatch):
     search, rng, given = _Search(two_laps(1)[1]), np.random.default_rng(5), []
     places = np.repeat(rng.uniform(-9, 9, (4, 2)), 3, axis=0)
     places += 0.05 * rng.standard_normal(places.shape)
@@ -444,7 +444,7 @@ def test_a_drive_is_rebuilt_part_by_part_where_matches_lower_the_score(monkeypat
     assert done == list(range(1, 8))
 
 
-def test_detections_are_as_unlikely_as_their_rates_say():
+def test_the_surprise_of_detections_follows_from_their_rates():
     for counts in np.array([[[4, 1], [2, 0]], [[0, 0], [3, 1]], [[1, 1], [0, 5]]]):
         rates = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
         assert _surprise(counts) == pytest.approx(-xlogy(counts, rates).sum())

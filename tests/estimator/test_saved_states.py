@@ -259,7 +259,7 @@ def test_a_state_saved_after_an_uncertain_start_is_accepted(name):
     ],
     ids=["numbers", "symmetric", "covariance", "whole", "counts", "ids"],
 )
-def test_an_entry_is_a_copy_of_what_it_must_be(kind, shape, taken, refused):
+def test_an_entry_is_checked_and_copied(kind, shape, taken, refused):
     given = np.array(taken)
     found = kind.checked("key", given, shape)
     given[...] = 0

@@ -595,8 +595,8 @@ def test_a_reading_of_a_pose_without_a_scan_has_a_pose_of_its_own():
     assert (made.landmark_ids, other.landmark_ids) == ((3,), (8,))
 
 
-def test_a_path_between_scans_is_what_is_expected_given_both_of_its_ends():
-    """The noise of all readings, conditioned on where they lead, to first order."""
+def test_a_path_between_scans_is_its_mean_given_both_of_its_ends():
+    """The noise of all readings, conditioned on the last pose, to first order."""
     noise = MotionNoise.checked((0.2, 0.1, 0.15), noise_at_rest=True)
     steps = [(1.0, 0.5, 1.0), (0.7, -0.9, 2.0), (1.2, 0.4, 0.5)]
 

@@ -307,7 +307,7 @@ def test_a_whole_map_is_the_same_however_often_it_is_asked_for():
 
 
 @pytest.mark.parametrize("base", ["ekf", "invariant"])
-def test_initial_frames_need_no_look_at_their_last_step(base, monkeypatch):
+def test_initial_frames_need_no_linearisation_after_their_last_step(base, monkeypatch):
     slams, counts = [], []
     linearise = gauss_newton.JoinedMap._linearise
     for trusted in (0.0, closing.NEARLY_CONVERGED):

@@ -244,7 +244,7 @@ def test_a_report_holds_the_tests_of_the_runs_that_succeeded():
 
 
 @pytest.mark.parametrize("count", [9, 10, 19, 20])
-def test_few_runs_are_warned_of_and_their_averages_do_not_count(scores, count):
+def test_few_runs_cause_a_warning_and_their_averages_do_not_count(scores, count):
     found = report(*(part[:count] for part in scores))
     average = found.time_average.p_value
     assert found.average_p_value == (average if count >= 10 else 1.0)

@@ -544,7 +544,7 @@ def test_few_runs_decide_nothing():
     assert diagnose(**honest(0, runs=20)).cause == "honest"
 
 
-def test_innovations_are_too_large_from_a_seventh_on():
+def test_innovations_are_named_if_they_are_too_large_by_more_than_a_seventh():
     said = "; the squared innovations are 1.16 times too large. "
     assert said in diagnose(**wrong(11), nis_ratio=1.16).sentence
     assert "innovations" not in diagnose(**wrong(11), nis_ratio=1.15).sentence
@@ -596,10 +596,10 @@ def test_arrays_that_do_not_fit_are_refused(place, message):
         summed(*data)
 
 
-# ---- the parts of the answer, by scipy and by hand
+# ---- the parts of a diagnosis, compared with scipy and with examples by hand
 
 
-def test_p_values_of_the_errors_are_those_of_runs_and_of_diverged_ones():
+def test_p_values_of_errors_come_from_averages_and_from_diverged_runs():
     rng = np.random.default_rng(20)
     for of_pose, of_heading, lost in [
         *((1.3, 1.2, 0), (0.7, 1.05, 0), (1.05, 0.6, 0), (1.0, 1.5, 2)),
@@ -634,7 +634,7 @@ def test_a_run_diverges_beyond_the_quantile_of_one_nees():
 
 
 def steady(ratios, degrees=3):
-    """NEES of two steps, whose averages per degree are given."""
+    """Return NEES of two steps with the given averages per degree of freedom."""
     return np.repeat(degrees * np.asarray(ratios)[:, None], 2, axis=1)
 
 
@@ -678,7 +678,7 @@ def test_as_many_runs_are_repeated_as_show_half_of_the_excess(ratios, lost, coun
         ([0.9, 1.3], 49, 0.01, "cannot tell", 0),
     ],
 )
-def test_more_runs_are_repeated_where_those_show_too_little(
+def test_more_runs_are_repeated_where_the_repeated_ones_show_too_little(
     after, known, factor, cause, count
 ):
     found = np.resize(np.array(after), 200)
@@ -755,7 +755,7 @@ def test_knowledge_of_the_heading_is_tested_by_students_test():
     assert spurious_knowledge(knowledge) == pytest.approx(expected)
 
 
-def test_blame_is_the_smaller_p_value_of_two_tests_of_ranks():
+def test_blame_is_the_smaller_p_value_of_two_rank_tests():
     rng = np.random.default_rng(23)
     for lost, slope in ((0, 0.1), (3, 0.02), (3, 0.0)):
         mistakes = rng.integers(0, 6, 40).astype(float)
@@ -815,7 +815,7 @@ def test_means_of_few_runs_are_tested_by_students_test():
         assert _larger(values, ~chosen, n // 2 + 1) == 1
 
 
-def test_what_is_left_with_less_noise_leaves_few_diverged_runs_out():
+def test_the_excess_that_remains_with_less_noise_ignores_few_diverged_runs():
     rng = np.random.default_rng(26)
     for lost, sign, of in [
         *product((0, 1, 2, 3, 6), (1.0, -1.0), ("pose", "heading"))

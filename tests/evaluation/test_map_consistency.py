@@ -80,14 +80,14 @@ def test_a_map_without_nees_is_not_shown_to_be_consistent():
 
 
 def p_outside(total, freedom):
-    """p-value of a sum of NEES that is χ² times a ratio from 0.8 to 1.25."""
+    """Return the p-value of a sum of NEES, if it is χ² times 0.8 to 1.25."""
     tails = stats.chi2.cdf(total / 0.8, freedom), stats.chi2.sf(total / 1.25, freedom)
     return min(1.0, 2 * min(tails))
 
 
 @pytest.mark.parametrize("joint", [False, True])
 @pytest.mark.parametrize("size", [1.0, 1.25, 0.8])
-def test_a_report_is_that_of_sums_over_the_runs_that_know_a_landmark(joint, size):
+def test_a_report_is_made_of_sums_over_the_runs_that_map_a_landmark(joint, size):
     rng = np.random.default_rng(8)
     errors = size * np.linspace(0.9, 1.2, 6)[:, None] * rng.standard_normal((31, 6, 2))
     errors[rng.random((31, 6)) < 0.2] = np.nan

@@ -1,4 +1,4 @@
-"""Every convention of estimates is read as its name says, by formulas in the test."""
+"""Compare how each convention of estimates is read with a formula of the test."""
 
 from itertools import permutations
 
@@ -35,7 +35,7 @@ SHIFTED = {2: (POSES + 1, CLAIMS + 1), -1: (POSES - 1, CLAIMS - 1)}
 
 
 def moved(start, pose):
-    """The pose in the world of one that is seen from another, as complex numbers."""
+    """Return the pose in the world of a pose that is given in the frame of another."""
     point = start[0] + 1j * start[1] + np.exp(1j * start[2]) * (pose[0] + 1j * pose[1])
     return np.array([point.real, point.imag, start[2] + pose[2]])
 
@@ -107,7 +107,7 @@ def scaled(x, heading):
 
 
 def from_lower(C):
-    """Fill the lower triangle by rows with what the file has as the upper one."""
+    """Fill the lower triangle by rows with the entries of the upper one in the file."""
     full = np.empty_like(C)
     upper = [C[..., i, j] for i in range(3) for j in range(i, 3)]
     places = [(i, j) for i in range(3) for j in range(i + 1)]
@@ -199,7 +199,7 @@ def test_positions_are_scaled_to_the_size_of_the_true_path():
 
 
 def arcs(times):
-    """Poses on circles of several radii, (6, T, 3)."""
+    """Return poses on circles of several radii, shape (6, T, 3)."""
     radius = np.arange(1.0, 7.0)[:, None]
     heading = np.asarray(times) / radius
     x, y = radius * np.sin(heading), radius * (1 - np.cos(heading))
@@ -230,7 +230,7 @@ def test_a_shift_between_steps_is_that_of_the_nearest_positions(offset):
 
 
 def as_by_cholesky(truth, reading):
-    """Mean squares per component, log-likelihood and median errors, pose by pose."""
+    """Return mean squares per component and the log likelihood, pose by pose."""
     white, logs = np.empty((B, T, 3)), np.empty((B, T))
     for b, t in np.ndindex(B, T):
         own, P = reading.poses[b, t], reading.covariances[b, t]
@@ -295,7 +295,7 @@ def test_far_smaller_errors_are_named_with_both():
 
 
 def far_apart(drives):
-    """Paths far apart."""
+    """Return one constant path per drive, shape (drives, 4, 3)."""
     return np.arange(drives)[:, None, None] * np.array([90.0, -50, 0]) + np.zeros(
         (4, 3)
     )

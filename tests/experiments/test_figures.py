@@ -285,20 +285,20 @@ def test_one_huge_ellipse_does_not_make_all_others_tiny():
     assert np.ptp(wild.get_xlim()) < 2 * np.ptp(calm.get_xlim())
 
 
-def test_boxes_share_limits_up_to_half_the_first_beyond_it():
+def test_shared_limits_exceed_the_first_box_by_at_most_half_its_size():
     boxes = [[[0, 0], [4, 2]], [[-1, -9], [3, 1]], [[1, 1], [9, 3.5]]]
     np.testing.assert_array_equal(shared_limits(boxes), [[-1, -2], [6, 3.5]])
 
 
-def test_a_box_holds_points_and_what_is_near_of_the_ellipses():
+def test_a_box_holds_points_and_the_near_parts_of_ellipses():
     points = np.array([[0.0, 1], [6, 2], [np.nan, np.nan], [3, 4]])
     covariances = np.array([np.diag([0.25, 0.04]), np.diag([9.0, 9])])
     means = np.array([[0.5, 3.8], [5.0, 2.0]])
-    size = np.array([10, 7]) + 0.06 * 6  # to a third of 6 beyond the points
+    size = np.array([10, 7]) + 0.06 * 6  # a third of the width 6 beyond the points
     expected = np.array([[3.0, 2.5] - size / 2, [3.0, 2.5] + size / 2])
     np.testing.assert_allclose(box_around(points, means, covariances), expected)
     small = box_around(points, means[:1], covariances[:1])
-    width, height = 7.0, 0.55 * 7  # from -1 to 6, and 1 to 4.4: not much lower
+    width, height = 7.0, 0.55 * 7  # x from -1 to 6; y from 1 to 4.4 would be too low
     middle = np.array([2.5, 2.7])
     half = (np.array([width, height]) + 0.06 * 6) / 2
     np.testing.assert_allclose(small, [middle - half, middle + half])

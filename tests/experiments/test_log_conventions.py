@@ -346,7 +346,7 @@ def test_commands_name_the_mistake_and_suggest_no_noise(corridor, tmp_path):
     assert file.read_text() == text
 
 
-# ---- a log of four steps by hand
+# ---- a log of four steps, written by hand
 
 ROWS = np.array(
     [[1, 0.5, 0.1], [2, -0.4, 0.2], [3, 0.3, 0.1], [4, -2, 0.3], [5, 3, 0.1]]

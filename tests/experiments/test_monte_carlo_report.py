@@ -816,7 +816,7 @@ def test_a_figure_needs_a_run_that_succeeded():
 
 
 def a_map(ratios, *, alone=None, means=0.0, p_values=0.0, **changes):
-    """A report of a rejected map of 40 runs, of landmarks 3, 4, …."""
+    """Return the report of 40 runs on a rejected map with landmarks 3, 4, …."""
     ratios, n = np.array(ratios, dtype=float), len(ratios)
     means = np.broadcast_to(np.reshape(means, (-1, 1)) * [0.6, 0.8], (n, 2))
     lone = np.broadcast_to(p_values, n).astype(float)
@@ -948,7 +948,7 @@ def test_a_refused_map_is_written_by_the_test_that_shows_it_best():
         (1.0, 0.99, 1.01, 40, 41),
     ],
 )
-def test_the_runs_needed_halve_the_interval_inside_the_margin(
+def test_the_runs_needed_shrink_the_interval_to_half_of_the_margin(
     ratio, low, high, runs, needed
 ):
     found = EquivalenceTest(ratio, (low, high), "not shown", 0.05)

@@ -98,7 +98,7 @@ def test_a_missing_library_is_named(monkeypatch):
 
 
 class Stream(SimpleNamespace):
-    """A recording as a list of time, place, and what is there."""
+    """A recording that lists the time, the place and the content of each entry."""
 
     def __init__(self, name):
         super().__init__(logged=[], now={}, ended=[], name=name)
@@ -115,7 +115,7 @@ class Stream(SimpleNamespace):
 
 
 class Library:
-    """A module rerun whose things are tuples of their arguments."""
+    """A substitute for the module rerun that returns the arguments of each call."""
 
     ViewCoordinates = SimpleNamespace(RIGHT_HAND_Z_UP="z up")
 
@@ -223,7 +223,7 @@ def _check_step(own, colour, run, step):
 
 
 def _check_readings(found, colour, run, step):
-    """Check readings, correlations and numbers of a step."""
+    """Check the readings, correlations and plots of a step."""
     trace, pose, alarm = run.trace, run.trace.poses[step], [213, 94, 0]
     frame = run.frames.maps[step]
     _, (lines,), style = found["world/<a>/readings"]

@@ -337,11 +337,11 @@ def test_left_errors_are_normalised_by_their_own_covariance():
     assert nees.mean() == pytest.approx((100 * twists**2).sum(axis=1).mean())
 
 
-# ---- the readings, by formulas of matrices
+# ---- the conventions, compared with matrix formulas
 
 
 def some_poses(rng, runs=6, steps=5):
-    """Poses, truth near them, and covariances, of a few drives."""
+    """Return the poses of a few drives, the truth near them, and covariances."""
     poses = exponential(rng.normal(size=(runs, steps, 6)))
     roots = rng.normal(0, 0.05, (runs, steps, 6, 6))
     claims = roots @ roots.swapaxes(-1, -2) + 1e-4 * np.eye(6)

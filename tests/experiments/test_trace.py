@@ -69,7 +69,7 @@ def test_the_nees_is_that_of_the_error_of_the_truth_in_the_frame_of_the_filter(f
         assert found == pytest.approx(error @ np.linalg.solve(P, error))
 
 
-def test_an_association_is_compared_as_it_stands_and_aligned():
+def test_an_association_is_compared_before_and_after_alignment():
     truth = TrueLandmarks(np.array([4, 7, 9]), np.array([[0.0, 0], [4, 0], [0, 3]]))
     landmarks = truth.positions[:2] + np.array([0.4, -0.2])
     decisions = [ScanDecisions((1, 2), (1, 2)), ScanDecisions((1, 1), ())]

@@ -162,7 +162,7 @@ def test_a_slamlog_tells_a_filter_what_the_trajectory_says(preset, tmp_path):
 
 
 def read_as(layout, folder, monkeypatch, *, by_line):
-    """Read a shard of one slamlog, and return its arrays or what refuses it."""
+    """Read a shard of one slamlog; return its arrays, or the error that refuses it."""
 
     def refuse(text, about):
         raise ValueError

@@ -433,7 +433,7 @@ def test_a_file_is_written_under_a_hidden_name_of_its_process(tmp_path):
         files.replace_when_written(tmp_path / "a" / "map").__enter__()
 
 
-def test_only_what_ended_processes_of_this_machine_left_is_removed(tmp_path):
+def test_only_files_left_by_ended_processes_of_this_machine_are_removed(tmp_path):
     ended, node = 2**22 + 7, platform.node()  # no process has so large a number
     gone = tmp_path / f".map.{ended}@{node}-01234567.toml"
     kept = [

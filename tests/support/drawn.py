@@ -1,4 +1,4 @@
-"""What a figure shows, as text: a line for each artist with its style and its data."""
+"""Describe a figure as text: one line per artist, with its style and its data."""
 
 from collections import Counter
 from difflib import unified_diff
@@ -30,12 +30,12 @@ _USUAL += ("xscale=linear", "yscale=linear", "facecolor=#ffffffff", "zorder=2")
 
 
 def check_looks(figure, name):
-    """Compare a figure with its text in ``looks``; delete this to record another."""
+    """Compare a figure with its file in ``looks``; delete that to record another."""
     lines = [f"{n} × {line}" for line, n in Counter(described(figure)).items()]
     file = Path(__file__).with_name("looks") / f"{name}.txt"
     if not file.exists():
         file.write_text("\n".join([*lines, ""]))
-        pytest.fail(f"recorded {file}: read it, and run the test again")
+        pytest.fail(f"wrote {file}: check it, and run the test again")
     differ = "\n".join(unified_diff(file.read_text().splitlines(), lines, n=0))
     assert not differ, differ
 
@@ -72,14 +72,14 @@ def _lines(artist):
 
 
 def _side(name):
-    """Name the sides of both axes alike, which versions of matplotlib do not."""
+    """Use the same names for both axes, because versions of matplotlib differ."""
     for side, like in (("left", "bottom"), ("right", "top")):
         name = name.replace(side, like)
     return name
 
 
 def _cell(spec):
-    """Return where a layout has axes, and the ratios of its columns and rows."""
+    """Return the cell of axes in a layout, and the ratios of its columns and rows."""
     if not spec:
         return {}
     grid = spec.get_gridspec()
@@ -114,7 +114,7 @@ def _fields(found):
 
 
 def _short(value, is_colour=False):
-    """Write a value; nothing for what is not set, or what matplotlib counts."""
+    """Write a value, or nothing if it is not set or a label that matplotlib counts."""
     if value is None or str(value).startswith("_child"):
         return ""
     if isinstance(value, str | int | float | np.number):
@@ -128,5 +128,5 @@ def _short(value, is_colour=False):
     known = np.nan_to_num(numbers).ravel()
     if known.size <= 4:
         return f"({', '.join(f'{each:.4g}' for each in numbers.ravel())})"
-    order = known @ np.arange(1, known.size + 1) / known.size  # what only order changes
+    order = known @ np.arange(1, known.size + 1) / known.size  # depends on the order
     return f"{numbers.shape} {known.mean():.4g} {known.std():.4g} {order:.4g}"

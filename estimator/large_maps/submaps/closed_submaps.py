@@ -29,8 +29,8 @@ from .factor import Gaussian, retract
 from .store import LostSubmapError, Submap, SubmapStore
 
 NO_SLOTS: IntArray = np.empty(0, dtype=np.int64)
-# Decrements at which to stop while computing initial frames: now, and after a step.
-# A step of ten standard deviations leads to within 0.1 of the solution.
+# For initial frames, Gauss-Newton stops at a decrement up to the first number. Up to
+# the second, a step of ten standard deviations, it stops after one more step.
 ROUGHLY_CONVERGED, NEARLY_CONVERGED = 0.1, 100.0
 
 
@@ -65,7 +65,7 @@ class ClosedSubmaps:
         self.slots: set[int] = set().union(*(s.slots.tolist() for s in summaries))
         self._initialisation = initialisation or joining.FrameInitialisation()
         self._joined: joining.JoinedMap | None = None
-        #: Landmarks of the last whole map, and their marginal if it is cached.
+        #: Landmarks of the last `marginal` to remember, and their marginal if cached.
         self._whole: tuple[IntArray, Gaussian | None] = NO_SLOTS, None
 
     def __len__(self) -> int:
@@ -135,6 +135,8 @@ class ClosedSubmaps:
     ) -> Gaussian:
         """Return the last frame and some landmarks, given the first frame.
 
+        The caller may overwrite the covariance.
+
         Parameters
         ----------
         slots : ndarray, shape (n,)
@@ -142,10 +144,8 @@ class ClosedSubmaps:
         known : ndarray, shape (J + 1, 3)
             As for :meth:`join`.
         remember : bool
-            Whether to cache the result, from the second call for these landmarks on,
-            until a submap is appended.
-
-        The caller may overwrite the covariance.
+            Whether to cache the result until a submap is appended. It is cached at the
+            second successive call for these landmarks.
         """
         if not self.summaries:
             return Gaussian(known[0], np.zeros((3, 3)))

@@ -247,7 +247,8 @@ class Gaussian(NamedTuple):
 
     mean: Array  # (x, y, θ, l1x, l1y, …), shape (3 + 2n,)
     covariance: Array  # (3 + 2n, 3 + 2n)
-    #: The column of each entry of the mean, if there are more than these, in any order.
+    #: The column of each entry of the mean; None if the order is the same.  With an
+    #: order, more rows may follow those of the mean, and there are as many columns.
     order: IntArray | None = None
 
     def block(self, rows: IntArray, columns: slice = slice(None)) -> Array:
@@ -257,9 +258,9 @@ class Gaussian(NamedTuple):
         return self.covariance[rows].take(self.order[columns], axis=1)
 
     def taken(self, size: int) -> Array:
-        """Return an array of this size that begins with the covariance.
+        """Return an array, shape (size, size), that begins with the covariance.
 
-        A covariance with an order is lost, because its memory is used.
+        The array may use the memory of a covariance with an order, which is then lost.
         """
         if self.order is not None and size <= len(self.covariance):
             memory = self.covariance.reshape(-1)[: size**2].reshape(size, size)
@@ -273,7 +274,7 @@ class Gaussian(NamedTuple):
 
 @jit_in_place
 def _sort_columns(matrix: Array, order: IntArray, row: Array, found: Array) -> None:
-    """Write rows with their entries in an order; both begin at the same address."""
+    """Write rows with reordered columns, into the memory where the matrix begins."""
     for i in range(len(order)):
         for j in range(len(row)):
             row[j] = matrix[i, j]

@@ -336,9 +336,9 @@ def _composed(
 
 
 def _changes(world: Gaussian, lever: Array, V: Array) -> Array:
-    """Return u, d and W, rows that change the covariance of the map by the fusion.
+    """Return the rows u, d and W, with which the fusion changes the map.
 
-    ::
+    The covariance of its landmarks becomes ::
 
         P + d uᵀ + u dᵀ − Wᵀ W,    u = P_θ + d P_θθ / 2,    W = V + V_θ (J q)ᵀ
 
@@ -351,7 +351,7 @@ def _changes(world: Gaussian, lever: Array, V: Array) -> Array:
 
 
 def _change_map(covariance: Array, W: Array) -> None:
-    """Change the covariance of the map's landmarks; see `_changes`."""
+    """Update the covariance of the map's landmarks with the rows of `_changes`."""
     left, cut = np.vstack([W[1], W[0], -W[2:]]), W.shape[1]
     for first in range(3, cut, AT_ONCE):
         own, so_far = slice(first, min(first + AT_ONCE, cut)), slice(3, first)

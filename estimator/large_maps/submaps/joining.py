@@ -57,7 +57,8 @@ class JoinedMap:
     converged : float
         The decrement, in squared standard deviations, at which to stop.
     trusted : float
-        The decrement at which one more step leads to the frames, and to nothing else.
+        The decrement at which one more step is the last. The map is not linearised
+        after it, and only its frames and landmarks are up to date.
 
     Raises
     ------
@@ -168,9 +169,10 @@ class JoinedMap:
     def _large_covariance(
         self, size: int, rows: IntArray, columns: IntArray, owned: Sequence[Owned]
     ) -> tuple[Array, IntArray]:
-        """Return the covariance of a large part, then of the other unknowns.
+        """Return the covariance of a large part, and the column of each of its entries.
 
-        Also the column of each entry of the part.
+        The other unknowns follow after the part. For the parameters, see
+        `_small_covariance`.
         """
         number = np.full(3 * self._count + self._points.size, -1)
         number[columns] = rows
@@ -525,18 +527,19 @@ def minimise(
     converged: float,
     trusted: float = 0.0,
 ) -> Array | None:
-    """Iterate until the decrement is small; return the values, None without success.
+    """Iterate until the decrement is small; return the values, or None if it is not.
 
     Parameters
     ----------
     evaluate : callable
-        Linearises the problem at given values.  Its last call is at the result.
+        Linearises the problem at given values.  Its last call is at the result, except
+        after the step that ``trusted`` describes.
     values : ndarray, shape (N,)
         Where to begin.
     converged : float
         The decrement at which to stop.
     trusted : float
-        The decrement at which to stop after another step, which is not evaluated.
+        The decrement at which to stop after one more step, without evaluating it.
     """
     now = evaluate(values)
     past: list[Iterate] = []
