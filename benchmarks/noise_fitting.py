@@ -59,7 +59,8 @@ def coverage(world: str, runs: int, seed: int) -> None:
             verdicts[noise.name][noise.verdict] += 1
             if true:
                 errors[noise.name].append(noise.value / true)
-        held.update(truth.keys() - {noise.name for noise in result.noise})  # they are 0
+        fitted = {noise.name for noise in result.noise}
+        held.update(name for name in truth.keys() - fitted if not truth[name])
         inflated += result.suggested.settings != result.fitted.settings
     seconds = (time.process_time() - started) / runs
     for name, true in truth.items():

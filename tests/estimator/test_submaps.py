@@ -17,9 +17,6 @@ from slamgym.estimator.large_maps.elimination import (
     common_ancestor,
     dissect,
 )
-from slamgym.estimator.large_maps.submaps import (
-    closed_submaps as closed_submaps_chapter,
-)
 from slamgym.estimator.large_maps.submaps import closed_submaps as closing
 from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.large_maps.submaps.closed_submaps import Neighbourhood, Region
@@ -933,6 +930,6 @@ def test_a_region_is_twice_as_large_as_required_and_holds_the_nearest(monkeypatc
     points = region.centre + np.array([(7.0, 0), (0, 7.1), (2, 0), (0, -3), (-1, 0)])
     inside, same = region.chosen(points)
     assert (inside.tolist(), same) == ([0, 2, 3, 4], region)
-    monkeypatch.setattr(closed_submaps_chapter, "LARGEST_COUNT", 2)
+    monkeypatch.setattr(closing, "LARGEST_COUNT", 2)
     inside, smaller = region.chosen(points)
     assert (inside.tolist(), smaller.farthest) == ([2, 4], 2.0)
