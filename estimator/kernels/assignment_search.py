@@ -384,7 +384,7 @@ def cost_if_settled(
     for a in range(rows):
         own = C[here, 2 * a, 2 * a] / Q[a, a, 0]
         share = max(share, own + C[here, 2 * a + 1, 2 * a + 1] / Q[a, a, 1])
-    limits = margin, problem.gate, same
+    allowed = margin, problem.gate, same
     for u in range(1, rows + 1):
         if u * saved.min() - squared >= margin:
             break
@@ -395,7 +395,7 @@ def cost_if_settled(
             q0, q1 = Q[a, a, 0], Q[a, a, 1]
             if u == 1:
                 left = q0 - C[here, c, c], -C[here, d, c], q1 - C[here, d, d]
-                if not _is_idle((n0, n1), left, (q0, q1), missing[a], limits):
+                if not _is_idle((n0, n1), left, (q0, q1), missing[a], allowed):
                     return np.inf
                 continue
             x = n0 * n0 / q0 + n1 * n1 / q1

@@ -465,10 +465,15 @@ def path_between(
     >>> path_between(np.array([[0.0, 0, 0], [2.4, 0, 0]]), motions, noise)[:, 0]
     array([0. , 1.1, 2.4])
     """
-    path, covariances = [poses[:1]], np.array([motion.covariance for motion in motions])
-    inverses = np.linalg.pinv(covariances, hermitian=True)
+    path, spreads = [poses[:1]], [m.covariance for m in motions if len(m.steps) > 1]
+    stack = np.reshape(spreads, (-1, 3, 3))
+    inverses = iter(np.linalg.pinv(stack, hermitian=True))
     for k in range(1, len(poses)):
-        path.append(_between(poses[k - 1 : k + 1], motions[k], inverses[k], noise))
+        ends, motion = poses[k - 1 : k + 1], motions[k]
+        single = len(motion.steps) == 1
+        path.append(
+            ends[1:] if single else _between(ends, motion, next(inverses), noise)
+        )
     found = np.concatenate(path)
     found[:, 2] = wrap_angle(found[:, 2])
     return found
@@ -483,8 +488,6 @@ def _between(
     of `path_between`.
     """
     first, last = ends
-    if len(motion.steps) == 1:
-        return np.asarray(last[None])
     turn = pose_rotation(first[2])
     gap = turn.T @ (last - first) - motion.increment
     gap[2] = wrap_angle(gap[2])

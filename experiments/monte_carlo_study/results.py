@@ -102,7 +102,7 @@ def write_results(
     command: str = "",
     more: Mapping[str, str] | None = None,
 ) -> None:
-    """Write the blocks of a job as one netCDF file, one block in memory at a time.
+    """Write the blocks of a job as one netCDF file, a few in memory at a time.
 
     Parameters
     ----------

@@ -31,6 +31,7 @@ from ..logs import slamlog
 from ..logs.decimals import texts
 from ..logs.log_lines import (
     LARGEST,
+    MAX_ID_DIGITS,
     ReadFile,
     columns_of,
     read_text,
@@ -412,7 +413,10 @@ def _from_columns(text: str, about: dict[str, Any]) -> Trajectory:
     times = texts(np.arange(len(truth[0]), dtype=np.float64))
     number = dict(zip(times, range(len(times)), strict=True))
     step = np.array([*map(number.__getitem__, readings[0])])
-    ids = np.array([*map(int, readings[5 if hides else 1])])
+    true = readings[5 if hides else 1]
+    if max(map(len, true), default=0) > MAX_ID_DIGITS:
+        raise ValueError("an id is too long")
+    ids = np.array([*map(int, true)])
     row = np.arange(len(step)) - np.searchsorted(step, step) if hides else ids
     shape = len(times), count_rows(about["scenario"])
     measurements, mask = np.zeros((*shape, 2)), np.zeros(shape, dtype=np.bool_)

@@ -933,3 +933,17 @@ def test_a_region_is_twice_as_large_as_required_and_holds_the_nearest(monkeypatc
     monkeypatch.setattr(closing, "LARGEST_COUNT", 2)
     inside, smaller = region.chosen(points)
     assert (inside.tolist(), smaller.farthest) == ([2, 4], 2.0)
+
+
+@pytest.mark.parametrize("size", [9, 11, 13], ids=["smaller", "equal", "larger"])
+def test_a_covariance_is_taken_in_the_order_of_the_mean(size):
+    P = np.arange(121.0).reshape(11, 11)
+    order = np.array([3, 0, 8, 10, 1, 2, 4, 5, 6])
+    gaussian = Gaussian(np.zeros(9), P.copy(), order)
+    expected = gaussian.block(np.arange(9))
+    np.testing.assert_array_equal(expected, P[:9, order])
+    taken = gaussian.taken(size)
+    np.testing.assert_array_equal(taken[:9, :9], expected)
+    assert np.shares_memory(taken, gaussian.covariance) == (size <= 11)
+    plain = Gaussian(np.zeros(11), P)
+    np.testing.assert_array_equal(plain.taken(13)[:11, :11], P)

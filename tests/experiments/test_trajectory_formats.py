@@ -1,5 +1,6 @@
 """Every file format gives back what was written, and other programs read it too."""
 
+import itertools
 import json
 import sys
 import warnings
@@ -210,6 +211,19 @@ def test_whole_columns_are_read_as_line_by_line_and_refused_alike(
         assert quick == read_as(layout, file.parent, monkeypatch, by_line=True), lines
         found.add(str(quick)[:8])
     assert {"LogError", "[(dtype("} <= found
+    rows = [row for row in text.split("\n") if row.startswith("measurement")]
+    for digits, changed in itertools.product(
+        ("1" * 19, "9" * 19, "-" + "9" * 23), (1, -1)
+    ):
+        long = text
+        for row in rows[:changed]:
+            fields = row.split(",")
+            fields[6 if preset == "hidden_identities" else 2] = digits
+            long = long.replace(row, ",".join(fields))
+        file.write_text(long)
+        quick = read_as(layout, file.parent, monkeypatch, by_line=False)
+        assert quick == read_as(layout, file.parent, monkeypatch, by_line=True)
+        assert quick.startswith("LogError")
 
 
 def test_parquet_is_one_row_per_moment(tmp_path):

@@ -262,19 +262,21 @@ class Gaussian(NamedTuple):
 
         The array may use the memory of a covariance with an order, which is then lost.
         """
-        if self.order is not None and size <= len(self.covariance):
-            memory = self.covariance.reshape(-1)[: size**2].reshape(size, size)
-            row = np.empty(len(self.covariance))
-            _sort_columns(self.covariance, self.order, row, memory)
-            return memory
-        count, array = len(self.mean), np.empty((size, size))
-        array[:count, :count] = self.block(np.arange(count))
+        count, P = len(self.mean), self.covariance
+        if self.order is not None and size <= len(P):
+            array = P.reshape(-1)[: size**2].reshape(size, size)
+        else:
+            array = np.empty((size, size))
+        if self.order is None:
+            array[:count, :count] = P
+        else:
+            _sort_columns(P, self.order, np.empty(len(P)), array)
         return array
 
 
 @jit_in_place
 def _sort_columns(matrix: Array, order: IntArray, row: Array, found: Array) -> None:
-    """Write rows with reordered columns, into the memory where the matrix begins."""
+    """Write rows with reordered columns, perhaps where the matrix itself begins."""
     for i in range(len(order)):
         for j in range(len(row)):
             row[j] = matrix[i, j]
