@@ -607,8 +607,8 @@ def test_mirror_images_of_ranges_are_kept_until_they_separate():
 def test_readings_that_waited_are_used_once_as_by_least_squares():
     """Against a batch of all poses and readings, where both are nearly linear."""
     motion, std, steps = np.array([1e-3, 1e-3, 1e-3]), 1e-3, 12
-    noise = {"motion_std": motion, "measurement_std": (std,)}
-    slam = make_estimator("ekf", **noise, sensor="bearing")
+    noise = {"motion_std": motion, "measurement_std": (std, 0.0)}  # 0 is not read
+    slam = make_estimator("ekf", **noise, sensor="bearing", landmark_init="delayed")
     landmark, rng, turn = np.array([2.0, 3.0]), np.random.default_rng(3), 0.1
     pose, readings = np.zeros(3), []
     for _ in range(steps):

@@ -1,5 +1,6 @@
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -490,6 +491,19 @@ def test_true_poses_of_a_graph_are_taken_by_id(file, vertex):
     assert log.header["truth"] == "graph true.g2o"
 
 
+def test_a_start_that_the_log_states_is_kept_beside_a_true_path(file, tmp_path):
+    log, own = read_log(file(ISAM)), np.array([1.0, 2.0, 0.5])
+    for name, start in (("own", own), ("none", np.zeros(3))):
+        write_slamlog(replace(log, start=start), tmp_path / f"{name}.csv")
+    poses = "timestamp,x,y,theta\n0,7,8,0.25\n1,7,8,0.25\n2,9,8,0.25\n"
+    truth = file(poses, "truth.csv")
+    kept, taken = (
+        read_log(tmp_path / f"{n}.csv", truth=truth) for n in ("own", "none")
+    )
+    np.testing.assert_array_equal(kept.start, own)
+    np.testing.assert_array_equal(taken.start, (7, 8, 0.25))
+
+
 def test_true_poses_follow_from_exact_edges(file):
     exact = (
         f"EDGE2 0 1 2 0 {math.pi / 2}\nLANDMARK 1 2 1 2\nEDGE2 1 3 -3 1 0\n"
@@ -585,6 +599,14 @@ def test_noise_of_positions_becomes_bearing_noise_in_metres(file):
     header = read_log(file(far), noise_from_file=True).header
     assert numbers(header["measurement_std"]) == pytest.approx((0, 1 / 1.5))
     assert float(header["bearing_std_metres"]) == pytest.approx(1 / 1.5)
+
+
+def test_bearing_noise_that_falls_with_the_range_is_in_metres(file):
+    near, far = "BR 1 2 0.1 2 0.25 0.3\n", "BR 1 3 0.2 10 0.05 0.3\n"
+    text = f"EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n{near}{far}"
+    header = read_log(file(text), noise_from_file=True).header
+    assert numbers(header["measurement_std"]) == pytest.approx((0, 0.3))
+    assert float(header["bearing_std_metres"]) == pytest.approx(0.5)
 
 
 def test_noise_of_differing_information_is_the_median(file):
