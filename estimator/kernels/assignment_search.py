@@ -380,29 +380,29 @@ def cost_if_settled(
         here = 1 - here
     limit = min(cost if most == 1 else np.inf, cost + spread, ceiling)
     margin = max(limit - cost, 0.0) + ROUNDING
-    share = 0.0  # the largest tr Q⁻¹ C⁺
+    allowed, least_saved = (margin, problem.gate, same), saved.min() if rows else np.inf
+    # ρᵀ Q⁻¹ ρ of each reading, and the largest tr Q⁻¹ C⁺.
+    residuals, share = np.empty(rows), 0.0
     for a in range(rows):
-        own = C[here, 2 * a, 2 * a] / Q[a, a, 0]
-        share = max(share, own + C[here, 2 * a + 1, 2 * a + 1] / Q[a, a, 1])
-    allowed = margin, problem.gate, same
-    for u in range(1, rows + 1):
-        if u * saved.min() - squared >= margin:
+        c, d, q0, q1 = 2 * a, 2 * a + 1, Q[a, a, 0], Q[a, a, 1]
+        n0, n1 = nu[a, a, 0] - h[here, a, 0], nu[a, a, 1] - h[here, a, 1]
+        left = q0 - C[here, c, c], -C[here, d, c], q1 - C[here, d, d]
+        if not (
+            least_saved - squared >= margin
+            or _is_idle((n0, n1), left, (q0, q1), missing[a], allowed)
+        ):
+            return np.inf
+        residuals[a] = n0 * n0 / q0 + n1 * n1 / q1
+        share = max(share, C[here, c, c] / q0 + C[here, d, d] / q1)
+    for u in range(2, rows + 1):
+        if u * least_saved - squared >= margin:
             break
         least, next_least = np.inf, np.inf
         for a in range(rows):
-            c, d = 2 * a, 2 * a + 1
-            n0, n1 = nu[a, a, 0] - h[here, a, 0], nu[a, a, 1] - h[here, a, 1]
-            q0, q1 = Q[a, a, 0], Q[a, a, 1]
-            if u == 1:
-                left = q0 - C[here, c, c], -C[here, d, c], q1 - C[here, d, d]
-                if not _is_idle((n0, n1), left, (q0, q1), missing[a], allowed):
-                    return np.inf
-                continue
-            x = n0 * n0 / q0 + n1 * n1 / q1
-            more = saved[a] - x / (1 - u * share)
+            more = saved[a] - residuals[a] / (1 - u * share)
             next_least = min(next_least, max(least, more))
             least = min(least, more)
-        if u > 1 and not (u * share < 1 and least + (u - 1) * next_least >= margin):
+        if not (u * share < 1 and least + (u - 1) * next_least >= margin):
             return np.inf
     return cost
 
