@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -173,15 +173,26 @@ def _typical_range(likelihood: LogLikelihood) -> float:
     return max(float(np.median(np.abs(likelihood.events.readings[:, 1]))), 1e-3)
 
 
-def _fit(smooth: LogLikelihood, found: _NoiseFit, **ends: Any) -> _NoiseFit:
-    """Fit the free entries, starting from their present values."""
+def _fit(
+    smooth: LogLikelihood,
+    found: _NoiseFit,
+    *,
+    most: int = scoring.MOST,
+    gain: float = scoring.GAIN,
+) -> _NoiseFit:
+    """Fit the free entries from their present values on; see `scoring.maximise`."""
     free = np.flatnonzero(found.free)
     along = scoring.restricted(smooth.of, found.noise, free)
-    fit = scoring.maximise(along, found.noise[None, free], **ends)
+    fit = scoring.maximise(along, found.noise[None, free], most=most, gain=gain)
     noise = found.noise.copy()
     noise[free] = fit.parameters
-    passes = found.passes + fit.passes
-    return _NoiseFit(noise, found.free, *fit[1:-1], passes)
+    return found._replace(
+        noise=noise,
+        likelihood=fit.log_likelihood,
+        information=fit.information,
+        converged=fit.converged,
+        passes=found.passes + fit.passes,
+    )
 
 
 def _fixed_at_zero(found: _NoiseFit, entry: int) -> _NoiseFit:
