@@ -14,7 +14,15 @@ import numpy as np
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.kernels.imagine import View, is_hidden, is_in_view
 from ..estimator.kernels.sizes_of_covariances import half_log_det, largest_variance
-from ..jit import fma, jit, jit_in_place, njit_allocating, njit_internal, njit_reordered
+from ..jit import (
+    fma,
+    jit,
+    jit_in_place,
+    njit_allocating,
+    njit_inlined,
+    njit_internal,
+    njit_reordered,
+)
 from .belief_features import Bounds, FeatureArrays, write_belief_features
 
 CELLS = 8.0  # that weigh as much as one landmark
@@ -92,27 +100,28 @@ def advance(
     plain tuples, the entries of `Worlds`, `Floor`, `TaskRules` and `Scratch`: numba
     takes microseconds to recognise a NamedTuple. The numeric features of a `Worlds`
     come in one array: the values of the first feature for all worlds, then those of the
-    next one. The boolean feature, which landmarks are mapped, is an array of its own.
+    next one, with an array of where each begins. The boolean feature, which landmarks
+    are mapped, is an array of its own, and has no numbers.
     """
-    beliefs, actions, collisions, episodes, outcome, counts, numbers, mapped = worlds
+    beliefs, actions, collisions, episodes, outcome, counts, flat, mapped = worlds
     now, result = Episodes(*episodes), StepOutcome(*outcome)
-    count, rows = mapped.shape
-    first, last = 2 * count * rows, 6 * count * rows
-    alone = numbers[:first].reshape(2, count, rows)
-    pairs = numbers[first:last].reshape(2, count, rows, 2)
-    rest = numbers[last:]
+    shape = (*mapped.shape, 2)
     of_belief = (
-        *(alone[0], alone[1], pairs[0], pairs[1], mapped),
-        rest[: 4 * count].reshape(count, 4),
-        rest[4 * count : 7 * count].reshape(count, 3),
-        rest[7 * count : 10 * count].reshape(count, 3),
+        _feature(flat, 0, mapped),
+        _feature(flat, 1, mapped),
+        _feature(flat, 2, mapped).reshape(shape),
+        _feature(flat, 3, mapped).reshape(shape),
+        mapped,
+        _feature(flat, 5, mapped),
+        _feature(flat, 6, mapped),
+        _feature(flat, 7, mapped),
     )
     more = (
-        rest[10 * count : 19 * count].reshape(count, 9),
-        rest[19 * count : 23 * count].reshape(count, 4),
-        rest[23 * count : 39 * count].reshape(count, 2 * SECTORS),
-        rest[39 * count : 55 * count].reshape(count, 2 * SECTORS),
-        rest[55 * count :].reshape(count, SECTORS),
+        _feature(flat, 8, mapped),
+        _feature(flat, 9, mapped),
+        _feature(flat, 10, mapped),
+        _feature(flat, 11, mapped),
+        _feature(flat, 12, mapped),
     )
     everything = Worlds(
         beliefs, actions, collisions, now, result, counts, of_belief, more
@@ -124,6 +133,14 @@ def advance(
             advance_world(
                 b, moving[b], everything, floor, TaskRules(*rules), Scratch(*scratch)
             )
+
+
+@njit_inlined
+def _feature(flat: tuple[Array, IntArray], place: int, mapped: BoolArray) -> Array:
+    """Return the feature at a place of the array of all numbers, shape (B, size)."""
+    (numbers, starts), count = flat, len(mapped)
+    first, end = starts[place], starts[place + 1]
+    return numbers[first:end].reshape(count, (end - first) // count)
 
 
 @njit_internal

@@ -4,6 +4,7 @@
 computes; `AssociationRecord` scores the association of filters without identities.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from numbers import Real
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.spaces.utils import flatten_space
+from gymnasium.spaces.utils import flatdim, flatten_space
 from numpy.typing import ArrayLike
 
 from ..arrays import AnyArray, Array, BoolArray, IntArray
@@ -135,13 +136,14 @@ class ActiveSlamTask(Restorable):
             np.zeros(landmarks),
             np.zeros((2 * landmarks, 2 * landmarks)),
         )
-        #: Place of each entry in the array of all numbers; ``belief_mask`` has none.
-        self._parts: dict[str, slice] = {}
-        self._length = 0
-        for key, box in flat.items():
-            size = count * (box.shape or (0,))[0] * (key != "belief_mask")
-            self._parts[key] = slice(self._length, self._length + size)
-            self._length += size
+        sizes = [
+            0 if key == "belief_mask" else count * flatdim(box)
+            for key, box in flat.items()
+        ]
+        #: Where each entry begins in the array of all numbers, and the end of the last.
+        self._starts = np.append(0, np.cumsum(sizes))
+        ends = itertools.pairwise(self._starts.tolist())
+        self._parts = dict(zip(flat, itertools.starmap(slice, ends), strict=True))
         self._all = np.ones(count, dtype=np.bool_)
         self._rows: tuple[AnyArray, ...] = ()
         self.episodes = Episodes(
@@ -217,7 +219,7 @@ class ActiveSlamTask(Restorable):
             tuple(self.episodes),
             tuple(self.outcome),
             (self.mapped, self.known),
-            numbers,
+            (numbers, self._starts),
             mapped,
         )
         advance(worlds, moving, worlds_now, self.grid.plan, self._rules, self._scratch)
@@ -225,7 +227,7 @@ class ActiveSlamTask(Restorable):
             write_landmark_sets(worlds, worlds_now[0], self.episodes.known, *sets)
 
     def _empty_rows(self) -> tuple[AnyArray, ...]:
-        rows = np.empty(self._length), np.empty(self._shape, dtype=np.bool_)
+        rows = np.empty(self._starts[-1]), np.empty(self._shape, dtype=np.bool_)
         if not self._form.rows:
             return rows
         shape = self._shape[0], self._form.rows
