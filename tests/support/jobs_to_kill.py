@@ -101,11 +101,11 @@ def two_filters(folder):
 
 
 def episodes(folder, format):
-    """Generate shards of trajectories, 24 of npz and 8 of a slower format."""
+    """Generate 24 shards of trajectories."""
     generate_trajectories(
         load_scenario("loop").with_changes(steps=200),
         folder,
-        episodes=120 if format == "npz" else 40,
+        episodes=120,
         episodes_per_shard=5,
         controller="waypoints",
         format=format,
