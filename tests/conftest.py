@@ -45,13 +45,16 @@ def pytest_runtestloop():
 
 
 # Where little is compiled.  Each worker begins with its share of the list.  The last
-# one compiles the filters while the others run these tests; otherwise all do.
+# one compiles the filters while the others run these tests; otherwise all do.  The
+# examples need most kernels, and would wait for them in the middle of the list.
 _FIRST = ("tests/envs/", "tests/sim_configs/", "src/", "tests/experiments/")
+_LAST = "tests/contracts/test_examples.py"
 
 
 def pytest_collection_modifyitems(config, items):
     """Move the tests that compile much behind the others; keep the remaining ones."""
     items.sort(key=lambda item: not item.nodeid.startswith(_FIRST))
+    items.sort(key=lambda item: item.nodeid.startswith(_LAST))
     if config.getoption("--remaining"):
         passed = set(config.cache.get(_PASSED, []))
         config.hook.pytest_deselected(items=[i for i in items if i.nodeid in passed])

@@ -68,7 +68,7 @@ def workers_among(processes):
     return [p for p, name in names.items() if "popen_loky" in name]
 
 
-IMPORTS = 2.5  # [s] more than a forked command takes to load what it lacks
+IMPORTS = 1.5  # [s] more than a forked command takes to load what it lacks
 LONG = (  # those that the next test ends in a filter are not among them
     "replay ../city.csv --out out",
     "judge ../path.tum --truth ../city.csv --out out",
