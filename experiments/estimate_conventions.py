@@ -145,7 +145,7 @@ def _all_readings(
     truth: Array, poses: Array, claims: Array, starts: Array, errors: _Errors
 ) -> tuple[Array, list[list[PosesAsRead]]]:
     """Return true poses at some steps, and the readings by those of the poses."""
-    last = truth.shape[1] - 1
+    last = claims.shape[1] - 1
     reach = min(_SHIFT, (last - 1) // 2)
     steps = np.unique(np.linspace(1 + reach, last - reach, _STEPS).round().astype(int))
 

@@ -524,8 +524,9 @@ def _measured(
     claims = np.full((count, steps, 3, 3), np.nan)
     failures: dict[int, Failure] = {}
     for run, each in enumerate(files):
-        reason = each if isinstance(each, str) else _unmatched(each, steps, chunk.dt)
-        if reason or isinstance(each, str):
+        if isinstance(each, str):
+            failures[run] = Failure(-1, each)
+        elif reason := _unmatched(each, steps, chunk.dt):
             failures[run] = Failure(-1, reason)
         else:
             poses[run], claims[run] = each.poses, each.covariances

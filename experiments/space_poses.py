@@ -382,7 +382,7 @@ def _median_errors(truth: Pose, poses: Pose) -> tuple[float, float]:
 
 def _pose_readings(truth: Pose, poses: Pose) -> Iterator[tuple[str, Pose, Pose]]:
     """Yield truth and estimates, read in other conventions of the poses."""
-    origin = Pose(np.zeros_like(poses.positions), np.eye(3) + 0 * poses.rotations)
+    origin = Pose(np.zeros(3), np.eye(3))
     inverse = "poses of the world as the robot sees it (inverse)"
     yield inverse, truth, between(poses, origin)
     yield f"{inverse}, in the truth", between(truth, origin), poses

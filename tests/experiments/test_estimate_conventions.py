@@ -19,6 +19,7 @@ from slamgym.experiments.estimate_conventions import (
     _readings,
     _truth_at,
     additive_covariances,
+    mistake_in_estimates,
     stray_poses,
     swapped_drives,
 )
@@ -170,6 +171,26 @@ def test_covariances_are_read_in_every_convention(frame, decides):
         assert each.truth is None
 
 
+@pytest.mark.parametrize("frame", ["left", "invariant"])
+def test_additive_covariances_are_those_of_a_numeric_jacobian(frame):
+    pose, eps = np.array([2.0, -1.0, 0.7]), 1e-6
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+
+    def moved(xi):
+        """Apply a small motion to the estimate, in the robot's or the world's frame."""
+        small = np.array([[1, -xi[2], xi[0]], [xi[2], 1, xi[1]], [0, 0, 1]])
+        own = np.array([[cos, -sin, pose[0]], [sin, cos, pose[1]], [0, 0, 1]])
+        result = own @ small if frame == "left" else small @ own
+        heading = np.arctan2(result[1, 0], result[0, 0])
+        return np.array([result[0, 2], result[1, 2], heading])
+
+    steps = eps * np.eye(3)
+    J = np.column_stack([(moved(s) - moved(-s)) / (2 * eps) for s in steps])
+    P = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 0.5]])
+    found = additive_covariances(pose, P, frame)
+    np.testing.assert_allclose(found, J @ P @ J.T, rtol=1e-6)
+
+
 def test_a_covariance_follows_the_convention_of_its_pose():
     J = np.diag([1.0, 2.0, 3.0])
     first, second, *rest = _readings("a", POSES, CLAIMS, J, _Errors("additive", ""))
@@ -192,6 +213,8 @@ def test_positions_are_scaled_to_the_size_of_the_true_path():
     assert claims is CLAIMS
     truth[..., :2] = 1.1 * POSES[..., :2]
     assert not list(_in_other_units(truth, POSES, CLAIMS))
+    assert not list(_in_other_units(0 * truth, POSES, CLAIMS))  # at rest
+    assert not list(_in_other_units(truth, 0 * POSES, CLAIMS))
     truth[..., :2] = 0.7 * POSES[..., :2]
     ((name, poses, *_),) = _in_other_units(truth, POSES, CLAIMS)
     assert name == "positions in a unit of 0.7 m"
@@ -202,7 +225,7 @@ def arcs(times):
     """Return poses on circles of several radii, shape (6, T, 3)."""
     radius = np.arange(1.0, 7.0)[:, None]
     heading = np.asarray(times) / radius
-    x, y = radius * np.sin(heading), radius * (1 - np.cos(heading))
+    x, y = radius * np.sin(heading) - 2, radius * (1 - np.cos(heading))
     return np.stack([x, y, heading], axis=-1)
 
 
@@ -215,7 +238,9 @@ def test_the_truth_between_steps_lies_on_arcs():
 @pytest.mark.parametrize("offset", [-1.4, -0.3, 0.5, 1.7, 0.1])
 def test_a_shift_between_steps_is_that_of_the_nearest_positions(offset):
     truth, steps = arcs(np.arange(12.0)), np.array([4, 5, 7])
-    estimates = arcs(steps - offset), np.broadcast_to(np.eye(3), (6, 3, 3, 3))
+    # Headings that are not wrapped do not count.
+    poses = arcs(steps - offset) + 4 * QUARTER
+    estimates = poses, np.broadcast_to(np.eye(3), (6, 3, 3, 3))
     later = lambda shift: arcs(np.arange(12.0) + shift)  # noqa: E731
     for truth_at in (None, later):
         of = _Errors("additive", "invariant", truth_at)
@@ -226,7 +251,7 @@ def test_a_shift_between_steps_is_that_of_the_nearest_positions(offset):
         ((first, *_),) = found
         side = "late" if offset > 0 else "early"
         assert first.name == f"time stamps that are {abs(offset):.1f} steps too {side}"
-        np.testing.assert_allclose(first.truth, estimates[0], atol=1e-12)
+        np.testing.assert_allclose(first.truth + 4 * QUARTER, poses, atol=1e-12)
 
 
 def as_by_cholesky(truth, reading):
@@ -276,6 +301,27 @@ def test_a_fit_is_that_of_whitened_errors(is_additive, scale):
     assert _fit(POSES, reading._replace(truth=truth)) == found
     wrong = reading._replace(covariances=-CLAIMS)
     assert _fit(truth, wrong)[1:] == (False, -np.inf, found.errors)
+
+
+@pytest.mark.parametrize("mean", [1 / 2.6, 1 / 2.4, 2.4, 2.6])
+def test_squares_of_an_honest_reading_have_a_mean_within_a_factor(mean):
+    """Runs that differ much do not excuse more."""
+    swing = np.sqrt(mean * (1 + 0.9 * (-1.0) ** np.arange(8)))[:, None, None]
+    poses, P = np.ones((8, 5, 3)), np.broadcast_to(np.eye(3) / 100, (8, 5, 3, 3))
+    fit = _fit((1 + swing / 10) * poses, PosesAsRead("", poses, P, True))
+    assert fit.is_honest == (1 / 2.5 < mean < 2.5)
+
+
+def test_two_poses_of_a_drive_show_a_convention():
+    rng = np.random.default_rng(2)
+    truth = rng.uniform(-9, 9, (40, 2, 3))
+    given = (
+        truth + rng.normal(0, 0.1, truth.shape),
+        np.tile(np.eye(3) / 10, (40, 2, 1, 1)),
+    )
+    said = mistake_in_estimates(truth, *given, truth[:, 0])
+    assert said.startswith("standard deviations in place of variances: read so, NEES")
+    assert mistake_in_estimates(*(a[:, :1] for a in (truth, *given)), truth[:, 0]) == ""
 
 
 def test_far_smaller_errors_are_named_with_both():

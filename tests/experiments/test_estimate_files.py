@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slamgym.experiments.estimate_files import near_truth, read_estimates, true_path
+from slamgym.experiments.estimate_files import (
+    near_truth,
+    paired,
+    paths_by_label,
+    read_estimates,
+    true_path,
+)
 from slamgym.experiments.logs import LogError
 
 RNG = np.random.default_rng(0)
@@ -96,18 +102,34 @@ def test_a_tum_file_is_read_number_by_number(count, tmp_path):
     assert_poses(found)
     assert found.in_seconds
     assert found.is_spatial == (count > 9)
+    last = path.read_text().splitlines()[-1]
     np.savetxt(path, tum_rows(), fmt="%.17g")
-    np.testing.assert_allclose(true_path(path)[:, 1:], POSES, atol=1e-12)
-    np.testing.assert_array_equal(true_path(path)[:, 0], TIMES)
+    for text in path.read_text(), "\n".join([*path.read_text().split("\n")[:2], last]):
+        path.write_text(text)  # rows of one length, or of two
+        np.testing.assert_allclose(true_path(path)[:, 1:], POSES, atol=1e-12)
+        np.testing.assert_array_equal(true_path(path)[:, 0], TIMES)
 
 
-@pytest.mark.parametrize("climb", [0.0, 0.5])
-def test_a_path_is_spatial_only_if_it_leaves_its_plane(climb, tmp_path):
-    path, heights = tmp_path / "run.tum", HEIGHTS + np.array([[0.0], [climb], [0.0]])
-    turns = Rotation.from_euler("z", POSES[:, 2:]).as_quat()
-    parts = TIMES[:, None], POSES[:, :2], heights, turns, entries(SPATIAL, 21)
+@pytest.mark.parametrize(
+    ("climb", "tilt", "known", "is_spatial"),
+    [
+        (0.04, 0, 1, False),
+        (0.06, 0, 1, True),
+        (0, 0.048, 1, False),
+        (0, -0.052, 1, True),
+        (0.06, 0, np.array([1, 1, 0, 1, 1, 1]), False),  # without variance of z
+        (0.06, 0, np.array([[[1]], [[0]], [[0]]]), True),
+    ],
+)
+def test_a_path_is_spatial_only_if_it_leaves_its_plane(
+    climb, tilt, known, is_spatial, tmp_path
+):
+    path = tmp_path / "run.tum"
+    places = np.column_stack([[0, 3, 9], [0, 2, 1], [7, 7 + 9 * climb, 7]])
+    turns = Rotation.from_euler("x", [[0.0], [0.0], [tilt]]).as_quat()
+    parts = TIMES[:, None], places, turns, entries(known * SPATIAL, 21)
     np.savetxt(path, np.hstack(parts), fmt="%.17g")
-    assert read_estimates([path])["run"].is_spatial == (climb > 0)
+    assert read_estimates([path])["run"].is_spatial == is_spatial
 
 
 def test_an_npz_is_read_by_its_seeds_and_holds_the_final_map(tmp_path):
@@ -131,7 +153,63 @@ def test_an_npz_is_read_by_its_seeds_and_holds_the_final_map(tmp_path):
 
 
 def test_times_outside_a_true_path_or_in_its_gap_are_not_near_it():
-    due = np.array([0.0, 1.0, 2.0, 3.0, 9.0, 10.0])
-    times = np.array([-0.1, 0.0, 2.5, 3.04, 3.5, 5.0, 8.97, 9.5, 10.0, 10.1])
-    near = [False, True, True, True, False, False, True, True, True, False]
+    due = np.array([0.0, 1.0, 2.0, 3.0, 9.0, 10.0, 13.0])
+    times = np.array([-0.1, 0.0, 2.5, 3.04, 3.07, 5.0, 8.97, 9.5, 11.5, 13.0, 13.1])
+    near = [False, True, True, True, False, False, True, True, True, True, False]
     assert near_truth(times, due).tolist() == near
+
+
+def test_estimates_keep_the_labels_of_a_mapping(tmp_path):
+    assert paths_by_label({"a": tmp_path, 2: [tmp_path]}) == {
+        "a": [tmp_path], "2": [tmp_path]
+    }  # fmt: skip
+    with pytest.raises(ValueError, match="at least one file or folder, got none"):
+        paths_by_label({"a": tmp_path, "b": []})
+
+
+@pytest.mark.parametrize("names", [["run1", "run01", "run2"], ["run1", "run2"]])
+@pytest.mark.parametrize("estimates", [["e1", "e01", "e2"], ["e1", "e2"]])
+def test_names_are_paired_only_if_what_differs_is_unique(names, estimates):
+    read = {name: k for k, name in enumerate(estimates)}
+    is_unique = len(names) == len(estimates) == 2
+    expected = {"run1": 0, "run2": 1} if is_unique else read
+    assert paired(read, names) == expected
+
+
+def tilted(degrees):
+    return Rotation.from_euler("ZY", (0.5, np.radians(degrees))).as_quat()
+
+
+@pytest.mark.parametrize(
+    ("turn", "message"),
+    [
+        (tilted(31), "line 2: .*, tilted by 31°; --space judges"),
+        (tilted(25)[[3, 0, 1, 2]], "line 2: .*: qw comes first; write it last"),
+        (tilted(35)[[3, 0, 1, 2]], "line 2: .*, tilted by"),
+    ],
+)
+def test_a_true_path_is_tilted_by_at_most_30_degrees(turn, message, tmp_path):
+    path, rows = tmp_path / "run.tum", np.eye(8)[[7, 7]]
+    rows[1, 0], rows[1, 4:] = 1.0, tilted(29)
+    np.savetxt(path, rows)
+    assert true_path(path)[1, 3] == pytest.approx(0.5)
+    rows[1, 4:] = turn
+    np.savetxt(path, rows)
+    with pytest.raises(LogError, match=message):
+        true_path(path)
+
+
+@pytest.mark.parametrize(
+    ("counts", "message"),
+    [
+        ((0, 0, 0), "line 1: expected t x y z .*, got no covariance"),
+        ((6, 0, 9), "line 2: expected t x y z .*, got no covariance"),
+        ((6, 6, 9), "expected lines t x y z .*, all alike, got lines of several"),
+    ],
+)
+def test_rows_of_tum_without_the_same_covariance_are_refused(counts, message, tmp_path):
+    path, rows = tmp_path / "run.tum", tum_rows(entries(PLANAR, 9)).tolist()
+    lines = [row[: 8 + n] for row, n in zip(rows, counts, strict=True)]
+    path.write_text("\n".join(" ".join(map(repr, line)) for line in lines))
+    with pytest.raises(LogError, match=message):
+        read_estimates([path])

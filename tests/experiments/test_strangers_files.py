@@ -45,6 +45,13 @@ def own(folder, **changes):
     )
 
 
+def stamped(text, name, time):
+    """Give a table other stamps, and their column another name."""
+    head, *rows = (line.split(",") for line in text.split())
+    rows = [[time(float(t)), *others] for t, *others in rows]
+    return "\n".join(map(",".join, [[name, *head[1:]], *rows])) + "\n"
+
+
 def events_of(log):
     return [
         (e.t, e.d, e.alpha, e.dt)
@@ -190,13 +197,14 @@ def test_the_start_is_the_true_pose_before_the_first_motion(
 @pytest.mark.parametrize(("unit", "name"), [(1, "t"), (1e3, "t"), (1e9, "stamp [ns]")])
 def test_epoch_stamps_count_from_the_first_odometry(folder, unit, name):
     epoch = 1.7e9
-
-    def stamped(text):
-        head, *rows = (line.split(",") for line in text.split())
-        rows = [[f"{(float(t) + epoch) * unit:.0f}", *others] for t, *others in rows]
-        return "\n".join(map(",".join, [[name, *head[1:]], *rows])) + "\n"
-
-    log = own(folder, odometry=stamped(ODOMETRY), measurements=stamped(MEASUREMENTS))
+    tables = {"odometry": ODOMETRY, "measurements": MEASUREMENTS}
+    log = own(
+        folder,
+        **{
+            key: stamped(text, name, lambda t: f"{(t + epoch) * unit:.0f}")
+            for key, text in tables.items()
+        },
+    )
     assert [e.t for e in log.events] == [-1, 0, 0, 1, 2, 2]
     assert float(log.header["epoch"]) == epoch + 1
 
@@ -213,10 +221,13 @@ def test_readings_without_id_are_hidden(folder):
 
 
 def test_comments_set_the_noise_the_motion_and_the_start(folder):
-    remarks = "# motion_std: 0.1,0.1,0.05\n# motion: midpoint\n# start: 1,2,3\n"
+    remarks = (
+        "# by: me\n# motion_std: 0.1,0.1,0.05\n# motion: midpoint\n# start: 1,2,3\n"
+    )
     log = own(folder, odometry=remarks + ODOMETRY)
     assert (log.motion, log.start.tolist()) == ("midpoint", [1, 2, 3])
     assert log.header["motion_std"] == "0.1,0.1,0.05"
+    assert "by" not in log.header
 
 
 def test_a_log_of_tables_can_be_kept_as_slamlog(folder, tmp_path):
@@ -308,16 +319,29 @@ def test_what_is_wrong_in_a_table_is_named(folder, changes, message):
 @pytest.mark.parametrize("form", ["t [{}]", "time_{}"])
 def test_the_unit_of_relative_stamps_is_that_of_the_header(folder, unit, form):
     scale = {"ms": 1000, "us": 10**6, "nanoseconds": 10**9}[unit]
-
-    def stamped(text):
-        head, *rows = (line.split(",") for line in text.split())
-        rows = [[str(int(t) * scale), *others] for t, *others in rows]
-        return "\n".join(map(",".join, [[form.format(unit), *head[1:]], *rows])) + "\n"
-
     tables = {"odometry": ODOMETRY, "measurements": MEASUREMENTS, "groundtruth": TRUTH}
-    log = own(folder, **{name: stamped(text) for name, text in tables.items()})
+    name = form.format(unit)
+    log = own(
+        folder,
+        **{
+            key: stamped(text, name, lambda t: str(int(t) * scale))
+            for key, text in tables.items()
+        },
+    )
     assert [event.t for event in log.events] == pytest.approx([0, 1, 1, 2, 3, 3])
     assert log.ground_truth[:, 0] == pytest.approx([0, 1, 2, 3])
+
+
+@pytest.mark.parametrize("step", [4e-4, 6e-4, 4.9, 5.1])
+def test_steps_of_plausible_length_need_no_unit(folder, step):
+    tables = {"odometry": ODOMETRY, "measurements": MEASUREMENTS}
+    tables = {k: stamped(x, "t", lambda t: repr(step * t)) for k, x in tables.items()}
+    if 5e-4 <= step <= 5:
+        two = "t,x,y\n0,0,0\n99,1,1\n"  # too few to judge their step
+        assert len(own(folder, **tables, groundtruth=two).ground_truth) == 2
+        return
+    with pytest.raises(LogError, match="expected the unit of t in its name"):
+        own(folder, **tables)
 
 
 POSES = TRUTH.replace("t,x,y,theta", "t,{0}x,{0}y,{0}theta")
@@ -520,7 +544,9 @@ def test_a_single_file_of_utias_asks_for_its_folder(file, name):
 def test_a_table_without_the_columns_of_odometry_is_shown_with_them(folder):
     place = folder(measurements=MEASUREMENTS, wheels="t,v,gyro\n0,1,2\n", empty="")
     (place / "old.csv").mkdir()
-    with pytest.raises(LogError, match=r"got measurements.csv .*; wheels.csv with"):
+    with pytest.raises(
+        LogError, match=r"got measurements.csv .*; wheels.csv with 't,v"
+    ):
         read_log(place)
 
 

@@ -392,7 +392,7 @@ def read_named(tables: Sequence[Table], name: str, source: Path) -> slamlog.Slam
         raise of["odometry"].header.error("rows of odometry below it", "empty ones")
     stamps = of["odometry"].times(rows)
     of["odometry"].check_step(stamps, _LONGEST)
-    epoch = float(stamps[0]) if abs(stamps[0]) > _EPOCH else 0.0
+    epoch = float(stamps[0]) if stamps[0] > _EPOCH else 0.0
 
     def on_clock(times: Array) -> Array:
         return np.round(times - epoch, TIME_DIGITS) if epoch else times
