@@ -125,7 +125,7 @@ def _join(axes: Axes, estimates: Array, truth: Array, *, width: float) -> None:
         zorder=3,
         label="error",
     )
-    axes.add_collection(lines, autolim=False)
+    axes.add_collection(lines)
 
 
 def distances_from_truth(trace: RunTrace) -> LandmarkDistances | None:

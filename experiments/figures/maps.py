@@ -224,7 +224,6 @@ def shared_limits(limits: Sequence[Array]) -> Array:
 def _label_outer_axes(grid: NDArray[np.object_], panels: int) -> None:
     """Label x below the lowest panel of each column, and y at the left."""
     shown = np.arange(grid.size).reshape(grid.shape) <= panels
-    shown[0, 1] = False  # the legend
     for i, row in enumerate(grid):
         for j, axes in enumerate(row):
             last = not shown[i + 1 :, j].any()
@@ -443,5 +442,5 @@ def draw_walls(axes: Axes, walls: Walls) -> list[Artist]:
     if not len(walls):
         return []
     lines = scene.wall_lines(wall_ends(walls), 2.2, zorder=1.5)
-    axes.add_collection(lines, autolim=False)
+    axes.add_collection(lines)
     return [lines]

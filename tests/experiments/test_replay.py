@@ -443,7 +443,11 @@ def test_a_summary_holds_plain_finite_numbers_and_null_for_the_unknown():
     settings = FilterSettings("ekf", (0.1,) * 3, (0.1, 0.1), options={"k": math.inf})
     summary = summarise(replay(known, ekf()), settings)
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+    trace = replay(known, ekf()).trace
+    assert summary["pose"] == trace.poses[-1].tolist()
+    assert summary["pose_covariance"] == trace.pose_covariances[-1].tolist()
     first, second, _ = summary["landmarks"]
+    assert [first["x"], first["y"]] == trace.landmarks[0].tolist()
     assert first["euclidean"] > 0
     assert first["mahalanobis"] > 0
     assert (second["euclidean"], second["mahalanobis"]) == (None, None)

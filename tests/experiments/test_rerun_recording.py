@@ -161,7 +161,8 @@ def test_a_recording_holds_each_step_of_each_filter_in_place(tmp_path, monkeypat
     assert (kind, looks) == ("LineStrips3D", {"colors": grey})
     np.testing.assert_array_equal(strips, [flat((0, 1), (3, 4))])
     kind, (points,), looks = still["world/truth/landmarks"]
-    assert (kind, looks["labels"]) == ("Points3D", ["4", "9"])
+    expected = {"labels": ["4", "9"], "colors": grey, "show_labels": False}
+    assert (kind, looks) == ("Points3D", expected)
     np.testing.assert_array_equal(points, flat(*LOG.landmarks))
     (path,) = still["world/truth/path"][1][0]
     np.testing.assert_array_equal(path, flat((0, 0), (1, 0.5)))

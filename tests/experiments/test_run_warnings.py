@@ -98,14 +98,29 @@ def test_bearings_that_are_coarse_beside_fine_ranges_are_reported():
         assert silent == []
 
 
-def test_landmarks_that_are_seen_no_longer_are_told():
-    # two of five landmarks seem to vanish, and to stand 1.5 m further on
+@pytest.mark.parametrize("count", [1, 2])
+def test_landmarks_that_are_seen_no_longer_are_told_if_they_are_many(count):
+    # some of five landmarks seem to vanish, and to stand 1.5 m further on
     before = np.vstack([PLACES, [(2.0, 5.0), (2.0, -5.0)]])
-    after = before + np.array([(0, 0), (1.5, 0), (1.5, 0), (0, 0), (0, 0)])
-    done = run(standing([before] * 20 + [after] * 20), management=True)
-    assert len(done.belief.landmark_ids) == 7
-    assert abandoned_landmarks(done) == 2
-    assert any("2 of the 7 landmarks in the map" in w for w in run_warnings(done))
+    after = before + np.array([(1.5 * (2 - count < k < 3), 0) for k in range(5)])
+    log = standing([before] * 20 + [after] * 20)
+    done = run(replace(log, start=(30.0, -7.0, 0.5)), management=True)
+    assert len(done.belief.landmark_ids) == 5 + count
+    assert abandoned_landmarks(done) == count
+    told = any("2 of the 7 landmarks in the map" in w for w in run_warnings(done))
+    assert told == (count == 2)
+
+
+def test_rejections_and_innovations_are_told_beyond_their_limits():
+    done = run(standing([PLACES] * 30, ids=[1, 2, 3]))
+    for rejected in 4, 6:
+        counts = done.readings._replace(rejected=rejected, associated=100 - rejected)
+        told = run_warnings(replace(done, readings=counts))
+        assert [w[:21] for w in told] == ["The gate rejects 6% o"] * (rejected > 5)
+    for ratio in 0.48, 0.52, 1.92, 2.08:
+        trace = replace(done.trace, nis=ratio * done.trace.nis_dof)
+        told = run_warnings(replace(done, trace=trace))
+        assert [w[:15] for w in told] == [f"The NIS is {ratio}"] * (not 0.5 < ratio < 2)
 
 
 def test_landmarks_out_of_view_are_not_missed():
