@@ -71,7 +71,8 @@ TESTS = {
     ),
     "envs/controllers": "controllers vector_controllers drawn_worlds",
     "envs/landmark_world": (
-        "landmark_world streams models_of_worlds drawn_worlds pose_sensors"
+        "landmark_world streams models_of_worlds drawn_worlds pose_sensors "
+        "state_and_restore"
     ),
     "envs/noise_streams": "bearing_range_sensor streams pose_sensors faults",
     "envs/random_numbers": "streams bearing_range_sensor drawn_worlds",
@@ -81,6 +82,7 @@ TESTS = {
     "envs/specs": "gymnasium_contract every_environment",
     "envs/robot": "unicycle_body world_batch landmark_world models_of_worlds",
     "envs/vector": "landmark_world_vector world_batch vector_controllers",
+    "envs/vector/wrappers": "landmark_world_vector stable_baselines",
     "estimator/": "ekf_slam filter_family errors_change_nothing",
     "estimator/models/bearing_range": "motions bearing_range ekf_slam",
     "estimator/models/relative_geometry": "relative_geometry",
@@ -126,7 +128,7 @@ TESTS = {
     "estimator/registry": (
         "representations models_of_logs filter_family ekf_slam large_maps peers"
     ),
-    "estimator/smoother": "smoother reassociation symmetries",
+    "estimator/smoother": "smoother reassociation symmetries pose_readings",
     "evaluation/association_scores": "association_scores gospa",
     "evaluation/consistency_report": "consistency_report",
     "evaluation/diagnosis": "diagnosis noise_findings",
@@ -163,7 +165,7 @@ TESTS = {
     "experiments/judging": "judging strangers_files",
     "experiments/log_conventions": "log_conventions",
     "experiments/logs": "slamlog importers strangers_files replay pose_rows",
-    "experiments/logs/ground_truth": "slamlog replay noise_fitting",
+    "experiments/logs/ground_truth": "slamlog replay noise_fitting map_management",
     "experiments/logs/recording": "recording replay pose_rows",
     "experiments/logs/importers": "importers strangers_files log_conventions",
     STUDY: "study_by_hand monte_carlo",
@@ -195,10 +197,11 @@ TESTS = {
     ),
     "src/slamgym": "public_names kernel_cache leaves scenario",
     "src/slamgym/argument_checks": (
-        "errors_change_nothing magnitudes filter_memory hypothesis_tests association"
+        "errors_change_nothing magnitudes filter_memory hypothesis_tests association "
+        "batch"
     ),
     "src/slamgym/restorable": "state_and_restore",
-    "src/slamgym/suggestions": "scenario command_line",
+    "src/slamgym/suggestions": "scenario command_line check_estimator",
 }
 PLAIN = (
     *("estimator/models", "estimator/kernels", "evaluation/error_bound"),

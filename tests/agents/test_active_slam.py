@@ -823,10 +823,9 @@ def returns():
     known = np.array([True, False])
     explored = np.ones(len(env.task.grid.cells), dtype=bool)
     baseline = make_baseline("revisit", env.scenario, np.random.default_rng(0))
-    count = iter(range(1000))
 
-    def steps(*shares):
-        for share in shares:
+    def steps(*shares, begin=1):
+        for step, share in enumerate(shares, begin):
             spread = np.diag([0.01, share**2, 4.0, 0.01, 0.01, 1.0, 1.0])
             belief = Belief(mean, spread, (0, 1))
             speed, turn = baseline.act(
@@ -835,13 +834,13 @@ def returns():
                     known=known,
                     explored=explored,
                     accuracy=1.0,
-                    step=next(count),
+                    step=step,
                 )
             )
             assert (speed > 0) != (turn != 0)  # ahead, or round on the spot
             yield bool(turn)
 
-    return lambda *shares: list(steps(*shares))
+    return lambda *shares, **of: list(steps(*shares, **of))
 
 
 def test_a_return_begins_above_four_fifths_of_the_accuracy_and_ends_below_half(returns):
@@ -849,6 +848,7 @@ def test_a_return_begins_above_four_fifths_of_the_accuracy_and_ends_below_half(r
     assert returns(0.81, 0.6, 0.51, 0.5) == [True] * 4
     assert returns(0.49, 0.6, 0.79) == [False] * 3
     assert returns(0.81, 0.49, 0.81) == [True, False, True]
+    assert returns(0.6, 0.6, begin=0) == [False] * 2  # another episode
 
 
 @pytest.mark.parametrize("share", [0.6, 0.9])

@@ -9,6 +9,7 @@ from slamgym.agents import ActiveSlamEnv, ActiveSlamVectorEnv
 from slamgym.agents.landmark_set import FEATURES, SCALE
 
 SET = {"observation": "set", "max_landmarks": 9}
+AXES = "ahead", "aside"
 
 
 def expected_rows(env):
@@ -61,6 +62,10 @@ def test_rows_are_the_belief_in_the_frame_of_the_robot():
         if terminated:
             break
     assert len(rows) > 4
+    pose = [f"{a}_pose_{b}" for a in AXES for b in (*AXES, "heading")]
+    names = [f"{of}{axis}" for of in ("", "std_", "map_std_") for axis in AXES]
+    own = [*names[:4], "correlation", *names[4:], "map_correlation", "known"]
+    assert (*own, *pose) == FEATURES
 
 
 def test_spaces_are_the_same_whatever_the_number_of_landmarks():

@@ -32,18 +32,27 @@ def same(one, other):
     return data_equivalence(one, other, exact=True)
 
 
+def shown(env):
+    """Return what the properties of an environment show of its state."""
+    kind = type(env)
+    names = [name for name in dir(kind) if isinstance(getattr(kind, name), property)]
+    values = {name: getattr(env, name) for name in names}
+    return {n: value for n, value in values.items() if isinstance(value, np.ndarray)}
+
+
 def check(env, seed, *, before=7, after=50):
     rng = np.random.default_rng(seed)
     low, high = env.action_space.low, env.action_space.high
     actions = rng.uniform(low, high, (before + 2 * after, *low.shape)).astype("f4")
     env.reset(seed=seed)
     drive(env, actions[:before])
-    state = env.state()
+    state, there = env.state(), shown(env)
     first = drive(env, actions[before : before + after])
     drive(env, actions[before + after :])
     env.reset(seed=seed + 1)  # a new generator and, in some scenarios, a new world
     for _ in range(2):  # the state itself stays as it was
         env.restore(state)
+        assert same(there, shown(env))
         again = drive(env, actions[before : before + after])
         assert same(first, again)
 
@@ -72,6 +81,7 @@ def test_worlds_that_draw_their_settings_return_to_them():
     ranges = {"motion_std": [0.5, 2.0], "measurement_std": [0.5, 2.0]}
     check(LandmarkWorldEnv("loop", randomise=ranges), 8)
     check(LandmarkWorldVectorEnv(3, "loop", randomise=ranges), 8)
+    check(LandmarkWorldEnv("loop", compass={"std": 0.1, "every": 2}), 8)
 
 
 def test_filters_of_any_kind_return_with_their_world():

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from comparison import same
-from gymnasium.vector import AutoresetMode, VectorWrapper
+from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import slamgym  # noqa: F401 (registers the environments)
@@ -72,6 +72,17 @@ def test_it_steps_as_a_dummy_of_single_worlds_does(changes, sb3):
     same(*(dict(vector.reset()) for vector in vectors))
 
 
+def test_options_are_those_of_one_reset(sb3):
+    mode = {"vector_kwargs": {"autoreset_mode": AutoresetMode.SAME_STEP}}
+    certain = {"start": {"std": [0.0] * 3}}
+    worlds = gym.make_vec(ID, 2, vectorization_mode="sync", **mode, **certain)
+    vector = to_stable_baselines(worlds)
+    vector.set_options({"pose": (1.0, 2.0, 0.5)})
+    for pose in ([1.0, 2.0, 0.5], [0.0] * 3):
+        vector.reset()
+        assert vector.reset_infos[1]["pose"].tolist() == pose
+
+
 @pytest.mark.slow
 def test_flat_worlds_have_flat_terminal_observations(sb3):
     vector = to_stable_baselines(FlattenBatch(native(steps=2)))
@@ -83,25 +94,6 @@ def test_flat_worlds_have_flat_terminal_observations(sb3):
     for info in infos:
         assert info["terminal_observation"].shape == (20,)
         assert info["TimeLimit.truncated"] is True
-
-
-class Ending(VectorWrapper):
-    """Says of three worlds, when they are cut off, that two of them terminate."""
-
-    def step(self, actions):
-        observations, rewards, _, truncated, infos = self.env.step(actions)
-        terminated = truncated & [False, True, True]
-        return observations, rewards, terminated, truncated & [True, False, True], infos
-
-
-@pytest.mark.slow
-def test_a_world_that_terminates_in_its_last_step_is_not_truncated(sb3):
-    vector = to_stable_baselines(Ending(native(steps=2)))
-    vector.reset()
-    vector.step(np.zeros((3, 2)))
-    _, _, dones, infos = vector.step(np.zeros((3, 2)))
-    assert dones.all()
-    assert [info["TimeLimit.truncated"] for info in infos] == [True, False, False]
 
 
 @pytest.mark.slow

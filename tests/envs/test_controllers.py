@@ -183,7 +183,8 @@ def test_waypoints_keep_near_the_planned_path_of_a_preset(name):
     path = drive(controller, scenario.steps, dt=scenario.dt, pose=scenario.start.pose)
     plan = planned_path(scenario)[:, :2]
     gaps, _ = KDTree(plan).query(path[:, :2])
-    assert gaps.max() <= np.linalg.norm(np.diff(plan, axis=0), axis=1).max()
+    longest = np.linalg.norm(np.diff(plan, axis=0), axis=1).max()
+    assert gaps.max() <= longest == pytest.approx(2 * controller.tolerance)
 
 
 def test_a_plan_that_stays_put_is_followed_by_standing_still():

@@ -59,20 +59,6 @@ def test_they_change_no_other_noise():
         assert all(np.array_equal(one[key], other[key]) for key in one)
 
 
-def test_a_restored_world_reads_the_same_again():
-    world = gymnasium.make(WORLD, scenario=scenario(**BOTH)).unwrapped
-    world.reset(seed=2)
-    state = world.state()
-    first = [world.step([0.5, 0.1])[4] for _ in range(6)]
-    world.reset(seed=7)
-    world.restore(state)
-    for before, after in zip(
-        first, [world.step([0.5, 0.1])[4] for _ in range(6)], strict=True
-    ):
-        assert np.array_equal(before["gps"], after["gps"])
-        assert np.array_equal(before["compass"], after["compass"])
-
-
 def test_errors_are_normal_with_the_given_deviations():
     sensors = PoseSensors(scenario(compass={"std": 0.05}, gps={"std": 0.5}))
     keys = np.random.default_rng(0).integers(0, 2**63, (4000, 2)).astype(np.uint64)

@@ -1,6 +1,4 @@
-import copy
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -169,22 +167,6 @@ def test_random_driving_never_gets_stuck():
         visited.add(tuple(np.floor(body.pose[:2]).astype(int).tolist()))
     assert longest_rest < 30
     assert len(visited) == 64  # every square metre of the arena
-
-
-@pytest.mark.parametrize(
-    "duplicate", [copy.deepcopy, lambda body: pickle.loads(pickle.dumps(body))]
-)
-def test_a_copy_continues_alike(duplicate):
-    rng = np.random.default_rng(3)
-    body = UnicycleBody(RADIUS, ARENA)
-    body.place((-3.0, 0.0, 0.3))
-    moves = rng.normal([0.3, 0.0], [0.4, 0.8], size=(200, 2)).tolist()
-    for move in moves:
-        body.drive(move)
-    twin = duplicate(body)
-    for move in moves:
-        assert body.drive(move) == twin.drive(move)
-        assert body.pose.tolist() == twin.pose.tolist()
 
 
 def test_reported_poses_are_copies():

@@ -56,10 +56,12 @@ def test_the_rest_of_a_killed_film_goes_and_that_of_another_film_stays(tmp_path)
 
 def test_gif_keeps_white_and_shows_colours_that_come_later(tmp_path):
     frames = [np.full((8, 8, 3), 255, np.uint8) for _ in range(2)]
-    frames[1][2:5, 2:5] = (213, 94, 0)
+    frames[0][7] = frames[1][7] = 255, 200, 0
+    frames[1][2:5, 2:5] = 213, 94, 0
     write_video(frames, tmp_path / "run.gif")
     (_, _), (last, _) = frames_of_gif(tmp_path / "run.gif")
     np.testing.assert_array_equal(last[0, 0], [255, 255, 255])
+    np.testing.assert_allclose(last[7, 0], [255, 200, 0], atol=8)
     np.testing.assert_allclose(last[3, 3], [213, 94, 0], atol=32)
 
 

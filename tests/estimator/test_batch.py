@@ -214,6 +214,11 @@ def test_a_scan_that_fails_leaves_the_belief_of_its_run(landmarks):
     assert_same_bits(batch.belief(0), before)
 
 
+def test_a_batch_has_a_thread_for_each_core_of_its_process(monkeypatch):
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {2, 5, 7}, raising=False)
+    assert make_batch("ekf", runs=1, landmarks=1, **NOISE)._threads == 3
+
+
 def test_settings_of_a_wrong_shape_and_those_that_a_batch_would_ignore_are_refused():
     with pytest.raises(ValueError, match="initial_poses must be finite with shape"):
         make_batch("ekf", runs=3, landmarks=1, initial_poses=np.zeros((2, 3)), **NOISE)

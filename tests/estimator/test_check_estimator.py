@@ -698,10 +698,13 @@ def test_an_estimator_is_found_by_its_import_path():
 
 def test_a_module_that_fails_at_its_import_is_named(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "fails_at_import.py").write_text("Mine = no_such_name")
-    complaint = "'fails_at_import:Mine', NameError: name 'no_such_name' is not defined"
-    with pytest.raises(ValueError, match=complaint):
-        make_estimator("fails_at_import:Mine", **NOISE)
+    for text, error in (
+        ("Mine = no_such_name", "NameError: name 'no_such_name' is not defined"),
+        ("import nowhere", "ModuleNotFoundError: No module named 'nowhere'"),
+    ):
+        (tmp_path / "fails_at_import.py").write_text(text)
+        with pytest.raises(ValueError, match=f"'fails_at_import:Mine', {error}$"):
+            make_estimator("fails_at_import:Mine", **NOISE)
 
 
 @pytest.mark.usefixtures("own_registry")

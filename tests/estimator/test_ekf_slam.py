@@ -227,9 +227,11 @@ def test_degenerate_innovation_names_the_landmark_and_changes_nothing():
     slam = EkfSlam((0, 0, 0), (0, 0))
     slam.update([(0.0, 2.0), (1.0, 2.0)], [4, 7])
     before = slam.belief()
-    with pytest.raises(np.linalg.LinAlgError, match="landmark 7"):
-        slam.update([(1.0, 2.0), (0.0, 2.0)], [7, 4])
-    assert_same_bits(before, slam.belief())
+    too_near = [(2.0, 1e-9)], [9]
+    for near, name in (([], []), too_near):
+        with pytest.raises(np.linalg.LinAlgError, match="landmark 7"):
+            slam.update([*near, (1.0, 2.0), (0.0, 2.0)], [*name, 7, 4])
+        assert_same_bits(before, slam.belief())
 
 
 @pytest.mark.parametrize(

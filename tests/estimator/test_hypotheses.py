@@ -354,6 +354,8 @@ def test_no_more_filters_are_made_than_hypotheses_are_allowed(slippery_drive):
     slam, _ = several_hypotheses(scans, world)
     allowed = slam.policy.hypotheses
     assert len(filters_of(slam)[0]) <= allowed + 1
+    slam.remove(slam.landmark_ids[:1])  # only the best one continues
+    assert len(slam.hypotheses) == 1
 
 
 def test_a_discarded_hypothesis_keeps_no_scans(slippery_drive):

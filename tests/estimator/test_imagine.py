@@ -1,6 +1,7 @@
 """Imagined beliefs against real filters that drive the same plans."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +17,7 @@ from slamgym.estimator import (
 )
 from slamgym.estimator.kernels.imagine import is_hidden
 from slamgym.estimator.models.bearing_range import predict_measurement
+from slamgym.estimator.models.sensors import BEARING_RANGE
 
 FAMILY = ("ekf", "invariant", "first_estimates", "observability_constrained")
 NOISE = {"motion_std": (0.05, 0.03, 0.03), "measurement_std": (0.02, 0.1)}
@@ -170,6 +172,13 @@ def test_new_landmarks_are_expected_where_a_plan_looks_first():
     found = imagine(slam, [ahead, turning], sight, density=(points, counts))
     np.testing.assert_allclose(found.new_landmarks[0, :, -1], [0.5, 0.2])
     assert found.new_landmarks[0, 1].tolist() == [0.0, 0.0, 0.2, 0.2]
+    narrow = replace(BEARING_RANGE, field_of_view=1.0)  # the filter's own
+    own = imagine(
+        make_estimator("ekf", **NOISE, sensor=narrow),
+        *([ahead, turning], sensor()),
+        density=(points, counts),
+    )
+    np.testing.assert_array_equal(own.new_landmarks, found.new_landmarks)
     sight.dropout = 0.1
     lossy = imagine(slam, [ahead, turning], sight, density=(points, counts))
     np.testing.assert_allclose(lossy.new_landmarks[0, 0, -1], 0.5 * (1 - 0.1**2))

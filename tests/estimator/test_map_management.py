@@ -682,6 +682,7 @@ def test_a_merged_landmark_answers_to_both_names():
     place = polar([(5, 1), (2, 2)])
     for _ in range(30):
         slam.update(place, [0, 1])
+    before = slam.snapshot()
     pairs = [pair for _ in range(30) for pair in slam.update(place, [8, 1]).merged_ids]
     assert pairs == [(0, 8)]
     assert slam.belief().landmark_ids == (0, 1)
@@ -689,8 +690,9 @@ def test_a_merged_landmark_answers_to_both_names():
     both = slam.update(np.vstack([place[:1], place[:1]]), [0, 8])
     assert both.associated_ids == (0,)
     assert both.ambiguous_rows == (1,)
-    slam.reset((0, 0, 0), (0, 0, 0))
-    assert slam.update(place[:1], [8]).added_ids == (8,)  # another run, other names
+    for back in (partial(slam.resume, before), partial(slam.reset, *np.zeros((2, 3)))):
+        back()
+        assert slam.update(place[:1], [8]).added_ids == (8,)  # other names
 
 
 def test_records_of_merged_landmarks_are_those_of_one_with_all_their_names():
@@ -852,6 +854,9 @@ def test_the_summary_counts_what_was_done_to_the_map():
     assert summary["map_changes"]["removed"] == 2
     assert summary["map_changes"]["most"] == 6
     assert len(summary["landmarks"]) == 4
+    few = hidden_settings(management={**TIDY, "confirm": (1, 1), "capacity": 3})
+    found = replay(hidden_log(), few.make((0, 0, 0))).changes
+    assert found.most == found.confirmed - found.removed == 3
 
 
 def test_own_identities_are_scored_by_the_nearest_truth():

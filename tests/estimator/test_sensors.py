@@ -525,6 +525,9 @@ def drive_past(
         report = slam.update(
             reading(sensor, pose, landmarks, rng, noise), range(len(landmarks))
         )
+        own = report.added_ids[-1:] * (not slam.sensor.places)
+        first = [3 + 2 * slam.map.slots[i] for i in own]
+        assert (slam.map.reference[first] == slam.map.mean[first]).all()
     return pose, report
 
 

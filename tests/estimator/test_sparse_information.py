@@ -314,6 +314,12 @@ def test_marginals_are_blocks_of_the_dense_inverse():
     np.testing.assert_array_equal(whole.landmarks, slam.landmarks)
 
 
+def test_a_view_ends_ten_deviations_beyond_its_distance():
+    slam = SparseInformationSlam(*NOISE, initial_pose_std=(0.3, 0.3, 0.0))
+    slam.update([(0.0, r) for r in range(1, 12)], range(11))
+    assert slam.local_view(2.0).ids == (0, 1, 2, 3, 4, 5)  # up to 6.2 m
+
+
 def test_a_map_of_separate_parts_can_be_asked_for_any_part():
     """Scans of new landmarks alone leave the local map without a link to the rest."""
     slam, rng = sparse(*NOISE), np.random.default_rng(0)

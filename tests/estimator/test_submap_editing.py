@@ -614,9 +614,11 @@ def test_editing_writes_no_submap_again(tmp_path):
 
 def test_reset_forgets_all_edits():
     slam = edited_run(made(submap_size=9), list(laps(75)))
+    slam.local_view(5.0)
     slam.reset(START, (0, 0, 0))
     fresh = made(submap_size=9)
     for each in (slam, fresh):
+        assert not each.local_view(5.0).ids
         edited_run(each, list(laps(75)))
     assert state_of(slam) == state_of(fresh)
 

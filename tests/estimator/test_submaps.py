@@ -301,6 +301,10 @@ def test_a_whole_map_is_the_same_however_often_it_is_asked_for():
     for _ in range(3):
         assert_same_bits(slam.belief(), first)
     assert before < asked_once < slam.nbytes  # it keeps what is asked for again
+    other = run(made(submap_size=15), laps(90, landmarks=spread, reach=5.0))
+    for each in (slam, other):
+        each.join()
+    assert_same_bits(slam.belief(), other.belief())
 
 
 @pytest.mark.parametrize("base", ["ekf", "invariant"])

@@ -8,6 +8,7 @@ from scipy import stats
 from slamgym.evaluation.noise_findings import (
     CHANNELS,
     HEAVY_TAILS,
+    MOMENTS,
     _growth,
     _size_beside_tails,
     _spread_of_variance,
@@ -161,17 +162,19 @@ def test_a_bias_of_the_sensor_is_that_of_its_readings():
     readings = np.zeros((1, 2, 3, 2))
     readings[..., 0] = [0.0, np.pi / 2, np.pi]
     readings[..., 1] = [4.0, 3.0, 2.0]
+    seen = np.array([[[True, False, True], [False, True, True]]])
     sums = noise_sums(
         poses,
         points,
         np.zeros((1, 2, 2)),
         readings + np.array([0.02, 0.3]),
-        np.ones((1, 2, 3), dtype=bool),
+        seen,
         motion_std=(0.1, 0.1, 0.1),
         measurement_std=(0.05, 0.4),
     )
     slope, leverage = sums[0, 3:, 5:7].T
     assert slope / leverage == pytest.approx([0.02, 0.3])
+    assert sums[0, 3:, MOMENTS.index("pairs")].tolist() == [1, 1]  # of one landmark
 
 
 def test_noise_where_none_is_assumed_counts_in_units_of_a_millionth():

@@ -152,6 +152,10 @@ def test_a_run_without_identities_prints_and_saves_its_scores(here, without_pict
     assert scores["resolution"] == 0.5
     assert f"{scores['correct']} correct, {scores['wrong']} wrong" in text
     assert "GOSPA of the map" in text
+    of = {"distance": 1.5, "missed_count": 3, "false_count": 2, "localisation": 0.25}
+    gospa = {"raw": of, "aligned": of, "cutoff": 1.0}
+    *_, cell = tables.association_table(scores | {"gospa": gospa}).columns[1].cells
+    assert cell == "1.5 m: 3 missed, 2 false, localisation 0.5 m; cut-off 1 m"
     again = answered("replay", "out/log.csv", *drive[3:7], "--out", "again")
     assert again["association"]["correct"] > 0.9 * scores["correct"]
 
@@ -1051,6 +1055,12 @@ def test_the_comparison_of_many_filters_cuts_no_number_at_80_columns():
     assert "…" not in shown
     assert shown.count("7.16e+04") == 11
     assert shown.count("0.00123") == 22
+
+
+def test_written_files_are_listed_in_order_before_folders_of_pictures():
+    files = ["b/2.png", "z.csv", "b/1.png", "a/1.png", "c.json"]
+    shown = tables.written("out", files).plain.replace("\N{NO-BREAK SPACE}", " ")
+    assert shown == "Wrote out/\n  c.json, z.csv, a/ (1 pictures), b/ (2 pictures)"
 
 
 def test_skipped_readings_are_explained():

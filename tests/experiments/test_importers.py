@@ -37,7 +37,7 @@ UTIAS = {
     "Robot3_Measurement.dat": (
         f"# comment\n{EPOCH - 1:.3f} 63 1 0\n{EPOCH + 0.25:.3f} 63 7.05 -0.036\n"
         f"{EPOCH + 0.25:.3f} 41 2 0\n{EPOCH + 0.25:.3f} 81 7.2 4\n"
-        f"{EPOCH + 0.3:.3f} 99 1 0\n{EPOCH + 9:.3f} 63 1 0\n"
+        f"{EPOCH + 0.3:.3f} 99 1 0\n{EPOCH + 0.3:.3f} 41 3 0\n{EPOCH + 9:.3f} 63 1 0\n"
     ),
     "Robot3_Groundtruth.dat": f"{EPOCH - 0.2:.3f} 1 2 3\n{EPOCH + 0.8:.3f} 2 2 -3\n",
 }
@@ -682,7 +682,7 @@ def test_utias_readings_at_the_first_odometry_are_kept(utias):
 
 def test_utias_counts_what_it_leaves_out(utias):
     assert read_log(utias).header["left_out"] == (
-        "1 readings of robots, 1 of unknown barcodes, "
+        "2 readings of robots, 1 of unknown barcodes, "
         "2 outside the time of the odometry"
     )
 
@@ -739,8 +739,8 @@ def test_missing_utias_file_is_named(utias, name):
          "line 6: expected t >= 1248444187.95, the time"),
         ("Robot3_Odometry.dat", "1 0", "line 6: expected t v ω, got 2 fields"),
         ("Robot3_Measurement.dat", f"{EPOCH + 0.1} 63 1 0",
-         "line 8: expected t >= 1248444196.5, the"),
-        ("Robot3_Measurement.dat", f"{EPOCH + 10} code 1 0", "line 8: expected an id"),
+         "line 9: expected t >= 1248444196.5, the"),
+        ("Robot3_Measurement.dat", f"{EPOCH + 10} code 1 0", "line 9: expected an id"),
         ("Barcodes.dat", "8 x", "line 5: expected an id"),
         ("Landmark_Groundtruth.dat", "8 1 2", "line 4: expected subject x y σx σy"),
         ("Robot3_Groundtruth.dat", "2e9 2 3 nan", "line 3: expected a finite number"),

@@ -670,8 +670,8 @@ BAD_TRUTH = {
         "line 2: expected a time stamp after 0, got 0; write all digits",
     ),
     "rows not in order": (
-        lambda rows: rows[[*range(7), 9, 8, 7, *range(10, 30)]],
-        "line 9: expected a time stamp after 0.90000000000000002, got "
+        lambda rows: rows[[0, *range(7), 9, 8, 7, *range(10, 30)]],
+        "line 10: expected a time stamp after 0.90000000000000002, got "
         "0.80000000000000004; sort the rows by time",
     ),
     "another clock": (

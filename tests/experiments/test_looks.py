@@ -9,6 +9,7 @@ from monte_carlo_dataset import simulated
 from scipy import stats
 
 from slamgym.evaluation.hypothesis_tests import EQUIVALENCE_MARGIN
+from slamgym.evaluation.sequential_tests import ConfidenceSequence
 from slamgym.experiments.monte_carlo_study import (
     load_results,
     monte_carlo,
@@ -18,6 +19,7 @@ from slamgym.experiments.monte_carlo_study import (
 from slamgym.experiments.monte_carlo_study.looks import (
     Look,
     Watch,
+    _Shown,
     error_rate_after,
     verdict_of,
     watched,
@@ -304,6 +306,8 @@ def test_a_filter_with_a_wrong_map_is_rejected_within_few_runs(
     entry = summarise_monte_carlo(found)["estimators"][label]
     assert entry["verdict"] == "not consistent"
     assert entry["sequential"]["map_e_value"] > 200
+    of_all = entry["sequential"]["e_value"]
+    assert name == "Scaled" or of_all < entry["sequential"]["map_e_value"] / 5
     assert "an anytime-valid test rejects the map: " in entry["sentence"]
     assert entry["diagnosis"]["cause"] == "map"
     assert not entry["accepted"]
@@ -411,8 +415,15 @@ def test_failed_runs_forbid_consistency_at_later_looks_too():
     assert found.reason.startswith("1 of 200 runs failed; of the others, after ")
 
 
-def test_the_interval_in_the_sentence_is_inside_the_margin_if_it_says_so():
-    found = verdict(honest(np.random.default_rng(9), 300), (40, ""))
-    low, high = map(float, found.reason.split("[")[1].split("]")[0].split(","))
-    assert EQUIVALENCE_MARGIN.low <= low < high <= EQUIVALENCE_MARGIN.high
-    assert "lies inside" in found.reason
+def test_the_interval_in_the_sentence_is_the_first_inside_the_margin_else_the_last():
+    nees, shown = honest(np.random.default_rng(9), 300), _Shown()
+    ratios = nees.mean(axis=1) / 3
+    low, high = ConfidenceSequence().update(ratios)
+    least, most = EQUIVALENCE_MARGIN
+    first = int(((least <= low) & (high <= most)).argmax())
+    for runs in np.array_split(np.arange(300), 9):
+        shown.update(ratios[runs], runs + 1)
+        at = min(first, runs[-1])
+        assert shown.interval == (low[at], high[at])
+        assert shown.after == (None if at < first else first + 1)
+    assert f"{shown.text()}, lies inside" in verdict(nees, (40, "")).reason

@@ -240,7 +240,7 @@ def test_what_was_changed_since_is_set_aside_and_not_lost(fresh, tmp_path, whole
         if times == 2:
             (tmp_path / "results.nc").write_text("mine again")
         with (
-            pytest.warns(UserWarning, match=r"is moved to r.*\.aside"),
+            pytest.warns(UserWarning, match=rf"to r\S*\.aside{'2' * (times - 1)}$"),
             monte_carlo(**JOB, runs=RUNS, out=tmp_path, fresh=fresh) as anew,
         ):
             xr.testing.assert_equal(anew.load(), whole)

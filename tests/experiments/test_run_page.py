@@ -113,7 +113,8 @@ def test_codes_of_positions_and_deviations_are_fine_enough():
     np.testing.assert_allclose(position_codes(x) / 1e4, x, atol=5.1e-5)
     std = np.array([1e-6, 0.1, 30.0])
     np.testing.assert_allclose(np.exp(deviation_codes(std) / 2000), std, rtol=3e-4)
-    assert position_codes(np.array([np.nan, np.inf])).tolist() == [-(2**31), 2**31 - 1]
+    extremes = position_codes(np.array([np.nan, -np.inf, -3e5, np.inf]))
+    assert extremes.tolist() == [-(2**31), *[1 - 2**31] * 2, 2**31 - 1]
     assert deviation_codes(np.array([np.nan, 0.0])).tolist() == [-(2**15)] * 2
 
 
@@ -154,13 +155,16 @@ def test_the_page_holds_nees_and_nis_by_their_degrees(page, viewed):
 
 
 def test_the_page_holds_the_readings_of_every_step(page, loop):
-    _, arrays = arrays_of(page)
-    scans = {event.t: event for event in loop.events if isinstance(event, Scan)}
-    for step in range(61):
+    assert_readings(arrays_of(page)[1], loop)
+
+
+def assert_readings(arrays, log):
+    scans = {event.t: event for event in log.events if isinstance(event, Scan)}
+    for place, step in enumerate(arrays["step"]):
         scan = scans.get(step)
         expected = np.empty((0, 2)) if scan is None else scan.measurements
         bearings, ranges = (
-            arrays[f"reading.{name}"][step] / 1e4 for name in ("bearing", "range")
+            arrays[f"reading.{name}"][place] / 1e4 for name in ("bearing", "range")
         )
         found = np.column_stack([bearings, ranges])
         np.testing.assert_allclose(found, expected, atol=1e-4)
@@ -286,6 +290,7 @@ def test_a_long_run_shows_every_second_step_and_says_so(monkeypatch, loop, tmp_p
     _, arrays = arrays_of(page)
     assert arrays["step"].tolist() == list(range(0, 61, 2))
     assert len(arrays["0.id"]) == 31
+    assert_readings(arrays, loop)
 
 
 def test_correlations_are_thinned_alone(monkeypatch, loop, tmp_path):

@@ -345,7 +345,7 @@ def turning(seed):
     return drives("loop", "open_loop", seeds=(seed,), **TURNING)[0]
 
 
-def test_a_graph_begins_where_an_invariant_filter_is():
+def test_a_graph_begins_where_an_invariant_filter_is(tmp_path):
     (drive,) = drives("loop", steps=40, seeds=(3,), motion={"noise_at_rest": True})
     poses, landmarks = filtered_path(drive)
     run = replay(to_slamlog(drive), "invariant")
@@ -355,6 +355,11 @@ def test_a_graph_begins_where_an_invariant_filter_is():
     for landmark, place in landmarks.items():
         at = run.belief.landmarks[run.belief.landmark_ids.index(landmark)]
         np.testing.assert_allclose(place, at, atol=1e-12)
+    fmt("g2o").write([drive], tmp_path / "shard")
+    lines = (tmp_path / "shard/seed_00000003.g2o").read_text().splitlines()
+    rows = [line.split()[1:] for line in lines if line.startswith("VERTEX_XY")]
+    written = {int(i): [float(x), float(y)] for i, x, y in rows}
+    assert written == {i: place.tolist() for i, place in landmarks.items()}
 
 
 @pytest.mark.parametrize("end", ["", "_gtsam"])

@@ -13,6 +13,7 @@ from slamgym.sim_configs import (
     load_scenario,
 )
 from slamgym.sim_configs.landmarks_and_controls import (
+    BlocksSequence,
     CircleSequence,
     CommandSequence,
     FigureEightSequence,
@@ -68,6 +69,7 @@ def test_no_step_is_longer_than_the_speed_allows(length, speed, dt):
         SquareSequence(side=length, speed=speed, turn_steps=2),
         CircleSequence(radius=length, speed=speed),
         FigureEightSequence(radius=length, speed=speed),
+        BlocksSequence(columns=2, rows=2, side=length, speed=speed, turn_steps=2),
     ):
         assert controls.cycle(dt)[:, 0].max() <= speed * dt * (1 + 1e-9)
 
@@ -130,6 +132,8 @@ def test_a_spiral_inwards_is_refused():
     [
         {"commands": [[0.0, 0.0, 10**12]]},
         {"sequence": "circle", "radius": 1e9, "speed": 1e-3},
+        {"sequence": "blocks", "columns": 10**9, "rows": 2, "side": 1.0, "speed": 0.1,
+         "turn_steps": 2},
         {"sequence": "square", "side": 1.0, "speed": 0.1, "turn_steps": 10**12},
         {"sequence": "spiral", "inner_radius": 1.0, "outer_radius": 2.0,
          "turns": 1e9, "speed": 0.5},

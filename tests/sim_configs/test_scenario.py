@@ -187,6 +187,9 @@ NO_CLUTTER = "sensor.clutter must be 0 unless"
     [
         ({"landmarks": {"layout": "ring", "count": 3}},
          "landmarks.radius must be given"),
+        ({"landmarks": {"layout": "streets", "columns": 3, "rows": 2, "side": 9.0,
+                        "width": 9.0, "per_front": 2}},
+         r"landmarks\.width must be < side = 9\.0"),
         ({"landmarks": {"layout": "rnig"}},
          r"landmarks.layout must .*got 'rnig'; did you mean 'ring'\?$"),
         ({"controls": {"sequence": "spirral"}},
