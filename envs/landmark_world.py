@@ -130,6 +130,7 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         *("sensor.kind", "sensor.identities", "sensor.max_clutter"),
     )
     _spec: EnvSpec | None = None
+    _key: WordArray
 
     def __init__(
         self,
@@ -153,7 +154,6 @@ class LandmarkWorldEnv(Restorable, gymnasium.Env[Observation, AnyArray]):
         self._drive = drive_of(robot)
         self._body = UnicycleBody(robot.radius, self.scenario.walls, self._drive)
         self._pose_sensors = PoseSensors(self.scenario)
-        self._key: WordArray = np.zeros((1, 2), dtype=np.uint64)
         self._hides_identities = not self.scenario.sensor.identities
         self._landmarks: ComplexArray = np.empty(0, dtype=np.complex128)
         self._drawn_scenario = self.scenario

@@ -232,10 +232,10 @@ class PoseSensors:
     def __init__(self, scenario: Scenario) -> None:
         gps, compass = scenario.gps, scenario.compass
         sensors = gps, gps, compass
-        self.present = gps is not None or compass is not None
         #: (σx, σy, σθ) [m, m, rad]; 0 where there is no sensor.
         self.std = np.array([0.0 if each is None else each.std for each in sensors])
         self._every = np.array([0 if each is None else each.every for each in sensors])
+        self.present = bool(self._every.any())
 
     def read(self, keys: WordArray, steps: IntArray, poses: Array) -> Array:
         """Return readings (x, y, θ), shape (K, 3), nan where there is none.

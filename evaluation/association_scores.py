@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..argument_checks import as_floats
-from ..arrays import AnyArray, Array
+from ..arrays import SMALLEST, AnyArray, Array
 from ..estimator.interface import ScanDecisions
 from ..estimator.models.rigid_motion import rotation
 from ..estimator.models.sensors import Sensor, find_sensor
@@ -182,14 +182,14 @@ def oracle_errors(
         if not len(z) or not np.isfinite(pose).all():
             continue
         x, y = ((true - pose[:2]) @ rotation(pose[2])).T
-        distance = np.maximum(np.hypot(x, y), 1e-12)
-        stds = np.maximum(read.stds(measurement_std, distance), 1e-12)
+        distance = np.maximum(np.hypot(x, y), SMALLEST)
+        stds = np.maximum(read.stds(measurement_std, distance), SMALLEST)
         with np.errstate(divide="ignore", invalid="ignore"):  # slopes at the landmark
             apart = read.difference(z[:, None], read.read(x, y))
         squared = ((apart / stds) ** 2).sum(axis=2)
         right = [_place(places, i) for i in of.tolist()]
         wrong += int((groups[squared.argmin(axis=1)] != right).sum())
-        count += len(z)
+        count += len(right)
     return _share(wrong, count)
 
 
@@ -254,7 +254,7 @@ def places_of(
     if resolution == 0:
         pairs = pairs[:0]
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(ids), len(ids)))
-    _, group = connected_components(graph, directed=False)
+    _, group = connected_components(graph)
     least = {g: int(ids[group == g].min()) for g in set(group.tolist())}
     return {int(i): least[g] for i, g in zip(ids, group.tolist(), strict=True)}
 

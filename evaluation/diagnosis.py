@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 from scipy.special import bdtrc, chdtri, stdtr, stdtrit
 
 from .. import argument_checks
-from ..arrays import Array, BoolArray
+from ..arrays import SMALLEST, Array, BoolArray
 from ..suggestions import counted
 from . import noise_findings
 from .hypothesis_tests import time_average_test
@@ -161,8 +161,8 @@ def diagnose(
     'motion noise too small'
     """
     pose, heading = _checked(nees, heading_nees)
-    sums = None if noise is None else _checked_sums(noise, len(pose))
     runs = len(pose)
+    sums = None if noise is None else _checked_sums(noise, runs)
     if runs < FEWEST_RUNS:
         good = f"{counted(runs, 'run')} succeeded"
         text = f"cannot tell: {good}, and {FEWEST_RUNS} are needed."
@@ -182,8 +182,9 @@ def diagnose(
     )
     spurious = spurious_knowledge(knowledge) if knowledge.size else None
     p_value = smallest_adjusted(errors, spurious, blame)
+    nis = nis_ratio or 0.0
     if p_value >= FILTER_RATE and not rejected:
-        return _of_consistent_errors(before, p_value, nis_ratio or 0.0)
+        return _of_consistent_errors(before, p_value, nis)
     if _is_of_the_association(blame, errors):
         return _of_the_association(before, blame, errors)
     claims = _spurious_text(knowledge, spurious)
@@ -195,32 +196,28 @@ def diagnose(
         text = f"{before}{why}, although on average {errors.text}"
         sentence = f"cannot tell: {text} ({p_text(errors.p_of_one)})."
         return Diagnosis(CANNOT_TELL, p_value, sentence, others)
-    cause, text, repeat = _of_less_noise(pose, heading, small_noise, nis_ratio, most)
+    cause, text, repeat = _of_less_noise(pose, heading, small_noise, nis, most)
     if cause == WRONG_COVARIANCE and p_value >= FILTER_RATE:
         # The repeated runs have the same random numbers: what is chance stays, too.
         cause, text = CANNOT_TELL, f"{text} It may be chance: try another seed."
-    what = f"{before}{errors.text} ({p_text(shown)}){_also(claims, nis_ratio)}"
+    what = f"{before}{errors.text} ({p_text(shown)}){_also(claims, nis)}"
     return Diagnosis(cause, shown, f"{cause}: {what}. {text}", others, repeat)
 
 
 def _of_less_noise(
-    pose: Array,
-    heading: Array,
-    small: SmallNoise | None,
-    nis_ratio: float | None,
-    most: float,
+    pose: Array, heading: Array, small: SmallNoise | None, nis_ratio: float, most: float
 ) -> tuple[str, str, int]:
     """Return what runs with less noise show, and how many to repeat with still less."""
     cause, text = CANNOT_TELL, _WITHOUT_SMALL_NOISE
     if small is not None:
-        cause, text = excess_of(pose, heading, small, nis_ratio or 0.0, most)
+        cause, text = excess_of(pose, heading, small, nis_ratio, most)
     return cause, text, runs_to_repeat(pose, heading, small, cause)
 
 
-def _also(claims: str, nis_ratio: float | None) -> str:
+def _also(claims: str, nis_ratio: float) -> str:
     """Write what else is wrong with a filter."""
     text = f"; {claims}" if claims else ""
-    if nis_ratio is not None and nis_ratio > LARGEST_NIS:
+    if nis_ratio > LARGEST_NIS:
         text += f"; the squared innovations are {nis_ratio:.3g} times too large"
     return text
 
@@ -446,9 +443,10 @@ def errors_of(pose: Array, heading: Array) -> Errors:
     """
     scores = [pose / POSE] + [heading] * bool(heading.size)
     averages = [score.mean(axis=1) for score in scores]
-    diverged = int(diverged_runs(pose).sum())
+    lost = diverged_runs(pose)
+    diverged = int(lost.sum())
     p_values = [_beyond_margin(average) for average in averages]
-    p_values.append(float(bdtrc(diverged - 1, len(pose), DIVERGED_RATE)))
+    p_values.append(float(bdtrc(diverged - 1, len(lost), DIVERGED_RATE)))
     ratios = [float(average.mean()) for average in averages]
     ratio = max(ratios, key=lambda x: abs(np.log(x)))
     of = ("pose", "heading")[ratios.index(ratio)]
@@ -488,7 +486,8 @@ def runs_to_repeat(
     """
     if small is not None and cause == LINEARISATION:
         return 0
-    score, few = _averages(pose, heading), max(10, len(pose) // 10)
+    score = _averages(pose, heading)
+    few = max(10, len(score) // 10)
     diverged = np.flatnonzero(diverged_runs(pose))
     if np.median(score) > _CLEARLY:
         needed = few
@@ -502,32 +501,32 @@ def runs_to_repeat(
             return 0
         needed = max(needed, _runs_to_show(pose, heading, small))
         known = int(np.isfinite(np.asarray(small.nees, float)).sum())
-        if small.factor <= SMALLEST_NOISE and min(needed, len(pose)) <= known:
+        if small.factor <= SMALLEST_NOISE and min(needed, len(score)) <= known:
             return 0
-    return min(max(needed, few), len(pose))
+    return min(max(needed, few), len(score))
 
 
 def _runs_to_show(pose: Array, heading: Array, small: SmallNoise) -> int:
     """Return how many runs show in 90 % of cases that an excess vanishes."""
     needed = 0.0
     for _, before, after in _pairs(pose, heading, small):
-        left, known = _left(float(before.mean())), after[np.isfinite(after)]
-        if len(known) >= _FEWEST_OF_A_KIND and abs(np.median(known) - 1) < 1:
+        left, known = _left(before), after[np.isfinite(after)]
+        if len(known) >= _FEWEST_OF_A_KIND and np.median(known) < _CLEARLY:
             needed = max(needed, (3.0 * float(known.std()) / left) ** 2)
     return math.ceil(needed)
 
 
 def _left(ratio: float) -> float:
     """Return the largest excess that counts as none, after a ratio with all noise."""
-    return float(np.clip(_LEFT * abs(ratio - 1), _LEAST_LEFT, _MOST_LEFT))
+    return float(np.clip(_LEFT * (ratio - 1), _LEAST_LEFT, _MOST_LEFT))
 
 
 def excess_of(
     pose: Array,
     heading: Array,
     small: SmallNoise,
-    nis_ratio: float = 0.0,
-    of_the_noise: float = 1.0,
+    nis_ratio: float,
+    of_the_noise: float,
 ) -> tuple[str, str]:
     """Compare the errors of the same runs with much and with little noise.
 
@@ -565,7 +564,7 @@ def excess_of(
     is_known = np.isfinite(after[errors.of])
     if is_known.sum() < _FEWEST_OF_A_KIND:
         return CANNOT_TELL, "Too few runs succeed with less noise."
-    sign = 1.0 if errors.ratio > 1 else -1.0
+    sign = float(np.sign(errors.ratio - 1))
     rest = _rest_of(after, is_known, errors.of, sign)
     found = rest.text(small.factor, of_the_noise)
     many, factor = _averages(pose, heading), small.factor
@@ -585,8 +584,7 @@ def excess_of(
             f"{found}, so {left}: a Jacobian or a covariance of the filter is wrong."
         )
     is_small = all(
-        _is_small(float(before.mean()), after[name][rest.kept], sign)
-        for name, before, _ in pairs
+        _is_small(before, after[name][rest.kept], sign) for name, before, _ in pairs
     )
     if of_all != "shrinks" or rest.remains or not is_small:
         return CANNOT_TELL, f"{found}, which does not show the cause."
@@ -663,13 +661,12 @@ def _rest_of(
     few_lost = lost.sum() <= _FEW_LOST * is_known.sum()
     kept = is_known & ~lost if few_lost else is_known
     off = {
-        name: abs(math.log(max(float(values[kept].mean()), 1e-300)))
+        name: abs(math.log(max(float(values[kept].mean()), SMALLEST)))
         for name, values in after.items()
         if (values[kept].mean() - 1) * sign > 0
         and _beyond_margin(values[kept]) < _ERROR_RATE / len(after)
     }
-    many_lost = bdtrc(lost.sum() - 1, is_known.sum(), DIVERGED_RATE) < _ERROR_RATE
-    remains = bool(off) or (sign > 0 and not few_lost and bool(many_lost))
+    remains = bool(off) or bool(sign > 0 and not few_lost)
     of = max(off, key=lambda name: off[name], default=of)
     ratio, interval = float(after[of][kept].mean()), _interval(after[of][kept])
     return _Rest(of, ratio, *interval, remains, kept, int(lost.sum()), bool(few_lost))
@@ -689,12 +686,12 @@ def _averages_of(small: SmallNoise) -> dict[str, Array]:
 
 def _pairs(
     pose: Array, heading: Array, small: SmallNoise
-) -> list[tuple[str, Array, Array]]:
-    """Return name, NEES per degree of each run, and the same with less noise."""
+) -> list[tuple[str, float, Array]]:
+    """Return name, NEES per degree, and that of each run with less noise."""
     after = _averages_of(small)
-    found = [("pose", pose.mean(axis=1) / POSE, after["pose"])]
+    found = [("pose", float(pose.mean()) / POSE, after["pose"])]
     if heading.size and np.isfinite(after["heading"]).any():
-        found.append(("heading", heading.mean(axis=1), after["heading"]))
+        found.append(("heading", float(heading.mean()), after["heading"]))
     return found
 
 
@@ -717,10 +714,10 @@ def _change(
     """Return whether the excess "grows", "shrinks" or "stays", else ""."""
     known = np.isfinite(many) & np.isfinite(few)
     many, few, diverged = many[known], few[known], diverged[known]
-    if len(few) < _FEWEST_OF_A_KIND:
+    if known.sum() < _FEWEST_OF_A_KIND:
         return ""
     before, after = sign * (many - 1), sign * (few - 1)
-    chosen = np.ones(len(few), np.bool_)
+    chosen = np.ones_like(diverged)
     if np.median(many) <= _CLEARLY and diverged.sum() >= _FEWEST_DIVERGED:
         chosen = diverged
     if np.median(many[chosen]) > _CLEARLY:
@@ -748,13 +745,13 @@ def _averages(pose: Array, heading: Array) -> Array:
 
 def _is_positive(values: Array) -> bool:
     spread = values.std(ddof=1) / np.sqrt(len(values))
-    return bool(stdtr(len(values) - 1, -values.mean() / max(spread, 1e-300)) < 0.05)
+    return bool(stdtr(len(values) - 1, -values.mean() / max(spread, SMALLEST)) < 0.05)
 
 
 def spurious_knowledge(knowledge: Array) -> float:
     """Return the p-value of a variance that some filter can reach, from claims (M,)."""
     error = knowledge.std(ddof=1) / np.sqrt(len(knowledge))
-    score = (knowledge.mean() - KNOWABLE) / max(error, 1e-12)
+    score = (knowledge.mean() - KNOWABLE) / max(error, SMALLEST)
     return float(stdtr(len(knowledge) - 1, score))
 
 
@@ -791,7 +788,7 @@ def blame_association(pose: Array, mistakes: Array, known: Array | None) -> Blam
 
         larger = float(wilcoxon(excess, alternative="greater").pvalue)
     more_diverged = int(diverged.sum()) - int(diverged_runs(known).sum())
-    more = float(bdtrc(more_diverged - 1, len(pose), DIVERGED_RATE))
+    more = float(bdtrc(more_diverged - 1, len(excess), DIVERGED_RATE))
     text = f"its NEES would be {ratio:.3g} per degree with known identities"
     return Blame(min(1.0, 2 * min(larger, more)), share, text, is_paired=True)
 

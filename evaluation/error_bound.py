@@ -126,12 +126,10 @@ def posterior_bound(
     )
     position, heading, raw = (np.full((count, steps), np.nan) for _ in range(3))
     spread, covariances = np.full(count, np.nan), list[Array]()
-    if read not in (BEARING_RANGE, POSITION):
-        return PosteriorBound(position, heading, raw, spread, origin=origin)
     slam = EkfSlam(*stds, sensor=read, min_range=SMALLEST)
     durations = np.broadcast_to(np.asarray(dt, dtype=np.float64), (count, steps))
     fixes = np.broadcast_to(np.asarray(pose_std, dtype=np.float64), poses.shape)
-    for some in _pieces(seen):
+    for some in _pieces(seen) if read in (BEARING_RANGE, POSITION) else ():
         part = _Drives(
             poses[some], places[some], seen[some], durations[some], fixes[some]
         )
@@ -171,11 +169,11 @@ def efficiency(bound: Array, squared_error: Array) -> Efficiency:
     if not found.mean() > 0:
         return Efficiency(np.nan, (np.nan, np.nan))
     value = float(least.mean() / found.mean())
-    if len(found) < 2:
-        return Efficiency(value, (np.nan, np.nan))
     residual = (least - value * found) / found.mean()
-    reach = float(stdtrit(len(found) - 1, 0.975) * residual.std(ddof=1))
-    reach = reach / len(found) ** 0.5
+    runs = len(residual)
+    if runs < 2:
+        return Efficiency(value, (np.nan, np.nan))
+    reach = float(stdtrit(runs - 1, 0.975) * residual.std(ddof=1)) / runs**0.5
     return Efficiency(value, (value - reach, value + reach))
 
 
@@ -253,10 +251,11 @@ def _pose_covariances(batch: BatchSlam, drives: _Drives, sensor: Sensor) -> Arra
     """Take a batch through exact drives, in pieces that end where poses are read."""
     poses, _, visible, dt, pose_std = drives
     moved, z = _displacements(poses), _readings(drives, sensor)
-    dt = np.where(np.arange(dt.shape[1]) > 0, dt, 0.0)
+    dt = np.array(dt)
+    dt[:, :1] = 0.0
     P, begin = np.empty((*dt.shape, 3, 3)), 0
     due = np.flatnonzero(np.isfinite(pose_std).any(axis=(0, 2)))
-    for end in sorted({*(due + 1).tolist(), dt.shape[1]}):
+    for end in sorted({*(due + 1).tolist(), P.shape[1]}):
         part = np.s_[:, begin:end]
         P[part] = batch.run(
             moved[part], z[part], visible[part], dt[part]
@@ -274,7 +273,7 @@ def _pose_covariances(batch: BatchSlam, drives: _Drives, sensor: Sensor) -> Arra
 def _displacements(poses: Array) -> Array:
     """Return the motion before each pose in the frame of the robot, (B, T, 3)."""
     step, heading = np.diff(poses, axis=1, prepend=poses[:, :1]), poses[:, :-1, 2]
-    dx, dy = step[:, 1:, 0].copy(), step[:, 1:, 1].copy()
+    dx, dy = step[:, 1:, 0], step[:, 1:, 1]
     cos, sin = np.cos(heading), np.sin(heading)
     step[:, 1:, 0], step[:, 1:, 1] = cos * dx + sin * dy, cos * dy - sin * dx
     return step

@@ -75,7 +75,7 @@ def whitened(errors: Array, covariances: Array) -> Array:
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         scaled = errors / std
         correlations = covariances / std[..., :, None] / std[..., None, :]
-        whiten = _whiten_few if errors.shape[-1] <= _FEW else _whiten_each
+        whiten = _whiten_few if std.shape[-1] <= _FEW else _whiten_each
         return whiten(scaled, correlations)
 
 
@@ -278,21 +278,21 @@ def _whiten_few(errors: Array, correlations: Array) -> Array:
     """Solve L w = e, C = L Lᵀ, entry by entry over all leading axes at once.
 
     Each entry costs a few operations on whole arrays.  The result for one covariance
-    does not depend on the others, to the bit.
+    does not depend on the others, to the bit.  The arguments are overwritten.
     """
-    n = errors.shape[-1]
-    white = np.empty(errors.shape)
+    white: Array = np.empty(errors.shape)
+    n = white.shape[-1]
     factor = np.empty(correlations.shape)
     for j in range(n):
-        left = correlations[..., j, j].copy()
-        rest = errors[..., j].copy()
+        left = correlations[..., j, j]
+        rest = errors[..., j]
         for k in range(j):
             left -= factor[..., j, k] ** 2
             rest -= factor[..., j, k] * white[..., k]
         pivot = np.sqrt(np.where(left > SINGULAR, left, np.nan))
         white[..., j] = rest / pivot
         for i in range(j + 1, n):
-            entry = correlations[..., i, j].copy()
+            entry = correlations[..., i, j]
             for k in range(j):
                 entry -= factor[..., i, k] * factor[..., j, k]
             factor[..., i, j] = entry / pivot
@@ -304,11 +304,9 @@ def _whiten_each(errors: Array, correlations: Array) -> Array:
     from scipy.linalg.lapack import dpotrf, dtrtrs  # noqa: PLC0415 (slow to import)
 
     n = errors.shape[-1]
-    white = np.full((errors[..., 0].size, n), np.nan)
-    pivots = np.full(white.shape, np.nan)
     e, C = errors.reshape(-1, n), correlations.reshape(-1, n, n)
-    finite = np.isfinite(C).all(axis=(1, 2)) & np.isfinite(e).all(axis=1)
-    for index in np.flatnonzero(finite).tolist():
+    white, pivots = np.full((2, *e.shape), np.nan)
+    for index in range(len(white)):
         factor, failed = dpotrf(C[index], lower=1)
         if not failed:
             pivots[index] = factor.diagonal()
@@ -348,12 +346,12 @@ def without_rounding(covariances: Array) -> Array:
     1e-18 times the variance of x, in any direction.  Therefore, the smallest variance
     of the position given the heading decides.
     """
-    P = covariances[..., :3, :3]
-    heading = P[..., 2, 2]
+    position, heading = covariances[..., :2, :2], covariances[..., 2, 2]
     inverse = np.divide(1, heading, out=np.zeros(heading.shape), where=heading > 0)
-    given = P[..., :2, :2] - P[..., :2, 2:] * P[..., 2:, :2] * inverse[..., None, None]
+    cross = covariances[..., :2, 2, None]
+    given = position - cross * cross.mT * inverse[..., None, None]
     x, y = given[..., 0, 0], given[..., 1, 1]
-    largest = np.maximum(P[..., 0, 0], P[..., 1, 1])
+    largest = np.diagonal(position, axis1=-2, axis2=-1).max(axis=-1)
     area = x * y - given[..., 0, 1] * given[..., 1, 0]
     rounded = area < _ROUNDED * largest * (x + y)
     if not rounded.any():
@@ -368,4 +366,4 @@ def _landmarks_from_robot(states: Array) -> Array:
     dx, dy = states[..., 3::2] - states[..., :1], states[..., 4::2] - states[..., 1:2]
     cos, sin = np.cos(states[..., 2:3]), np.sin(states[..., 2:3])
     pairs = np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=-1)
-    return np.asarray(pairs.reshape(*dx.shape[:-1], -1))
+    return np.asarray(pairs.reshape(*states.shape[:-1], -1))

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtr, chdtrc, ndtr, stdtr
 
 from .. import argument_checks
-from ..arrays import Array, BoolArray, IntArray
+from ..arrays import SMALLEST, Array, BoolArray, IntArray
 from ..estimator.models.bearing_range import wrap_angle
 from ..estimator.models.sensors import Sensor, only_bearing_range
 
@@ -102,8 +102,7 @@ def significant_findings(sums: Array, error_rate: float) -> list[NoiseFinding]:
     The p-values are adjusted for the number of tests.
     """
     findings = noise_findings(sums)
-    tests = max(1, len(findings))
-    adjusted = [f._replace(p_value=min(1.0, f.p_value * tests)) for f in findings]
+    adjusted = [f._replace(p_value=f.p_value * len(findings)) for f in findings]
     guilty = [f for f in adjusted if f.p_value < error_rate and f.matters]
     return sorted(guilty, key=lambda f: -f.impact)
 
@@ -156,7 +155,7 @@ def _growth(
     count, mean = found["count"], found["distance"] / found["count"]
     spread = found["distance²"] / count - mean**2  # of distances
     second, fourth = found["second"] / count, found["fourth"] / count
-    if spread <= 1e-9 * max(mean, 1.0) ** 2 or fourth <= second**2:
+    if spread <= _ROUNDING * mean**2 or fourth <= second**2:
         return None
     joint = found["distance w²"] / count - mean * second
     rho = joint / np.sqrt(spread * (fourth - second**2))
@@ -167,7 +166,7 @@ def _growth(
     return NoiseFinding(
         f"{channel} noise {which}",
         float(2 * ndtr(-abs(rho) * np.sqrt(count))),
-        max(abs(float(np.log(max(x, 1e-12)))) for x in (near, far, variance)),
+        max(abs(float(np.log(max(x, SMALLEST)))) for x in (near, far, variance)),
         abs(2 * step) >= _LEAST_GROWTH * variance,
         f"{_SYMBOLS[channel]} is {np.sqrt(far):.3g} times what it assumes at distances "
         f"of {where[1]}, and {np.sqrt(near):.3g} times at {where[0]}",
@@ -183,7 +182,7 @@ def _size(channel: str, count: float, variance: float) -> NoiseFinding:
     return NoiseFinding(
         f"{of} noise {which}",
         float(min(1.0, 2 * min(below, above))),
-        abs(float(np.log(max(variance, 1e-12)))),
+        abs(float(np.log(max(variance, SMALLEST)))),
         abs(variance - 1) >= _LEAST_VARIANCE,
         f"{_SYMBOLS[channel]} is {np.sqrt(variance):.3g} times what it assumes",
         1 if variance > 1 else -1,
@@ -195,7 +194,7 @@ def _bias(
     channel: str, found: dict[str, float], variance: float, runs: int
 ) -> NoiseFinding:
     bias = found["slope"] / found["leverage"]
-    strength = bias**2 * found["leverage"] / max(variance, 1e-12)
+    strength = bias**2 * found["leverage"] / max(variance, SMALLEST)
     p_value = 2 * stdtr(found["count"] - 1, -np.sqrt(strength))
     return NoiseFinding(
         _BIASES[channel],
@@ -298,7 +297,7 @@ def _kurtosis_score(kurtosis: float, n: float) -> float:
         * np.sqrt(6 * (n + 3) * (n + 5) / (n * (n - 2) * (n - 3)))
     )  # fmt: skip
     a = 6 + 8 / skew * (2 / skew + np.sqrt(1 + 4 / skew**2))
-    cube = (1 - 2 / a) / max(1 + x * np.sqrt(2 / (a - 4)), 1e-12)
+    cube = (1 - 2 / a) / max(1 + x * np.sqrt(2 / (a - 4)), SMALLEST)
     return float((1 - 2 / (9 * a) - np.cbrt(cube)) / np.sqrt(2 / (9 * a)))
 
 
@@ -445,7 +444,7 @@ def _sensor_noise(
     bearing, distance = readings[run, step, landmark].T
     expected = np.arctan2(dy, dx) - poses[run, step, 2], np.hypot(dx, dy)
     bearing_error = wrap_angle(bearing - expected[0])
-    bearing_std, range_std = sensor.stds(std, np.maximum(expected[1], 1e-12)).T
+    bearing_std, range_std = sensor.stds(std, np.maximum(expected[1], SMALLEST)).T
     return [
         _Noise(bearing_error, bearing_std, 1.0, run, follows, expected[1]),
         _Noise(distance - expected[1], range_std, 1.0, run, follows, expected[1]),

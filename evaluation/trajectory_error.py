@@ -268,12 +268,12 @@ def _best_order(e: Array, g: Array) -> IntArray:
     moved = _median_aligned(e, g)
     errors = np.linalg.norm(moved - g, axis=1)
     (far,) = np.nonzero(errors > _FAR * np.median(errors))
+    order = np.arange(len(errors))
     if len(far) < 2:
-        return np.arange(len(e))
+        return order
     from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 (slow to import)
 
     gaps = np.linalg.norm(moved[far, None] - g[far], axis=2)
-    order = np.arange(len(e))
     order[far] = far[linear_sum_assignment(np.minimum(gaps, errors[far, None]))[1]]
     return order
 
@@ -287,7 +287,6 @@ def _median_aligned(e: Array, g: Array) -> Array:
 
     with positions as complex numbers.
     """
-    e, g = e - e.mean(axis=0), g - (centre := g.mean(axis=0))
     z, w = e @ (1, 1j), g @ (1, 1j)
     tried = np.unique(np.linspace(0, len(e) - 1, _MOST_TRIED).astype(np.int64))
     least, best = np.inf, z
@@ -299,7 +298,7 @@ def _median_aligned(e: Array, g: Array) -> Array:
         medians = np.median(np.abs(moved - w), axis=1)
         if len(j) and medians.min() < least:
             least, best = medians.min(), moved[medians.argmin()]
-    return np.asarray(np.column_stack([best.real, best.imag]) + centre)
+    return np.column_stack([best.real, best.imag])
 
 
 def _cycles(order: IntArray) -> list[tuple[int, ...]]:

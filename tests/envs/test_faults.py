@@ -107,18 +107,6 @@ def test_faulty_observations_stay_within_the_observation_space():
     assert np.isfinite(largest_noise(2.1))
 
 
-def test_the_observation_space_holds_the_reading_of_a_landmark_at_the_longest_range():
-    plain, biased = (
-        LandmarkWorldEnv(BASE.with_changes(faults=faults, sensor={"max_range": 9}))
-        for faults in ({}, {"range_bias": 3.0})
-    )
-    ranges = [
-        each.observation_space["landmarks"].high[0, 1] for each in (plain, biased)
-    ]
-    assert ranges[0] >= 9
-    assert ranges[1] == pytest.approx(ranges[0] + 3)
-
-
 RANGES = {"start_x": [1.0, 2.0], "start_y": [-3.0, -2.5], "landmark_shift": 0.5}
 
 
@@ -126,6 +114,11 @@ RANGES = {"start_x": [1.0, 2.0], "start_y": [-3.0, -2.5], "landmark_shift": 0.5}
 @pytest.mark.parametrize("kind", ["bearing_range", "range", "position", "bearing"])
 @pytest.mark.parametrize("reach", [9.0, None])
 def test_observation_bounds_follow_from_the_largest_errors(noise_in, kind, reach):
+    ranges = {  # those of one kind lack an end
+        name: ends
+        for name, ends in RANGES.items()
+        if (kind, name) not in (("position", "start_x"), ("bearing", "start_y"))
+    }
     stds = {"bearing_range": [0.2, 0.3], "position": [0.4, 0.3]}.get(kind, [0.3, 0])
     is_of_range = kind in ("bearing_range", "range")
     bias = 0.7 if is_of_range else 0.0
@@ -134,7 +127,8 @@ def test_observation_bounds_follow_from_the_largest_errors(noise_in, kind, reach
         motion={"std": [0.03, 0.04, 0.02], "noise_in": "motion"},
         sensor={"kind": kind, "std": stds, "max_range": reach or np.inf},
         faults={"odometry_scale": 0.1, "odometry_turn": -0.02, "range_bias": bias},
-        randomise=None if kind == "range" else RANGES,
+        randomise=None if kind == "range" else ranges,
+        robot={"max_speed": 1.5, "max_turn_rate": 0.7},
     )
     if noise_in == "odometry":
         world = world.with_changes(
@@ -143,7 +137,9 @@ def test_observation_bounds_follow_from_the_largest_errors(noise_in, kind, reach
     growth = 0.1 * (kind == "bearing_range")
     world = world.with_changes(sensor={"range_std_per_metre": growth})
     robot, dt, largest = world.robot, world.dt, largest_noise(np.inf)
-    start, moved = [2.0, -2.5], np.hypot(1.0, 0.5) + np.sqrt(2) * 0.5  # the largest
+    start = [2.0 if "start_x" in ranges else 1.0, -2.5 if "start_y" in ranges else -2.0]
+    widths = "start_x" in ranges, 0.5 * ("start_y" in ranges)
+    moved = np.hypot(*widths) + np.sqrt(2) * 0.5  # the largest
     if kind == "range":
         start, moved = [1.0, -2.0], 0.0
     away = place_landmarks(BASE.landmarks, None) - start
@@ -169,6 +165,18 @@ def test_observation_bounds_follow_from_the_largest_errors(noise_in, kind, reach
     )
     assert space["odometry"].high == pytest.approx(odometry)
     assert space["odometry"].low == pytest.approx(np.negative(odometry))
+
+
+def test_a_reference_point_beside_the_axle_moves_with_the_turns():
+    free = {"sensor": {"max_range": np.inf}, "robot": {"reference": [0.3, 0.4]}}
+    world = load_scenario("bicycle").with_changes(**free)
+    ranges = [
+        LandmarkWorldEnv(each).observation_space["landmarks"].high[0, 1]
+        for each in (world, world.with_changes(robot={"reference": None}))
+    ]
+    robot, noise = world.robot, 1 + 10 * world.sensor.range_std_per_metre
+    lever = 0.5 * robot.max_turn_rate * world.dt * world.steps
+    assert ranges[0] - ranges[1] == pytest.approx(lever * noise)
 
 
 @pytest.mark.parametrize("drive", ["differential", "bicycle"])

@@ -166,7 +166,7 @@ def test_a_robot_told_to_rest_has_noise_only_if_asked_for(noise_in):
 def test_a_wall_stalls_the_wheels_and_not_the_turn():
     still = {"std": [0.0, 0.0, 0.0]}
     env = make(walls=WALLS, dt=3.0, motion=still, start=still)
-    env.reset(seed=0)
+    assert env.reset(seed=0)[1]["collision"] is False
     observation, *_, info = env.step([1.0, 0.0])
     assert info["collision"] is False
     observation, *_, info = env.step([1.0, 0.5])
@@ -562,7 +562,8 @@ def test_a_frame_shows_the_walls_of_the_option():
     [
         lambda env: env.step([0.0, 0.0]), lambda env: env.render(),
         lambda env: env.pose, lambda env: env.landmarks,
-        lambda env: env.start_estimate,
+        lambda env: env.start_estimate, lambda env: env.state(),
+        lambda env: env.restore(()), lambda env: env.drawn_scenario,
     ],
 )  # fmt: skip
 def test_nothing_works_before_reset(use):
@@ -653,6 +654,15 @@ def test_frames_are_pictures_of_the_present():
     env.step([1.0, 1.0])
     assert (before != env.render()).any()
     env.close()
+
+
+def test_a_world_without_a_render_mode_warns_and_shows_nothing():
+    env = make()
+    env.spec = None
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="render shows nothing without a render_mode"):
+        assert env.render() is None
+    assert env.spec is None
 
 
 @pytest.mark.slow

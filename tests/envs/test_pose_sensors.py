@@ -41,6 +41,8 @@ def test_a_world_without_them_has_no_such_readings():
     _, info = gymnasium.make(WORLD, scenario=scenario(gps={"std": 1.0})).reset(seed=0)
     assert "gps" in info
     assert "compass" not in info
+    _, info = gymnasium.make(WORLD, scenario=scenario(compass={"std": 0.1})).reset()
+    assert {"compass", "compass_mask"} == info.keys() - {"pose", "collision"}
 
 
 @pytest.mark.parametrize("task", [WORLD, "slamgym/ActiveSlam-v0"])

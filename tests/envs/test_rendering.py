@@ -335,7 +335,9 @@ def test_a_view_has_room_for_eight_radii_of_the_robot():
 
 def test_frame_after_leaving_the_view_shows_the_robot(renderer):
     renderer.render(snapshot())
-    renderer.render(snapshot((90.0, -20.0, 0.0)))
+    frame = renderer.render(snapshot((90.0, -20.0, 0.0)))
+    fresh = WorldRenderer(SIX, LANDMARKS, "rgb_array", size_px=300)
+    np.testing.assert_array_equal(frame, fresh.render(snapshot((90.0, -20.0, 0.0))))
     axes = figure_of(renderer).axes[0]
     pixel = axes.transData.transform([90.0, -20.0])
     assert axes.bbox.contains(*pixel)

@@ -257,13 +257,14 @@ def test_worlds_that_begin_in_a_step_are_those_of_a_step_and_a_reset(name):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_an_action_that_is_no_number_names_its_world_and_moves_none(bad):
+@pytest.mark.parametrize("world", [0, 3])
+def test_an_action_that_is_no_number_names_its_world_and_moves_none(bad, world):
     batch, twin = begun(), begun()
     commands = np.zeros((WORLDS, 2))
-    commands[3, 1] = bad
-    with pytest.raises(ValueError, match=rf"finite.*\[0\.0, {bad}\] for world 3"):
+    commands[world, 1] = bad
+    with pytest.raises(ValueError, match=rf"finite.*\[0\.0, {bad}\] for world {world}"):
         batch.step(commands)
-    moving = np.arange(WORLDS) != 3
+    moving = np.arange(WORLDS) != world
     batch.step(commands, moving)
     twin.step(np.zeros((WORLDS, 2)), moving)
     assert bits(batch.poses) == bits(twin.poses)

@@ -13,7 +13,7 @@ from slamgym.evaluation import (
     places_of,
     score_association,
 )
-from slamgym.evaluation.association_scores import known_places
+from slamgym.evaluation.association_scores import AssociationScores, known_places
 
 A, B, C, CLUTTER = 7, 8, 9, -1
 
@@ -48,6 +48,11 @@ def test_every_kind_of_decision_is_counted_once():
     scores = score_association(decisions, true_ids)
     assert (scores.precision, scores.recall) == (3 / 9, 3 / 7)
     assert (scores.map_size, scores.true_map_size) == (4, 3)
+    each = AssociationScores(*2 ** np.arange(9))
+    assert each.precision == (1 + 4) / (1 + 4 + 2 + 8 + 16 + 64)
+    assert each.recall == (1 + 4) / (1 + 4 + 2 + 8 + 32)
+    twice = given(0, 0, added=(0,))
+    assert counts([twice], [[A, A]]) == {"new_correct": 1, "correct": 1}
 
 
 def test_the_confirming_reading_says_who_a_landmark_is():
@@ -160,7 +165,7 @@ def test_the_oracle_takes_the_landmark_of_the_least_mahalanobis_distance():
     rng = np.random.default_rng(4)
     ids, world = np.array([2, 3, 5, 9]), rng.uniform(-4, 4, (4, 2))
     poses, std, slope = rng.uniform(-1, 1, (6, 3)), (0.3, 0.2), 0.1
-    poses[4] = np.nan
+    poses[4, 2] = np.nan
     truth = [rng.choice([*ids, CLUTTER], 5) for _ in poses]
     scans = [rng.uniform((-3, 0.5), (3, 5), (5, 2)) for _ in poses]
     for places in (None, {2: 2, 3: 2, 5: 5, 9: 5}):
@@ -171,13 +176,8 @@ def test_the_oracle_takes_the_landmark_of_the_least_mahalanobis_distance():
                 squares = []
                 for x, y in world - pose[:2]:
                     expected = math.hypot(x, y)
-                    turn = (
-                        math.remainder(
-                            math.atan2(y, x) - pose[2] - bearing, 2 * math.pi
-                        )
-                        if math.isfinite(x)
-                        else math.nan
-                    )
+                    turn = math.atan2(y, x) - pose[2] - bearing
+                    turn = math.remainder(turn, 2 * math.pi)
                     gap = (distance - expected) / (std[1] + slope * expected)
                     squares.append((turn / std[0]) ** 2 + gap**2)
                 if i != CLUTTER and math.isfinite(squares[0]):
@@ -200,3 +200,5 @@ def test_the_oracle_takes_the_landmark_of_the_least_mahalanobis_distance():
     assert oracle_errors(*drive, [2, 3], at_one, std) == 0
     nothing = oracle_errors(poses[4:5], scans[4:5], truth[4:5], ids, world, std)
     assert math.isnan(nothing)
+    with pytest.raises(ValueError, match=r"zip\(\)"):
+        oracle_errors(poses[1:], scans, truth, ids, world, std)

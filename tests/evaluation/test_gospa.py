@@ -43,10 +43,13 @@ def test_empty_maps_are_missed_or_false(n, m):
 
 def test_no_assignment_costs_less():
     rng = np.random.default_rng(2)
-    for _ in range(40):
+    for case in range(40):
         n, m = rng.integers(0, 4, 2)
         x, y = rng.uniform(0, 3, (n, 2)), rng.uniform(0, 3, (m, 2))
         cutoff = float(rng.uniform(0.3, 2.0))
+        if case < 2:  # whose sums of distances, or of cubes, have another minimum
+            x, cutoff = np.array([(0, 0), (0.89 + case / 7, 0.95)]), 9.0
+            y = x * [1, -1]
         expected = over_all_assignments(x, y, cutoff)
         found = gospa(x, y, cutoff)
         np.testing.assert_allclose(found.distance, expected, rtol=1e-12)
@@ -66,6 +69,16 @@ def test_a_place_is_as_far_as_its_nearest_landmark():
     all_three = gospa(estimates, truth, cutoff=1.0, places=[3, 3, 4])
     np.testing.assert_allclose(all_three.localisation, 0.1**2 + 0.2**2)
     assert (all_three.missed_count, all_three.false_count) == (0, 1)
+    rng = np.random.default_rng(3)
+    for count in range(1, 6):
+        x, y = rng.uniform(0, 2, (count, 2)), rng.uniform(0, 2, (6, 2))
+        nearest = itertools.product((0, 1), (2,), (3, 4, 5))  # of each place
+        expected = min(gospa(x, y[list(some)]).distance for some in nearest)
+        found = gospa(x, y, places=[7, 7, 2, 5, 5, 5])
+        np.testing.assert_allclose(found.distance, expected)
+    assert [gospa([(0, y)], [(0, 0)]).pairs for y in (0.99, 1.01)] == [1, 0]
+    with pytest.raises(ValueError, match="estimate must be"):
+        gospa("here", truth)
     with pytest.raises(ValueError, match="places must have one entry per"):
         gospa([(0.5, 0)], truth, places=[3, 3])
 

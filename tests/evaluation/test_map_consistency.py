@@ -56,10 +56,12 @@ def test_wrong_covariances_between_landmarks_are_rejected_by_the_whole_map():
 
 def test_a_matrix_with_a_negative_eigenvalue_is_rejected():
     nees, freedom = (HONEST**2).sum(axis=(1, 2)), np.full(100, 40)
-    nees[5] = np.inf
+    assert "no NEES" not in map_test(HONEST, nees, freedom).sentence()
+    nees[5:7] = np.inf, np.nan
     found = map_test(HONEST, nees, freedom)
     assert not found.accepted
-    assert (found.indefinite, found.all_runs) == (1, 100)
+    assert (found.indefinite, found.undefined, found.all_runs) == (1, 1, 100)
+    assert "; 2 of 100 maps have no NEES: rejected" in found.sentence()
 
 
 def test_of_maps_without_any_nees_those_whose_landmarks_are_known_are_tested():

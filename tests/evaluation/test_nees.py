@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import logm
 
 from slamgym.evaluation.hypothesis_tests import autocorrelation
 from slamgym.evaluation.nees import (
     heading_nees,
+    in_frame,
     is_indefinite,
     landmark_nees,
     normalised_squared_error,
@@ -36,14 +38,6 @@ def expect_chi_square(nees, dof):
 
 
 @pytest.mark.parametrize("frame", ["additive", "invariant"])
-def test_nees_is_chi_square_in_either_frame(small_errors, frame):
-    expect_chi_square(position_nees(*small_errors, frame=frame), 2)
-    expect_chi_square(state_nees(*small_errors, frame=frame), 7)
-    for nees in landmark_nees(*small_errors, frame=frame).T:
-        expect_chi_square(nees, 2)
-
-
-@pytest.mark.parametrize("frame", ["additive", "invariant"])
 @pytest.mark.parametrize("far", [(1e3, -1e3), (451234.5, 4412345.25), (1e9, -1e9)])
 def test_nees_does_not_depend_on_the_origin_of_the_world(small_errors, far, frame):
     truth, means, covariances = (1e2 * array[:50] for array in small_errors)
@@ -69,30 +63,52 @@ def test_poses_far_from_the_origin_with_a_thin_covariance_keep_their_nees():
     expect_chi_square(np.tile(nees, RUNS // len(nees)), 3)
 
 
-def test_nees_of_the_relative_map_is_chi_square(small_errors):
-    expect_chi_square(relative_map_nees(*small_errors), 4)
+def large_errors(axes=(2, 3)):
+    """Return true states, estimates and full covariances with errors of any size."""
+    rng = np.random.default_rng(11)
+    means, roots = rng.normal(0, 3, (*axes, 7)), rng.normal(0, 0.3, (*axes, 7, 7))
+    return means + rng.normal(0, 0.6, means.shape), means, roots @ roots.mT
 
 
-def test_the_relative_map_ignores_a_turn_of_the_whole_world(small_errors):
-    truth, means, covariances = (array[:50] for array in small_errors)
-    turn, shift = np.exp(0.9j), 4.0 - 7.0j
-    turned = truth.copy()
-    for x, y in ((0, 1), (3, 4), (5, 6)):
-        point = turn * (truth[:, x] + 1j * truth[:, y]) + shift
-        turned[:, x], turned[:, y] = point.real, point.imag
-    turned[:, 2] += 0.9
-    before = relative_map_nees(truth, means, covariances)
-    after = relative_map_nees(turned, means, covariances)
-    np.testing.assert_allclose(after, before, rtol=1e-6)
+def error_and_slope(truth, mean, frame):
+    """Return e, or ξ about the estimated position by a matrix logarithm, and ∂ξ/∂e."""
+    D, error = np.eye(7), truth - mean
+    error[2] = np.remainder(error[2] + np.pi, 2 * np.pi) - np.pi
+    if frame == "additive":
+        return error, D
+    group = np.tile(np.eye(5), (2, 1, 1))
+    shift = mean[[0, 1, 0, 0, 1, 0, 1]] * (1, 1, 0, 1, 1, 1, 1)
+    truth, mean = truth - shift, mean - shift
+    for matrix, state in zip(group, (truth, mean), strict=True):
+        c, s = np.cos(state[2]), np.sin(state[2])
+        matrix[:2, :2] = [[c, -s], [s, c]]
+        matrix[:2, 2:] = np.delete(state, 2).reshape(3, 2).T
+    log = logm(group[0] @ np.linalg.inv(group[1])).real
+    x, y = np.delete(mean, 2).reshape(3, 2).T
+    D[[0, 3, 5], 2], D[[1, 4, 6], 2] = y, -x
+    return np.insert(log[:2, 2:].T.ravel(), 2, log[1, 0]), D
 
 
-def test_a_state_without_landmarks_is_a_pose(small_errors):
-    truth, means, covariances = small_errors
-    pose = (truth[:, :3], means[:, :3], covariances[:, :3, :3])
-    for frame in ("additive", "invariant"):
-        np.testing.assert_array_equal(
-            state_nees(*pose, frame=frame), pose_nees(*pose, frame=frame)
-        )
+@pytest.mark.parametrize("frame", ["additive", "invariant"])
+def test_nees_of_large_errors_is_that_of_the_definition_of_their_frame(frame):
+    truth, means, P = large_errors()
+    pose = truth[..., :3], means[..., :3], P[..., :3, :3]
+    found = [
+        *(pose_nees(*pose, frame=frame), position_nees(*pose, frame=frame)),
+        *(heading_nees(*pose), state_nees(truth, means, P, frame=frame)),
+        *np.moveaxis(landmark_nees(truth, means, P, frame=frame), -1, 0),
+    ]
+    parts = [0, 1, 2], [0, 1], [2], range(7), [3, 4], [5, 6]
+    for at in np.ndindex(2, 3):
+        e, D = error_and_slope(truth[at], means[at], frame)
+        for nees, rows in zip(found, parts, strict=True):
+            block = (D @ P[at] @ D.T)[np.ix_(rows, rows)]
+            expected = e[rows] @ np.linalg.solve(block, e[rows])
+            assert nees[at] == pytest.approx(expected, rel=1e-7)
+    errors, _ = in_frame(truth, means, P, "additive")
+    assert errors[at] == pytest.approx(
+        error_and_slope(truth[at], means[at], "additive")[0]
+    )
 
 
 def test_autocorrelation_of_a_moving_sum_and_across_gaps():
@@ -118,21 +134,25 @@ def test_the_error_is_normalised_over_all_leading_axes_and_at_any_scale(size, sc
 
 @pytest.mark.parametrize("size", [3, 12])
 def test_a_covariance_singular_within_rounding_has_no_nees(size):
-    covariance = np.tile(np.eye(size), (2, 1, 1))
-    covariance[1, 0, 1] = covariance[1, 1, 0] = 1 - 1e-12
-    nees = normalised_squared_error(np.ones((2, size)), covariance)
+    covariance = np.tile(np.eye(size), (3, 1, 1))
+    covariance[1:, 0, 1] = covariance[1:, 1, 0] = 1 - 0.4e-10, 1 - 0.6e-10
+    nees = normalised_squared_error(np.ones((3, size)), covariance)
     assert nees[0] == pytest.approx(size)
-    assert np.isnan(nees[1])
+    assert np.isnan(nees).tolist() == [False, True, False]
+    covariance[2, 1] = np.nan
+    assert np.isnan(normalised_squared_error(np.ones((3, size)), covariance)[2])
 
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("frame", ["additive", "invariant"])
 def test_a_variance_of_one_axis_that_is_rounding_gives_no_nees(axis, frame):
-    covariances = np.tile(np.diag([1e-4, 1e-4, 1e-4]), (3, 1, 1))
-    covariances[:, axis, axis] = 0.0, 1e-22, 1e-14
-    poses = np.zeros((3, 3))
-    nees = pose_nees(poses + 0.01, poses, covariances, frame=frame)
-    np.testing.assert_array_equal(np.isfinite(nees), [False, False, True])
+    covariances = np.tile(np.diag([1e-4] * 5), (4, 1, 1))
+    covariances[:, axis, axis] = 0.0, 0.9e-18, 1.1e-18, 1e-4
+    covariances[:, 2:4, 2:4], covariances[3, 2] = [[1e-4, 5e-5], [5e-5, 1e-4]], 0.0
+    states, before = np.zeros((4, 5)), covariances.copy()
+    nees = state_nees(states + 0.01, states, covariances, frame=frame)
+    np.testing.assert_array_equal(np.isfinite(nees), [False, False, True, False])
+    np.testing.assert_array_equal(covariances, before)
 
 
 def test_a_position_certain_in_a_slanted_direction_has_no_nees():
@@ -169,28 +189,33 @@ def test_a_singular_covariance_is_not_indefinite_by_rounding():
         P = scale * rows @ rows.T
         assert not is_indefinite(P)
         assert is_indefinite(P - 1e-3 * scale * np.eye(40))
+    for far, is_rounding in ((3.2e-5, True), (6e-5, False)):  # its square to 2e-9
+        assert is_indefinite(np.array([[0.0, far], [far, 1.0]])) != is_rounding
+    assert not is_indefinite(np.where(np.eye(3, k=1), np.nan, -np.eye(3)))
 
 
 def test_deviations_of_landmarks_are_whitened_in_the_axes_of_the_map():
-    rng = np.random.default_rng(11)
-    means = rng.normal(0, 3, (4, 7))
-    roots = rng.normal(0, 0.1, (4, 7, 7))
-    P, truth = roots @ roots.swapaxes(1, 2), means + rng.normal(0, 0.1, (4, 7))
+    truth, means, P = large_errors()
     found = relative_landmark_deviations(truth, means, P)
+    nees = relative_map_nees(truth, means, P)
     errors, blocks = parts_of_landmarks(truth - means, P)
-    for b, k in np.ndindex(4, 2):
-        rows = slice(3 + 2 * k, 5 + 2 * k)
-        np.testing.assert_array_equal(errors[b, k], (truth - means)[b, rows])
-        np.testing.assert_array_equal(blocks[b, k], P[b, rows, rows])
 
-        def seen(state, rows=rows):
-            gap = (state[rows] - state[:2]) @ [1, 1j] * np.exp(-1j * state[2])
-            return np.array([gap.real, gap.imag])
+    def seen(state):
+        gaps = (state[3:].reshape(2, 2) - state[:2]) @ [1, 1j] * np.exp(-1j * state[2])
+        return gaps.view(float)
 
-        steps = 1e-6 * np.eye(7)
-        slopes = [(seen(means[b] + h) - seen(means[b] - h)) / 2e-6 for h in steps]
-        J, c, s = np.transpose(slopes), *np.exp(1j * means[b, 2]).view((float, 2))
-        R = np.array([[c, -s], [s, c]])
-        L = np.linalg.cholesky(R @ J @ P[b] @ J.T @ R.T)
-        expected = np.linalg.solve(L, R @ (seen(truth[b]) - seen(means[b])))
-        np.testing.assert_allclose(found[b, k], expected, rtol=1e-5)
+    for b in np.ndindex(2, 3):
+        slopes = [
+            (seen(means[b] + h) - seen(means[b] - h)) / 2e-6 for h in 1e-6 * np.eye(7)
+        ]
+        J, c, s = np.transpose(slopes), *np.exp(1j * means[b][2]).view((float, 2))
+        R, error = np.array([[c, -s], [s, c]]), seen(truth[b]) - seen(means[b])
+        expected = error @ np.linalg.solve(J @ P[b] @ J.T, error)
+        assert nees[b] == pytest.approx(expected, rel=1e-5)
+        for k, rows in enumerate((slice(0, 2), slice(2, 4))):
+            own = slice(3 + 2 * k, 5 + 2 * k)
+            np.testing.assert_array_equal(errors[b][k], (truth - means)[b][own])
+            np.testing.assert_array_equal(blocks[b][k], P[b][own, own])
+            L = np.linalg.cholesky(R @ J[rows] @ P[b] @ J[rows].T @ R.T)
+            expected = np.linalg.solve(L, R @ error[rows])
+            np.testing.assert_allclose(found[b][k], expected, rtol=1e-5)

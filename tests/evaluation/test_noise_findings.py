@@ -8,7 +8,6 @@ from scipy import stats
 from slamgym.evaluation.noise_findings import (
     CHANNELS,
     HEAVY_TAILS,
-    MOMENTS,
     _growth,
     _size_beside_tails,
     _spread_of_variance,
@@ -54,27 +53,34 @@ def test_the_size_has_the_p_value_of_the_chi_square_test(scale, cause):
     assert f"σβ is {np.sqrt(variance):.3g} times" in found.text
 
 
-def test_a_correlation_in_time_has_the_p_value_of_a_normal_score():
-    numbers = draw((RUNS, 400)) + 0.3
-    numbers[:, 1:] += 0.1 * numbers[:, :-1]
+@pytest.mark.parametrize("share", [0.1, 0.07, 0.02, -0.02, -0.07, -0.1, 1.0])
+def test_a_correlation_in_time_has_the_p_value_of_a_normal_score(share):
+    numbers = draw((RUNS, 400))
+    numbers[:, 1:] += share * numbers[:, :-1]
+    if share == 1:  # nearly constant in time
+        numbers[:] = np.linspace(0, 1, 400)
+    numbers += 0.3
     found = findings_of("turn", numbers)["correlated noise"]
-    pairs = numbers - numbers.mean()
-    rho = (pairs[:, 1:] * pairs[:, :-1]).mean() / numbers.var()
-    score = rho * np.sqrt(pairs[:, 1:].size)
-    assert np.log(found.p_value) == pytest.approx(
-        np.log(2 * stats.norm.sf(score)), rel=0.02
-    )
-    assert found.matters
-    assert found.impact == pytest.approx(np.log((1 + rho) / (1 - rho)), rel=0.01)
-    assert "successive errors of σα have a correlation of 0.1" in found.text
-    assert not findings_of("turn", draw())["correlated noise"].matters
+    products = numbers[:, 1:] * numbers[:, :-1]
+    rho = (products.mean() - numbers.mean() ** 2) / numbers.var(ddof=1)
+    p_value = 2 * stats.norm.sf(abs(rho) * np.sqrt(products.size))
+    assert found.p_value == pytest.approx(p_value, rel=1e-6, abs=0)
+    assert (found.matters, found.sign) == (abs(rho) >= 0.05, 0)
+    most = min(rho, 0.99)
+    assert found.impact == pytest.approx(abs(np.log((1 + most) / (1 - most))))
+    assert f"successive errors of σα have a correlation of {rho:.2g}" in found.text
 
 
-def test_a_size_as_assumed_is_likely_and_does_not_matter():
-    found = findings_of("bearing", draw())
-    size = next(each for cause, each in found.items() if cause.startswith("bearing n"))
-    assert 0.05 < size.p_value <= 1
-    assert not size.matters
+@pytest.mark.parametrize(("strength", "matters"), [(0.09, False), (0.11, True)])
+def test_a_mean_matters_from_a_tenth_on(strength, matters):
+    numbers = draw()
+    numbers = (numbers - numbers.mean()) / numbers.std(ddof=1)
+    numbers += np.sqrt(strength / 200)
+    assert findings_of("turn", numbers)["odometry turn"].matters == matters
+    for lever in (0.0, 0.01):  # a robot at rest shows no error of the scale
+        causes = [f.cause for f in noise_findings(sums_of("along", numbers, lever))]
+        assert ("odometry scale" in causes) == (lever > 0)
+        assert len(causes) == 3 + (lever > 0)
 
 
 @pytest.mark.parametrize(("variance", "matters"), [(1.04, False), (0.94, True)])
@@ -130,6 +136,7 @@ def test_tails_have_the_p_value_of_anscombe_and_glynn(law, count, scale):
     assert found.impact == pytest.approx(max(by_size, (kurtosis - 3) / 10))
     assert found.matters == (kurtosis >= 3.5)
     assert f"kurtosis of {kurtosis:.3g}" in found.text
+    assert found.sign == 0
 
 
 @pytest.mark.parametrize(
@@ -152,45 +159,25 @@ def test_the_variance_of_student_noise_is_explained_by_its_tails(degrees):
 
 
 def test_thirty_numbers_are_enough_and_fewer_are_not():
-    assert findings_of("turn", draw((1, 30)))
     assert not findings_of("turn", draw((1, 29)))
-
-
-def test_a_bias_of_the_sensor_is_that_of_its_readings():
-    poses = np.zeros((1, 2, 3))
-    points = np.array([[[4.0, 0.0], [0.0, 3.0], [-2.0, 0.0]]])
-    readings = np.zeros((1, 2, 3, 2))
-    readings[..., 0] = [0.0, np.pi / 2, np.pi]
-    readings[..., 1] = [4.0, 3.0, 2.0]
-    seen = np.array([[[True, False, True], [False, True, True]]])
-    sums = noise_sums(
-        poses,
-        points,
-        np.zeros((1, 2, 2)),
-        readings + np.array([0.02, 0.3]),
-        seen,
-        motion_std=(0.1, 0.1, 0.1),
-        measurement_std=(0.05, 0.4),
-    )
-    slope, leverage = sums[0, 3:, 5:7].T
-    assert slope / leverage == pytest.approx([0.02, 0.3])
-    assert sums[0, 3:, MOMENTS.index("pairs")].tolist() == [1, 1]  # of one landmark
+    for count in (30, 31):  # with one pair less
+        found = findings_of("turn", draw((1, count)))
+        assert ("correlated noise" in found) == (count > 30)
+    assert set(findings_of("turn", np.ones((1, 40)))) == {
+        *("odometry turn", "motion noise too large")
+    }
 
 
 def test_noise_where_none_is_assumed_counts_in_units_of_a_millionth():
-    odometry = np.zeros((1, 2, 2))
-    poses = np.zeros((1, 2, 3))
-    poses[0, 1] = 0.0, 0.003, 0.0
-    sums = noise_sums(
-        poses,
-        np.ones((1, 1, 2)),
-        odometry,
-        np.ones((1, 2, 1, 2)),
-        np.zeros((1, 2, 1), dtype=bool),
-        motion_std=(0.1, 0.0, 0.1),
-        measurement_std=(0.1, 0.1),
-    )
-    assert sums[0, 1, 1] == pytest.approx(3000.0)
+    odometry = np.zeros((1, 3, 2))
+    poses = np.zeros((1, 3, 3))
+    poses[0, 2] = 0.0, -0.003, 0.0  # after a step without noise
+    drive = poses, np.ones((1, 1, 2)), odometry, np.ones((1, 3, 1, 2))
+    assumed = {"motion_std": (0.1, 0.0, 0.1), "measurement_std": (0.1, 0.1)}
+    sums = noise_sums(*drive, np.zeros((1, 3, 1), dtype=bool), **assumed)
+    assert sums[0, 1, 1] == pytest.approx(-3000.0)
+    with pytest.raises(ValueError, match="noise_in must be 'motion' or 'odometry'"):
+        noise_sums(*drive, np.zeros((1, 3, 1)), **assumed, noise_in="wheels")
 
 
 @far_origins
@@ -240,14 +227,35 @@ def test_noise_of_another_size_far_away_is_no_heavy_tail(factor, size):
     assert others == []
 
 
-@pytest.mark.parametrize("growth", [0.12, -0.04, 0.1, 0.01, -0.02, 0.005])
-def test_the_impact_of_a_growth_is_that_of_a_line_through_the_squares(growth):
-    rng = np.random.default_rng(6)
-    r, w = rng.uniform(1, 9, 5000), rng.standard_normal(5000)
-    squares = (w * (0.6 + growth * r)) ** 2
+def moments_of(r, squares):
     powers = {"distance": r, "distance²": r**2, "second": squares,
               "fourth": squares**2, "distance w²": r * squares}  # fmt: skip
-    found = {"count": 5000.0} | {name: each.sum() for name, each in powers.items()}
+    return {"count": 5000.0} | {name: each.sum() for name, each in powers.items()}
+
+
+def test_noise_has_no_growth_if_all_distances_or_all_squares_are_equal():
+    rng = np.random.default_rng(6)
+    w = rng.standard_normal(5000)
+    for r, is_none in (
+        *((np.full(5000, 1e4), True), (rng.uniform(9990, 10010, 5000), False)),
+        *((np.zeros(5000), True), (rng.uniform(1, 1.1, 5000), False)),
+    ):
+        assert (_growth("range", moments_of(r, w**2), 1.0) is None) == is_none
+        assert _growth("range", moments_of(r, np.full(5000, 0.25)), 0.25) is None
+
+
+@pytest.mark.parametrize(
+    ("base", "growth"),
+    [
+        *((0.6, 0.12), (0.6, -0.04), (0.6, 0.1), (0.6, 0.01), (0.6, -0.02)),
+        *((0.6, 0.005), (1.3, -0.05), (1.2, 0.05), (1.04, 0.0)),
+    ],
+)
+def test_the_impact_of_a_growth_is_that_of_a_line_through_the_squares(base, growth):
+    rng = np.random.default_rng(6)
+    r, w = rng.uniform(1, 9, 5000), rng.standard_normal(5000)
+    squares = (w * (base + growth * r)) ** 2
+    found = moments_of(r, squares)
     ends = r.mean() + r.std() * np.array([-1, 1])
     along = np.polyval(np.polyfit(r, squares, 1), ends)
     expected = np.abs(np.log([*along, squares.mean()])).max()
