@@ -3,6 +3,7 @@
 import math
 import pickle
 from dataclasses import replace
+from functools import cache
 
 import dense_family
 import numpy as np
@@ -744,20 +745,27 @@ def test_an_update_that_fails_leaves_the_readings_waiting():
     assert len(slam.map.waiting.ids) == 0
 
 
+PLACING = 35  # steps
+
+
+@cache
+def placed_about(origin, label, sensor):
+    """Return the belief after a drive that begins near an origin, and its last NIS."""
+    start = {"initial_pose": (*origin, 0), "initial_pose_std": (0.1, 0.1, 0.1)}
+    slam = waiting_filter(label, sensor, **start)
+    _, report = drive_past(slam, sensor, PLACING, start=(0.05, -0.1, 0.1))
+    return slam.belief(), report.nis
+
+
 @far_origins
 @pytest.mark.parametrize("sensor", [BEARING, RANGE], ids=lambda s: s.name)
 @pytest.mark.parametrize("label", ORACLES)
 def test_landmarks_far_from_the_origin_are_placed_as_at_the_origin(label, sensor, far):
-    steps, std, found = 35, (0.1, 0.1, 0.1), []
-    for origin in ((0, 0), far):
-        start = {"initial_pose": (*origin, 0), "initial_pose_std": std}
-        slam = waiting_filter(label, sensor, **start)
-        _, report = drive_past(slam, sensor, steps, start=(0.05, -0.1, 0.1))
-        found.append((slam.belief(), report.nis))
-    (near, nis), (there, nis_there) = found
+    near, nis = placed_about((0, 0), label, sensor)
+    there, nis_there = placed_about(far, label, sensor)
     assert len(near.landmark_ids) == 5
     assert there.landmark_ids == near.landmark_ids
-    slack, noise = rounding(far, steps), STD[sensor.name][0]
+    slack, noise = rounding(far, PLACING), STD[sensor.name][0]
     if label == "unscented":  # roots of a singular covariance have half its digits
         slack += 1e-9
     np.testing.assert_allclose(there.mean, shifted(near.mean, far), atol=slack, rtol=0)
