@@ -15,7 +15,15 @@ import numpy as np
 
 from ..arrays import AnyArray, Array, BoolArray, IntArray
 from .logs.importers.any_format import read_true_path
-from .logs.log_lines import LogLine, plain_rows, read_lines, read_text, to_lines
+from .logs.importers.planar_paths import TUM_SIZES
+from .logs.log_lines import (
+    LogLine,
+    is_number,
+    plain_rows,
+    read_lines,
+    read_text,
+    to_lines,
+)
 from .logs.slamlog import LogError
 from .trajectories.manifest import MANIFEST, load_trajectories
 from .trajectories.trajectory import BELIEFS, Trajectory, array_of
@@ -71,7 +79,7 @@ def is_tum(path: Path) -> bool:
     """Whether the first line that is not a comment has the numbers of a row of TUM."""
     lines = content_lines(path) if path.is_file() else []
     fields = lines[0].text.split() if lines else []
-    return len(fields) in (8, *(8 + size for size in _TUM_SIZES))
+    return len(fields) - 8 in TUM_SIZES and all(map(is_number, fields))
 
 
 def growing_rows(rows: Array, places: Sequence[str]) -> IntArray:
@@ -114,7 +122,6 @@ _UNIT = 0.1  # largest difference of the length of a quaternion from 1
 _TILT = np.pi / 6  # of a robot that has a heading
 _GAP = 3.0  # of the truth, in usual intervals of its rows
 _CLIMB = 0.05  # and tilt: beyond it, a path is not planar
-_POSE_SIZES, _TUM_SIZES = (6, 9), (6, 9, 21, 36)
 
 
 def read_estimates(paths: Sequence[Path]) -> dict[Any, DriveEstimate]:
@@ -359,7 +366,7 @@ def _plain_poses(path: Path) -> tuple[Array | None, list[LogLine]]:
 def tum_row(line: LogLine) -> list[float]:
     """Read the numbers of a row of TUM; its quaternion has length 1."""
     fields = line.text.split()
-    line.check_count(fields, (8, *(8 + size for size in _TUM_SIZES)), _TUM)
+    line.check_count(fields, tuple(8 + size for size in TUM_SIZES), _TUM)
     numbers = [line.to_real(field) for field in fields]
     if abs((length := float(np.linalg.norm(numbers[4:8]))) - 1) > _UNIT:
         wanted = "a rotation qx qy qz qw of length 1 in the fields 5 to 8"
@@ -370,7 +377,7 @@ def tum_row(line: LogLine) -> list[float]:
 def tum_rows(lines: Sequence[LogLine]) -> Array | list[list[float]]:
     """Read rows as :func:`tum_row` does, in less time where all are alike."""
     table = plain_rows([line.text for line in lines])
-    if table is None or table.shape[1] - 8 not in (0, *_TUM_SIZES):
+    if table is None or table.shape[1] - 8 not in TUM_SIZES:
         return [tum_row(line) for line in lines]
     is_unit = abs(np.linalg.norm(table[:, 4:8], axis=1) - 1) <= _UNIT
     return table if is_unit.all() else [tum_row(line) for line in lines]

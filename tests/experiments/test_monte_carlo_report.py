@@ -635,6 +635,11 @@ def test_the_legend_counts_the_steps_that_are_tested():
     page = html_report(dataset, summarise_monte_carlo(dataset))
     assert "all 4 marked steps" in page
     line_of(figure_of(typical(), "nees").axes[0], "95 % band, 10 steps")
+    bound = np.array(typical()["position_bound_raw"].sel(estimator="ekf"))[:, 1:]
+    line = line_of(figure_of(typical(), "rmse").axes[0], "bound of any filter")
+    np.testing.assert_allclose(line.get_ydata(), np.sqrt(bound.mean(axis=0)))
+    below = figure_of(typical().sel(estimator=["ekf"]), "nis").axes[1]
+    assert below.lines[-1].get_xdata().tolist() == list(range(1, 11))
 
 
 def test_the_heading_panels_show_claim_truth_and_what_is_knowable():
@@ -671,9 +676,25 @@ def test_autocorrelations_are_those_of_the_whiteness_decision():
 
 
 def test_pooled_nis_adds_up_to_all_of_it():
-    _, ratios, freedom = figures.pooled_nis(scores_of(typical(), "ekf", "invariant"))
-    nis = typical()["nis"].sel(estimator="ekf").values[:, 1:]
+    dataset = typical().copy(deep=True)
+    dataset["nis_dof"][..., 4] = 0  # nothing is corrected then
+    scores = scores_of(dataset, "ekf", "invariant")
+    steps, ratios, freedom = figures.pooled_nis(scores)
+    assert steps.tolist() == [1, 2, 3, *range(5, 30)]
+    nis = typical()["nis"].sel(estimator="ekf").values[:, steps.astype(int)]
     assert (ratios * freedom).sum() == pytest.approx(nis.sum())
+
+
+def test_dots_of_a_bin_lie_side_by_side_within_their_row():
+    edges = np.linspace(0, 7, 71)
+    values = np.append(np.full(31, 2.55), [0.0, 7.0])
+    x, lift = figures._swarm(values, edges)
+    np.testing.assert_allclose(x, np.append(np.full(31, 2.55), [0.05, 6.95]))
+    np.testing.assert_allclose(np.diff(np.sort(lift[:31])), 0.6 / 31)
+    assert lift[:31].mean() == pytest.approx(0)
+    assert lift[31:].tolist() == [0, 0]
+    _, few = figures._swarm(values[:2], edges)
+    np.testing.assert_allclose(np.diff(np.sort(few)), 0.6 / 8)
 
 
 def test_thinned_lines_keep_ends_and_peaks():

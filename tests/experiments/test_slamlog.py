@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slamgym.experiments.logs import log_lines
 from slamgym.experiments.logs.decimals import texts
 from slamgym.experiments.logs.ground_truth import hides_identities, without_identities
 from slamgym.experiments.logs.slamlog import (
@@ -344,3 +345,36 @@ def test_victoria_park_has_sizes_and_no_identities(public_logs):
     assert sum(len(scan.measurements) for scan in scans) == 52974
     assert all(s.landmark_ids is None and s.sizes is not None for s in scans)
     assert np.isnan(log.ground_truth[:, 3]).all()
+
+
+def test_texts_in_errors_are_cut_and_ids_have_18_digits():
+    assert log_lines.shown("x" * 58) == f"'{'x' * 58}'"
+    assert log_lines.shown("x" * 59) == f"'{'x' * 59}…"
+    line = log_lines.LogLine("file", 3, "")
+    assert line.to_id("9" * 18) == 10**18 - 1
+    with pytest.raises(LogError, match="file, line 3: expected an id"):
+        line.to_id("9" * 19)
+
+
+def test_a_row_without_any_number_above_others_is_a_header():
+    for text, rest in (
+        ("x y\n1 a", ["1 a"]),
+        ("x 1\n2 3", ["x 1", "2 3"]),
+        ("x", ["x"]),
+    ):
+        lines = log_lines.content_of(log_lines.to_lines(text, "file"))
+        assert [line.text for line in lines] == rest
+
+
+def test_rows_that_are_not_all_plain_numbers_are_read_one_by_one():
+    for other in "", " ", "-1e101 1", "1 1e101", "1 nan", "1 x":
+        assert log_lines.plain_rows(["1 2", other]) is None
+    assert log_lines.plain_rows(["1 2", "-1e100 1e100"])[1].tolist() == [-1e100, 1e100]
+
+
+def test_a_device_and_other_text_than_utf_8_are_refused(tmp_path):
+    with pytest.raises(LogError, match="/dev/null must be a file or a pipe, got a dev"):
+        log_lines.read_text("/dev/null")
+    (tmp_path / "log").write_bytes(b"\n\n\xff")
+    with pytest.raises(LogError, match=r"log, line 3: .* got byte 0xff: save the file"):
+        log_lines.read_text(tmp_path / "log")

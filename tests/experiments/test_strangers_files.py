@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import slamgym
+from scipy.spatial.transform import Rotation
 
 from slamgym import read_log
 from slamgym.estimator.models import predict_pose
@@ -428,6 +429,12 @@ ROS = (
 )
 
 
+COVARIANCES = {
+    f"tum, {count} entries": TUM.replace("\n", " 0" * count + "\n")
+    for count in (6, 9, 21, 36)
+}
+
+
 def matrices(camera):
     rows = []
     for x, y, a in IN_SPACE:
@@ -439,14 +446,17 @@ def matrices(camera):
     return "".join(" ".join(map(repr, row)) + "\n" for row in rows)
 
 
-PATHS = {
+PATHS = COVARIANCES | {
     "tum": TUM,
     "tum, header": "# timestamp tx ty tz qx qy qz qw\n" + TUM,
     "tum, title": "# ground truth trajectory\n# file: 'x.bag'\n" + TUM,
+    "tum, names": "timestamp tx ty tz qx qy qz qw\n" + TUM,
     "tum, commas": TUM.replace(" ", ","),
     "kitti": matrices(camera=True),
     "kitti, z up": matrices(camera=False),
     "euroc": EUROC_HEAD + EUROC_ROWS,
+    "euroc, no velocity": EUROC_HEAD.replace("#", "").replace(", v_RS_R_x [m s^-1]", "")
+    + EUROC_ROWS.replace(",0.1\n", "\n"),
     "euroc, no header": EUROC_ROWS.replace(",0.1\n", ",0.1" + ",0" * 8 + "\n"),
     "ros": ROS,
     "csv": f"t,x,y,yaw\n0,5,6,0\n1,6,6,0\n2,7,6,{TURN}\n3,8,8,{TURN}\n",
@@ -467,13 +477,35 @@ def test_true_paths_of_all_formats_are_the_same(file, name):
     np.testing.assert_allclose(np.diff(rows[:, 0]), 1, atol=1e-5)
 
 
+@pytest.mark.parametrize("axis", "XY")
+@pytest.mark.parametrize("degrees", [29, 31])
+def test_poses_tilted_by_at_most_30_degrees_have_a_heading(file, axis, degrees):
+    turn = Rotation.from_euler(f"Z{axis}", (1.0, math.radians(degrees)))
+    quaternion = ",".join(map(str, 1.02 * turn.as_quat()))
+    both = np.array([np.eye(3, 4), np.column_stack([turn.as_matrix(), np.zeros(3)])])
+    texts = (
+        f"t,x,y,qx,qy,qz,qw\n0,0,0,0,0,0,1\n1,0,0,{quaternion}\n",
+        "\n".join(" ".join(map(str, row.ravel())) for row in both),
+    )
+    for text in texts:
+        path = file(text, "path.txt")
+        if degrees < 30:
+            heading = math.atan2(*both[1, [1, 0], 0])
+            assert true_path(path)[1, 3] == pytest.approx(heading)
+            continue
+        with pytest.raises(LogError, match="pose 1 tilted by more than 30°"):
+            true_path(path)
+
+
 def test_a_true_path_of_numbers_may_have_any_number_of_rows(file):
     rows = np.arange(24.0).reshape(6, 4) / 100
     text = "".join("{} {} {} {}\n".format(*row) for row in rows.tolist())
     np.testing.assert_array_equal(true_path(file(text, "path.txt")), rows)
 
 
-@pytest.mark.parametrize("name", ["tum", "kitti", "csv", "utias", "graph", "slamlog"])
+@pytest.mark.parametrize(
+    "name", ["tum", "kitti", "csv", "utias", "graph", "slamlog", *COVARIANCES]
+)
 @pytest.mark.parametrize("kind", ["csv", "graph"])
 def test_the_truth_of_a_log_may_be_in_any_format(folder, file, name, kind):
     log = folder(odometry=ODOMETRY, measurements=MEASUREMENTS)
@@ -493,9 +525,10 @@ def test_a_truth_with_epoch_stamps_is_set_to_the_clock_of_the_log(folder, file):
     epoch = 1700000000
     odometry = "t,d,alpha\n" + "".join(f"{epoch + k},1,0\n" for k in range(4))
     readings = f"t,id,bearing,range\n{epoch + 2},7,0,1\n"
-    truth = file("".join(f"{epoch + k} {k} 0 0 0 0 0 1\n" for k in range(4)))
+    times = [0, 1, 2, 2, 3]  # one pose is given twice
+    truth = file("".join(f"{epoch + k} {k} 0 0 0 0 0 1\n" for k in times))
     log = read_log(folder(odometry=odometry, measurements=readings), truth=truth)
-    assert log.ground_truth[:, 0].tolist() == [0, 1, 2, 3]
+    assert log.ground_truth[:, 0].tolist() == times
 
 
 @pytest.mark.parametrize(
@@ -505,6 +538,7 @@ def test_a_truth_with_epoch_stamps_is_set_to_the_clock_of_the_log(folder, file):
         ("0 0 1 0 1 0 0 0 0 1 0 0\n" * 2, "pose 0 tilted by more than 30°: convert"),
         (TUM.replace("\n", "9\n", 1).replace("0 5", "90 5"), "path.txt"),
         ("# format: slamlog 1\nodometry,1,1,0,1\n", "expected a true path with poses"),
+        (TUM.replace("7 6", "7 1e101"), "path.txt, line 2: expected"),
         ("t,east,yaw\n0,1,2\n1,1,2\n", "expected truth, a table with the columns t"),
         (matrices(camera=True) * 2, "expected a pose for each of the 4 times of the l"),
         ("".join(f"{k + 50} 1 2 0 0 0 0 1\n" for k in range(3)),

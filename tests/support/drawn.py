@@ -23,10 +23,11 @@ _DATA = ("xydata", "offsets", "widths", "heights", "angles", "segments", "array"
 _AXES = ("xlim", "ylim", "xscale", "yscale", "aspect", "facecolor")
 _LEGEND = ("_ncols", "_loc", "handlelength", "handletextpad", "columnspacing")
 _LEGEND += ("borderpad", "labelspacing", "borderaxespad")
-_NOTE = ("xy", "xyann", "xycoords", "textcoords")
+_NOTE = ("xy", "xyann", "xycoords", "textcoords", "_unscaled_dash_pattern")
 _USUAL = ("visible=True", "clip_on=True", "clim=(None, None)", "fontweight=normal")
 _USUAL += ("rotation=0", "va=baseline", "ha=left", "aspect=auto", "offsets=(0, 0)")
 _USUAL += ("xscale=linear", "yscale=linear", "facecolor=#ffffffff", "zorder=2")
+_USUAL += ("_unscaled_dash_pattern=(0, None)",)
 
 
 def check_looks(figure, name):
