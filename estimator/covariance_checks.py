@@ -64,7 +64,7 @@ class _Gaussian(NamedTuple):
 
     def gaps(self, other: _Gaussian) -> tuple[Array, Array]:
         """Return how far another belief is away, in deviations of this one."""
-        std = np.sqrt(self.covariance.diagonal())
+        std = np.sqrt(np.abs(self.covariance.diagonal())) + 1e-9  # mistakes may be ≤ 0
         moved = other.mean - self.mean
         moved[2] = wrap_angle(float(moved[2]))
         spread = np.abs(other.covariance - self.covariance) / np.outer(std, std)
@@ -141,8 +141,13 @@ class _Prediction(NamedTuple):
         """Yield mistakes by a factor, which is fitted to the belief after this call."""
         kept = self._replace(R=0 * self.R).right().covariance
         inner = self.F.T @ (got.covariance - kept)[:3, :3] @ self.F  # F⁻¹ = Fᵀ
+        names = ("εx", "εy", "εα")
         yield from _noise_factors(
-            "motion noise", inner, self.R, ("εx", "εy", "εα"), "R"
+            "motion noise",
+            inner,
+            self.R,
+            names,
+            lambda f, q: q._replace(R=q.R @ f).right(),
         )
         yield from _covariance_changes(self.right(), got)
 
@@ -338,7 +343,18 @@ class _ScanUpdate(NamedTuple):
             own = slice(3 + 2 * self.slots[0], 5 + 2 * self.slots[0])
             N = np.linalg.inv(self.Hl[0])
             inner = np.linalg.inv(N.T @ gained[own, own] @ N)
-        yield from _noise_factors("sensor noise", inner, self.Q, _READING, "Q")
+        noise = "sensor noise", inner, self.Q, _READING
+        yield from _noise_factors(*noise, lambda f, q: q._replace(Q=q.Q @ f).right())
+        if len(self.new):
+            yield from _noise_factors(*noise, _with_noise_of_new)
+
+
+def _with_noise_of_new(factors: Array, call: _ScanUpdate) -> _Gaussian:
+    """Return the result with another noise of new landmarks, or of all if none is."""
+    Q = call.Q @ factors
+    if len(call.new):
+        return call.extended(call.corrected(), Q=Q)
+    return call._replace(Q=Q).right()
 
 
 def _wrapped(nu: Array) -> Array:
@@ -645,13 +661,6 @@ _CORRECTION: Sequence[tuple[str, Callable[[_ScanUpdate], _Gaussian]]] = (
     ),
     *(
         (
-            "the gain lacks S⁻¹, K = P Hᵀ",
-            lambda q, form=form: form(q, q.before.covariance @ q.jacobian.T),
-        )
-        for form in (_ScanUpdate.corrected, _ScanUpdate.downdated)
-    ),
-    *(
-        (
             "only the diagonal of S is inverted",
             lambda q, form=form: form(
                 q,
@@ -672,7 +681,10 @@ _CORRECTION: Sequence[tuple[str, Callable[[_ScanUpdate], _Gaussian]]] = (
         )
         for form in (_ScanUpdate.corrected, _ScanUpdate.downdated)
     ),
-    ("(I − K H) is multiplied twice", lambda q: q.downdated(n=2)),
+    (
+        "(I − K H) is multiplied twice, or (I − K H) P (I − K H)ᵀ lacks K Q Kᵀ",
+        lambda q: q.downdated(n=2),
+    ),
     (
         "P' lacks (I − K H) P = P − K H P: it is P − K H",
         lambda q: q.corrected()._replace(
@@ -690,13 +702,6 @@ _CORRECTION: Sequence[tuple[str, Callable[[_ScanUpdate], _Gaussian]]] = (
         "P' = P − K Kᵀ lacks S",
         lambda q: q.corrected()._replace(
             covariance=q.before.covariance - q.gain @ q.gain.T
-        ),
-    ),
-    (
-        "the form (I − K H) P (I − K H)ᵀ lacks K Q Kᵀ",
-        lambda q: q.corrected()._replace(
-            covariance=(np.eye(len(q.gain)) - q.gain @ q.jacobian)
-            @ q.downdated().covariance.T
         ),
     ),
     (
@@ -797,7 +802,11 @@ def _wrong_noises(what: str, noise: Array, std: Array) -> Iterator[tuple[str, Ar
 
 
 def _noise_factors(
-    what: str, inner: Array, noise: Array, names: Sequence[str], part: str
+    what: str,
+    inner: Array,
+    noise: Array,
+    names: Sequence[str],
+    wrong: Callable[[Array, Any], _Gaussian],
 ) -> Iterator[tuple[str, Callable[[Any], _Gaussian]]]:
     """Yield the mistakes of a noise that counts too often, as a whole or in a part."""
     ratios = inner.diagonal() / noise.diagonal()
@@ -810,13 +819,8 @@ def _noise_factors(
     for text, factors in candidates:
         factor = factors[np.abs(factors - 1).argmax()]
         if factor > -_TOLERANCE:
-            times = partial(_with_noise, part, np.diag(factors))
+            times = partial(wrong, np.diag(factors))
             yield f"the variance of {text} is multiplied by {factor:.3g}", times
-
-
-def _with_noise(part: str, factors: Array, call: Any) -> _Gaussian:
-    result: _Gaussian = call._replace(**{part: getattr(call, part) @ factors}).right()
-    return result
 
 
 def _covariance_changes(
@@ -896,6 +900,7 @@ def step_mistakes(make: Callable[[Mapping[str, Any]], Any]) -> Iterator[Mistake]
     if _UPDATE not in parts:
         yield from _wrong_nis(made)
     if not any(parts):
+        yield from _asymmetric(made)
         yield from _rounded(made)
     if failure:
         raise failure
@@ -950,6 +955,11 @@ def _state(belief: Belief, ids: Sequence[int]) -> _Gaussian | None:
     return _Gaussian(part.covariance, part.mean)
 
 
+def _is_symmetric(belief: _Gaussian) -> bool:
+    P, std = belief.covariance, np.sqrt(np.abs(belief.covariance.diagonal())) + 1e-9
+    return bool(((P - P.T) / np.outer(std, std)).max() < 1e-6)
+
+
 def _is_proper(belief: _Gaussian) -> bool:
     """Return whether a belief is finite, symmetric and definite."""
     P = belief.covariance
@@ -957,8 +967,7 @@ def _is_proper(belief: _Gaussian) -> bool:
     if not (np.isfinite(belief.mean).all() and np.isfinite(P).all() and std.all()):
         return False
     correlations = P / np.outer(std, std)
-    skew = np.abs(correlations - correlations.T).max()
-    return bool(skew < 1e-6 and np.linalg.eigvalsh(correlations)[0] > 1e-9)
+    return bool(_is_symmetric(belief) and np.linalg.eigvalsh(correlations)[0] > 1e-9)
 
 
 def _named(method: str, wrong: Sequence[_Made], fine: Sequence[_Made]) -> Mistake:
@@ -1041,6 +1050,15 @@ def _wrong_nis(made: Sequence[_Made]) -> Iterator[Mistake]:
         if abs(report.nis / right - 1) > 0.05:
             text = f"must be νᵀ S⁻¹ ν = {right:.3g}, got {report.nis:.3g}"
             yield Mistake("update().nis " + text, "", "")
+            return
+
+
+def _asymmetric(made: Sequence[_Made]) -> Iterator[Mistake]:
+    """Yield that a covariance is not symmetric, where this is within tolerance."""
+    for each in made:
+        if not _is_symmetric(each.got):
+            text = f"so it is in step {each.step}"
+            yield Mistake("belief()", "the covariance is not symmetric", text)
             return
 
 

@@ -119,7 +119,7 @@ TESTS = {
     "estimator/map_management": f"{SCANS} missed_detections map_editor",
     "estimator/map_management/clear_scans": "clear_scans map_management",
     "estimator/map_management/recent_scans": f"{SCANS} clear_scans",
-    "estimator/map_management/map_editor": "map_editor map_management",
+    "estimator/map_management/map_editor": "map_editor map_management loop_closing",
     f"{LARGE}/compressed": "compressed large_maps errors_change_nothing",
     f"{LARGE}/elimination": "submaps sparse_information smoother",
     f"{LARGE}/multifrontal": "sparse_information",

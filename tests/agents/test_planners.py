@@ -1,6 +1,7 @@
 """Compare planners and baselines with their formulas, plan by plan, goal by goal."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from slamgym.agents.active_slam_baselines import (
     coverage_lanes,
     make_baseline,
     nearest_goal,
+    steer,
 )
 from slamgym.agents.belief_space_planner import GREEDY, MPC, BeliefSpacePlanner
 from slamgym.agents.wall_routes import CoverageGrid
@@ -246,8 +248,52 @@ def test_lanes_run_up_and_down_then_across():
     up = [(x[k], y[-1 * ((k + end) % 2)]) for k in range(4) for end in (0, 1)]
     across = [(x[-1 * ((k + end) % 2)], y[k]) for k in range(3) for end in (0, 1)]
     np.testing.assert_allclose(lanes, [*up, *across])
-    far = coverage_lanes(floor(-4.0, 2.0, 16.0, 18.0, sensor={"max_range": 99.0}))
-    assert (far == (6.0, 10.0)).all()  # from where all of the floor is in view
+    for left, bottom, right, top in ((-4, 2, 16, 18), (-10, 3, 10, 5), (3, -10, 5, 10)):
+        far = coverage_lanes(floor(left, bottom, right, top, sensor={"max_range": 99}))
+        middle = np.array([[(left + right) / 2, (bottom + top) / 2]])
+        # from there, all of the floor is in view
+        np.testing.assert_allclose(far, middle.repeat(len(far), axis=0), atol=1e-12)
+
+
+def test_around_inner_walls_coverage_visits_points_of_its_lanes(knowledge):
+    points, lanes = [], coverage_lanes(knowledge.scenario)
+    for start, end in pairwise(lanes):
+        count = math.ceil(math.dist(start, end) / 2.0)  # at most 2 m apart
+        points += [start + k / count * (end - start) for k in range(count)]
+    expected = knowledge.grid.routes.kept_clear(np.array([*points, lanes[-1]]))
+    baseline = make_baseline("coverage", knowledge.scenario, np.random.default_rng(0))
+    np.testing.assert_allclose(baseline._waypoints.points, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("heading", [0.0, 3.1, -3.1])
+@pytest.mark.parametrize(
+    ("aside", "far", "speed", "turn"),
+    [(0.39, 5, 0.8, 0.78), (-0.41, 5, 0, -0.82), (3, 5, 0, 1.2), (0, 0.2, 0.4, 0)],
+)
+def test_a_robot_drives_to_what_is_ahead_and_turns_to_the_rest(
+    heading, aside, far, speed, turn
+):
+    way = far * np.array([math.cos(heading + aside), math.sin(heading + aside)])
+    here = np.array([2.0, -1.0, heading])
+    action = steer(here, here[:2] + way, ROBOT, 0.5)
+    np.testing.assert_allclose(action, (speed, turn), atol=1e-12)
+
+
+def test_frontier_drives_to_the_nearest_unseen_cell_while_landmarks_are_missing(
+    knowledge,
+):
+    now, routes, pose = knowledge, knowledge.grid.routes, knowledge.belief.pose
+    frontier, revisit = (
+        make_baseline(name, now.scenario, np.random.default_rng(0))
+        for name in ("frontier", "revisit")
+    )
+    unseen = points_of(now.grid.cells)[~now.explored & routes.reachable]
+    goal = unseen[routes.distances(pose[None, :2], unseen)[0].argmin()]
+    legs = routes.legs(pose[:2], routes.kept_clear(goal[None])[0])
+    expected = steer(pose, legs[0], ROBOT, 0.5)
+    np.testing.assert_array_equal(frontier.act(now), expected)
+    complete = now._replace(known=now.known[list(now.belief.landmark_ids)])
+    np.testing.assert_array_equal(frontier.act(complete), revisit.act(complete))
 
 
 def test_the_coverage_baseline_leaves_a_lane_half_a_step_before_its_end():

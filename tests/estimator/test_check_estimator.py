@@ -521,120 +521,224 @@ def test_the_example_can_be_managed(monkeypatch):
     assert_close_beliefs(own.belief(), shipped.belief())
 
 
-def textbook_module(old="", new=""):
-    """Import the example, with one text of it in place of another."""
+#: Lines of the example after which a statement is added, by the method they are in.
+PLACES = {
+    "u": "d, alpha = np.asarray(odometry, dtype=float)",
+    "c": "c, s = np.cos(self.x[2]), np.sin(self.x[2])",
+    "F": "F[:2, :2] = (c, -s), (s, c)",
+    "P": "self.P = G @ self.P @ G.T + F @ self.R @ F.T * dt",
+    "m": "known = tuple(i for i in scan if i in self.ids)",
+    "k": "at, pair = 3 + 2 * self.ids.index(i), slice(2 * k, 2 * k + 2)",
+    "H": "H[pair, at : at + 2] = (-dy / r**2, dx / r**2), (dx / r, dy / r)",
+    "z": "nu[pair] = scan[i] - (np.arctan2(dy, dx) - self.x[2], r)",
+    "ν": "nu[::2] = wrap_angle(nu[::2])",
+    "S": "S = H @ self.P @ H.T + np.kron(np.eye(len(known)), self.Q)",
+    "K": "K = np.linalg.solve(S, H @ self.P).T",
+    "D": "K = np.linalg.solve(S, H @ self.P).T",  # and P − K H P in place of P − K S Kᵀ
+    "+": "self.x, self.P = self.x + K @ nu, self.P - K @ S @ K.T",
+    "l": "c, s = np.cos(self.x[2] + beta), np.sin(self.x[2] + beta)",
+    "J": "J[-2:, :3] = (1, 0, -r * s), (0, 1, r * c)",
+    "B": "B[-2:] = (-r * s, c), (r * c, s)",
+    "n": "self.ids.append(landmark)",
+    "a": "self._add(i, *scan[i])",
+    "e": "nis = float(nu @ np.linalg.solve(S, nu))",
+    "R": "self.R = np.diag(np.square(motion_std))",
+    "Q": "self.Q = np.diag(np.square(measurement_std))",
+    "b": '"""Return a snapshot: a Belief copies its arguments."""',
+}
+METHODS = {
+    **dict.fromkeys("ucFPRb", "predict()"), **dict.fromkeys("mkHzνSKD+Q", "update()"),
+    **dict.fromkeys("lJBnae", "update() of new landmarks"),
+}  # fmt: skip
+SHORT = {
+    "A": "A = np.eye(len(K)) - K @ H; ",
+    "E": "is an elementwise product (*), which must be a matrix product (@)",
+    "N": "N = F @ self.R @ F.T * dt; ",
+    "Q": "np.kron(np.eye(len(known)), self.Q)",
+    "first": "and must drive d along the old heading, then turn",
+    "T": "t = self.x[2] + alpha; ",
+    "box": "B = np.kron(np.eye(50), np.ones((2, 2)))[1:, 1:][: len(P), : len(P)]; "
+    "B[:3, :3] = 1; ",
+    "twice": "(I − K H) is multiplied twice, or (I − K H) P (I − K H)ᵀ lacks K Q Kᵀ",
+    "o": "o = np.sqrt(np.outer(*[self.P.diagonal()] * 2)) + 1e-300; ",
+}
+#: The place, the cause that is named, and the statement; P is the covariance before.
+MISTAKES = """
+u | the odometry is lost, as if d = α = 0 | d = alpha = 0.0
+P | the mean does not move | self.x[:3] -= d * c, d * s, alpha
+F | the covariance is not predicted | G, dt = np.eye(len(G)), 0.0
+u | it drives forward where d < 0 | d = abs(d)
+u | it does not drive where d < 0 | d = max(d, 0.0)
+u | d has the wrong sign | d = -d
+u | the turn α has the wrong sign | alpha = -alpha
+u | it turns left where α < 0 | alpha = abs(alpha)
+u | the turn α is not added | alpha = 0.0
+u | the odometry is multiplied by dt | d, alpha = d * dt, alpha * dt
+u | d and α are exchanged | d, alpha = alpha, d
+c | it drives along θ + α/2, {first} | t = self.x[2] + alpha / 2; c, s = np.cos(t), np.sin(t)
+c | it turns before it moves, {first} | {T}c, s = np.cos(t), np.sin(t)
+c | the sine of the heading has the wrong sign | s = -s
+c | sine and cosine of the heading are exchanged | c, s = s, c
+F | ∂x'/∂θ has the wrong sign | G[0, 2] *= -1
+F | ∂y'/∂θ has the wrong sign | G[1, 2] *= -1
+F | ∂x'/∂θ and ∂y'/∂θ are missing | G = np.eye(len(G))
+F | ∂x'/∂θ and ∂y'/∂θ have the wrong sign | G = 2 * np.eye(len(G)) - G
+F | G is transposed, P' = Gᵀ P G | G = G.T
+F | the Jacobian G is that of the new heading | {T}G[:2, 2] = -d * np.sin(t), d * np.cos(t)
+P | Gᵀ is missing, P' = G P | {N}self.P = G @ P + N
+P | G P Gᵀ {E} | {N}self.P = G * P * G.T + N
+P | G P Gᵀ {E} | {N}self.P = G @ P * G.T + N
+P | G P Gᵀ {E} | {N}self.P = (G * P) @ G.T + N
+P | G P Gᵀ {E} | {N}self.P[:3, :3] = (G * P * G.T + N)[:3, :3]
+P | G P Gᵀ {E} | {N}self.P[:3, :3] = (G[:3, :3] @ P[:3, :3] * G[:3, :3].T + N[:3, :3])
+P | G P Gᵀ {E} | {N}self.P[:3, :3] = ((G * P)[:3, :3] @ G[:3, :3].T + N[:3, :3])
+P | F R Fᵀ {E} | self.P = G @ P @ G.T; self.P[:3, :3] += dt * F[:3] * self.R * F[:3].T
+P | F R Fᵀ {E} | self.P = G @ P @ G.T; self.P[:3, :3] += dt * (F[:3] @ self.R) * F[:3].T
+P | F R Fᵀ {E} | self.P = G @ P @ G.T; self.P[:3, :3] += dt * (F[:3] * self.R) @ F[:3].T
+F | F is transposed, the motion noise is rotated by −θ | F[:3] = F[:3].T
+F | ∂x'/∂εy has the wrong sign | F[0, 1] *= -1
+F | ∂y'/∂εy is missing | F[1, 1] = 0
+F | the motion noise is not rotated by the heading | F = np.eye(len(G), 3)
+F | the motion noise is rotated by the new heading | {T}C, Z = np.cos(t), np.sin(t); F[:2, :2] = (C, -Z), (Z, C)
+F | the variance of the motion noise is not multiplied by dt | dt = 1.0
+F | the variance of the motion noise is multiplied by dt² | dt = dt**2
+F | the variance of the motion noise is multiplied by √dt | dt = dt**0.5
+F | the variance of the motion noise is divided by dt | dt = 1 / dt
+F | the motion noise is multiplied by |d| | dt *= abs(d)
+F | the motion noise is multiplied by d² | dt *= d**2
+F | the motion noise is missing where d = 0 | dt *= d != 0
+F | the motion noise is missing | dt = 0.0
+F | the variance of the motion noise is multiplied by 0.5 | dt /= 2
+F | the variance of the motion noise in εy is multiplied by 3 | F[:, 1] *= 3**0.5
+R | standard deviations of the motion noise are used as variances | self.R **= 0.5
+R | standard deviations of the motion noise are in another order | self.R = self.R[::-1, ::-1]
+P | the covariance of pose and landmarks is not multiplied by G | self.P[:3, 3:], self.P[3:, :3] = P[:3, 3:], P[3:, :3]
+P | the covariance is multiplied by 1.05 | self.P *= 1.05
+P | 2e-06 is added to every variance | self.P += 2e-6 * np.eye(len(P))
+P | the covariance of pose and landmarks is set to zero | self.P[:3, 3:] = 0; self.P[3:, :3] = 0
+P | the covariance of different landmarks is set to zero | {box}B[:3] = B[:, :3] = 1; self.P *= B
+P | all covariances of pose and landmarks with each other are set to zero | {box}self.P *= B
+P | only the variances are kept, all covariances are set to zero | self.P = np.diag(self.P.diagonal())
+P | correlations are rounded to 0 decimals | {o}self.P = (self.P / o).round(0) * o
+b | correlations are rounded to 1 decimals | {o}self.P = (self.P / o).round(1) * o
+P | the covariance is rounded to 2 decimals | self.P = self.P.round(2)
+P | the covariance is rounded to 5 decimals | self.P = self.P.round(5)
+P | the covariance is rounded to 6 decimals | self.P = self.P.round(6)
+P | the mean is rounded to 0 decimals | self.x = self.x.round(0)
+P | the mean is rounded to 2 decimals | self.x = self.x.round(2)
+P | the mean is rounded to 3 decimals | self.x = self.x.round(3)
+n | the position of the robot is not added | self.x[-2:] -= self.x[:2]
+l | the heading is not added to the bearing | c, s = np.cos(beta), np.sin(beta)
+l | the heading is subtracted from the bearing | t = beta - self.x[2]; c, s = np.cos(t), np.sin(t)
+l | the bearing has the wrong sign | t = self.x[2] - beta; c, s = np.cos(t), np.sin(t)
+l | bearing and range are exchanged | t = self.x[2] + r; r = beta; c, s = np.cos(t), np.sin(t)
+l | sine and cosine are exchanged | c, s = s, c
+n | all covariances with the pose and other landmarks are missing | self.P[-2:, :-2] = 0; self.P[:-2, -2:] = 0
+e | the covariance with the pose is missing | self.P[len(P) :, :3] = 0; self.P[:3, len(P) :] = 0
+n | the covariance of two new landmarks is missing | self.P[-2:, 3:-2] = 0; self.P[3:-2, -2:] = 0
+n | new landmarks get the fixed variance 7, and no covariance | self.P[-2:] = 0; self.P[:, -2:] = 0; self.P[-2:, -2:] = 7 * np.eye(2)
+J | the uncertainty of the pose is left out | J[-2:, :3] = 0
+J | the uncertainty of the heading is left out | J[-2:, 2] = 0
+J | the uncertainty of the position is left out | J[-2:, :2] = 0
+J | ∂lx/∂θ has the wrong sign | J[-2, 2] *= -1
+J | ∂ly/∂y is missing | J[-1, 1] = 0
+B | ∂lx/∂r has the wrong sign | B[-2, 1] *= -1
+B | ∂ly/∂β is missing | B[-1, 0] = 0
+B | ∂l/∂z is transposed | B[-2:] = B[-2:].T
+B | ∂l/∂z is not multiplied by the range | B[:, 0] /= r
+B | ∂l/∂z is missing, P_ll = J P Jᵀ + Q | B[-2:] = np.eye(2)
+B | ∂l/∂z is missing, P_ll = J P Jᵀ + diag(σr², σβ²) | B[-2:] = np.eye(2)[::-1]
+B | the sensor noise is missing | B[:] = 0
+B | the variance of the sensor noise is multiplied by 2 | B *= 2**0.5
+B | the variance of the sensor noise in r is multiplied by 4 | B[:, 1] *= 2
+a | every reading is used twice | self.update([scan[i]], [i])
++ | the call changes nothing | self.x, self.P = self.x - K @ nu, P
++ | the covariance is not updated | self.P = P
++ | the mean is not updated | self.x = self.x - K @ nu
+z | arctan in place of arctan2 | nu[2 * k] += np.arctan2(dy, dx) - np.arctan(dy / dx)
+z | the arguments of arctan2 are exchanged | nu[2 * k] += np.arctan2(dy, dx) - np.arctan2(dx, dy)
+z | the heading is not subtracted from the expected bearing | nu[2 * k] -= self.x[2]
+z | the heading is added to the expected bearing | nu[2 * k] -= 2 * self.x[2]
+ν | the innovation has the wrong sign | nu = -nu
+ν | the innovation of the bearing is not used | nu[::2] = 0
+ν | the innovation of the range is not used | nu[1::2] = 0
+m | only the first reading of a scan is used | known = known[:1]
+m | only the last reading of a scan is used | known = known[-1:]
+m | the first reading of a scan is not used | known = known[1:]
+m | the last reading of a scan is not used | known = known[:-1]
+k | readings are assigned in the order of the map, and not by landmark_ids | at = sorted(3 + 2 * self.ids.index(j) for j in known)[k]
+S | every reading is used twice | S -= {Q} / 2
+S | the covariance of pose and landmarks is not used | self.P = self.P.copy(); self.P[:3, 3:] = 0; self.P[3:, :3] = 0; S = H @ self.P @ H.T + {Q}
+H | ∂β/∂θ has the wrong sign | H[2 * k, 2] = 1
+H | ∂β/∂θ is missing | H[2 * k, 2] = 0
+H | ∂r/∂ly has the wrong sign | H[2 * k + 1, at + 1] *= -1
+Q | standard deviations of the sensor noise are in another order | self.Q = self.Q[::-1, ::-1]
+Q | variances of the sensor noise are squared again | self.Q **= 2
+Q | the variance of the sensor noise is multiplied by 3 | self.Q *= 3
+K | the gain of the pose is missing | K[:3] = 0
+K | the gain of the heading is missing | K[2] = 0
+K | the gain of the landmarks is missing | K[3:] = 0
+K | landmarks that are not in the scan are not corrected | K[3:] *= H[:, 3:].any(axis=0)[:, None]
+K | only the diagonal of S is inverted | K = P @ H.T / S.diagonal()
+K | the gain is that of half the sensor noise | K = np.linalg.solve(S - {Q} / 2, H @ P).T
+K | the gain is that of twice the sensor noise | K = np.linalg.solve(S + {Q}, H @ P).T
+K | the gain is that of no sensor noise | K = np.linalg.solve(S - {Q}, H @ P).T
+D | the gain of the pose is missing | K[:3] = 0
+D | the gain of the heading is missing | K[2] = 0
+D | the gain of the landmarks is missing | K[3:] = 0
+D | only the diagonal of S is inverted | K = P @ H.T / S.diagonal()
+D | the gain is that of twice the sensor noise | K = np.linalg.solve(S + {Q}, H @ P).T
+D | the gain is that of no sensor noise | K = np.linalg.solve(S - {Q}, H @ P).T
++ | {twice} | {A}self.P = A @ A @ P
++ | P' lacks (I − K H) P = P − K H P: it is P − K H | self.P = P - K @ H
++ | (I − K H) P {E} | {A}self.P = A * P
++ | K S Kᵀ is added, and must be subtracted | self.P = P + K @ S @ K.T
++ | P' = P − K Kᵀ lacks S | self.P = P - K @ K.T
++ | {twice} | {A}self.P = A @ P @ A.T
++ | only the variances of pose and landmarks are updated | self.P[:3, 3:], self.P[3:, :3] = P[:3, 3:], P[3:, :3]
+""".strip().splitlines()  # noqa: E501
+
+
+def textbook_module(*edits):
+    """Import the example with statements added after some of its lines."""
     source = TEXTBOOK.read_text(encoding="utf-8")
-    assert not old or source.count(old) == 1
+    kept = [("G, F = np.eye(len(self.x)), np.eye(len(self.x), 3)", "P = self.P")]
+    for line, statement in [*kept, (PLACES["S"], "P = self.P"), *edits]:
+        assert source.count(line) == 1
+        source = source.replace(line, f"{line}; {statement}")
     module = ModuleType("textbook")
-    code = compile(source.replace(old, new) if old else source, TEXTBOOK, "exec")
-    exec(code, module.__dict__)
+    exec(compile(source, TEXTBOOK, "exec"), module.__dict__)
     return module
 
 
-INDENT = " " * 8
-READ = "d, alpha = np.asarray(odometry, dtype=float)\n" + INDENT
-COUNT = "self.n = getattr(self, 'n', 0) + 1\n" + INDENT
-MISTAKES = {
-    "sign of -d sin in G": ("G[:2, 2] = -d * s, d * c", "G[:2, 2] = d * s, d * c",
-        r"predict\(\): ∂x'/∂θ has the wrong sign: covariance\[0, 1\], of x and y, must "
-        r"be 3\.15e-06, got 5\.24e-06"),
-    "sign of d cos in G": ("G[:2, 2] = -d * s, d * c", "G[:2, 2] = -d * s, -d * c",
-        r"predict\(\): ∂y'/∂θ has the wrong sign: covariance\[1, 2\]"),
-    "G is the identity": ("G[:2, 2] = -d * s, d * c", "",
-        r"predict\(\): ∂x'/∂θ and ∂y'/∂θ are missing: covariance\[1, 1\]"),
-    "sign of a sine in F": ("F[:2, :2] = (c, -s), (s, c)",
-        "F[:2, :2] = (c, s), (s, c)", r"predict\(\): ∂x'/∂εy has the wrong sign"),
-    "noise along the axes of the world": ("F[:2, :2] = (c, -s), (s, c)", "",
-        r"predict\(\): the motion noise is not rotated by the heading"),
-    "half dt": ("F.T * dt", "F.T * dt / 2",
-        r"predict\(\): the variance of the motion noise is multiplied by 0\.5: "
-        r"covariance\[\d, \d\]"),
-    "dt squared": ("F.T * dt", "F.T * dt**2", "motion noise is multiplied by dt²"),
-    "no dt": ("F.T * dt", "F.T", "motion noise is not multiplied by dt"),
-    "deviations for variances of the motion": ("np.diag(np.square(motion_std))",
-        "np.diag(motion_std)",
-        "standard deviations of the motion noise are used as variances"),
-    "cross-covariance does not move": (
-        "self.P = G @ self.P @ G.T + F @ self.R @ F.T * dt",
-        "A, B = G[:3, :3], F[:3]\n"
-        "        self.P[:3, :3] = A @ self.P[:3, :3] @ A.T + B @ self.R @ B.T * dt",
-        r"predict\(\): the covariance of pose and landmarks is not multiplied by G: "
-        r"covariance\[\d, \d\], of .*l\d[xy], must be .*, got"),
-    "new landmark without cross-covariance": ("self.ids.append(landmark)",
-        "self.ids.append(landmark); self.P[-2:, :-2] = 0; self.P[:-2, -2:] = 0",
-        "new landmarks: all covariances with the pose and other landmarks are missing"),
-    "new landmark without the pose's covariance": (
-        "J[-2:, :3] = (1, 0, -r * s), (0, 1, r * c)", "",
-        "new landmarks: the uncertainty of the pose is left out"),
-    "new landmarks without each other's covariance": ("self.ids.append(landmark)",
-        "self.ids.append(landmark); self.P[-2:, 3:-2] = 0; self.P[3:-2, -2:] = 0",
-        "the covariance of two new landmarks is missing"),
-    "sign in the Jacobian of a new landmark": ("(1, 0, -r * s), (0, 1, r * c)",
-        "(1, 0, r * s), (0, 1, r * c)", "new landmarks: ∂lx/∂θ has the wrong sign"),
-    "new landmark without the noise of the reading": (" + B @ self.Q @ B.T", "",
-        "new landmarks: the sensor noise is missing"),
-    "reading of a new landmark used again": ("self._add(i, *scan[i])\n",
-        "self._add(i, *scan[i])\n        if new: self.update(*zip(*[(scan[i], i) for "
-        "i in new]))\n", "new landmarks: every reading is used twice"),
-    "scan used twice": (
-        "S = H @ self.P @ H.T + np.kron(np.eye(len(known)), self.Q)\n",
-        "H, nu = np.vstack([H, H]), np.append(nu, nu)\n"
-        "        S = H @ self.P @ H.T + np.kron(np.eye(2 * len(known)), self.Q)\n",
-        r"update\(\): every reading is used twice: "),
-    "sign of the heading in H": ("-dx / r**2, -1)", "-dx / r**2, 1)",
-        r"update\(\): ∂β/∂θ has the wrong sign"),
-    "no heading in H": ("-dx / r**2, -1)", "-dx / r**2, 0)",
-        r"update\(\): ∂β/∂θ is missing"),
-    "sign in the landmark's Jacobian": ("(dx / r, dy / r)", "(dx / r, -dy / r)",
-        r"update\(\): ∂r/∂ly has the wrong sign"),
-    "deviations of the readings swapped": ("np.diag(np.square(measurement_std))",
-        "np.diag(np.square(measurement_std)[::-1])",
-        "standard deviations of the sensor noise are in another order"),
-    "covariance not updated": ("self.P - K @ S @ K.T", "self.P",
-        r"update\(\): the covariance is not updated"),
-    "map not corrected": ("K = np.linalg.solve(S, H @ self.P).T",
-        "K = np.linalg.solve(S, H @ self.P).T; K[3:] = 0",
-        r"update\(\): the gain of the landmarks is missing"),
-    "innovation against the readings": ("self.x + K @ nu", "self.x - K @ nu",
-        r"update\(\): the innovation has the wrong sign: mean\[\d\]"),
-    "NIS without the noise": ("nu @ np.linalg.solve(S, nu)",
-        "nu @ np.linalg.solve(S / 2, nu)", r"update\(\)\.nis must be νᵀ S⁻¹ ν"),
-    "never drives backward": (READ, READ + "d = abs(d)\n" + INDENT,
-        r"predict\(\): it drives forward where d < 0: mean\[0\], x, .* \(in steps"),
-    "every eighth odometry lost": (READ, READ + COUNT + "if self.n % 8 == 0: return\n"
-        + INDENT, r"predict\(\): the call changes nothing: .* \(in steps 8, 16 of 20"),
-    "elementwise product": ("G @ self.P @ G.T", "G * self.P * G.T",
-        r"predict\(\): G P Gᵀ is an elementwise product"),
-    "transposed G": ("G @ self.P @ G.T", "G.T @ self.P @ G", "G is transposed"),
-    "noise that grows with the distance": ("F.T * dt", "F.T * dt * abs(d)",
-        r"the motion noise is multiplied by \|d\|"),
-    "no noise at rest": ("F.T * dt", "F.T * dt * (d != 0)",
-        "the motion noise is missing where d = 0"),
-    "arctan for arctan2": ("np.arctan2(dy, dx)", "np.arctan(dy / dx)",
-        r"update\(\): arctan in place of arctan2: mean\["),
-    "landmark mapped without the pose": ("self.x[:2] + np.array", "np.array",
-        r"new landmarks: the position of the robot is not added: mean\[3\], l1x"),
-    "only the first reading": ("known = tuple(i for i in scan if i in self.ids)",
-        "known = tuple(i for i in scan if i in self.ids)[:1]",
-        "only the first reading of a scan is used"),
-    "covariance downdated twice": ("self.P - K @ S @ K.T",
-        "self.P - 2 * K @ S @ K.T + K @ H @ K @ S @ K.T",
-        r"\(I − K H\) is multiplied twice"),
-    "correlations of one decimal": ("return Belief(self.x, self.P,",
-        "o = np.sqrt(np.outer(*[self.P.diagonal()] * 2)) + 1e-300; "
-        "self.P = (self.P / o).round(1) * o; return Belief(self.x, self.P,",
-        "correlations are rounded to 1 decimals"),
-    "inflated covariance": ("F.T * dt", "F.T * dt; self.P *= 1.05",
-        "the covariance is multiplied by 1.05"),
-}  # fmt: skip
-
-
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_wrong_covariance_is_named_with_the_entry_and_its_value(mistake):
-    old, new, complaint = MISTAKES[mistake]
-    textbook = textbook_module(old, new)
+def test_a_mistake_is_named_with_its_method(mistake):
+    place, cause, statement = mistake.format(**SHORT).split(" | ")
+    more = [(PLACES["+"], "self.P = P - K @ H @ P")] if place == "D" else []
+    textbook = textbook_module((PLACES[place], statement), *more)
     findings = find_breaches(textbook.TextbookEkf, ("correct",))
-    assert any(re.search(complaint, each.message) for each in findings), findings
+    start = f"{METHODS[place]}: {cause}: "
+    assert any(each.message.startswith(start) for each in findings), findings
+
+
+@pytest.mark.parametrize(
+    ("place", "statement", "text"),
+    [
+        ("F", "G[0, 2] *= -1",
+            "covariance[0, 1], of x and y, must be 3.15e-06, got 5.24e-06"),
+        ("u", "self.n = getattr(self, 'n', 0) + 1; d *= self.n % 8 > 0",
+            "mean[0], x, must be 4.15658, got 3.50634 (in steps 8, 16 of 20)"),
+        ("+", "self.P[0, 1] *= 1.001",
+            "belief(): the covariance is not symmetric: so it is in step 1"),
+        ("e", "nis *= 2", "update().nis must be νᵀ S⁻¹ ν = "),
+    ],
+)  # fmt: skip
+def test_a_finding_names_steps_and_the_entry_that_is_farthest_off(
+    place, statement, text
+):
+    textbook = textbook_module((PLACES[place], statement))
+    findings = find_breaches(textbook.TextbookEkf, ("correct",))
+    assert any(text in each.message for each in findings), findings
 
 
 def test_a_mistake_is_named_although_a_later_call_fails():
@@ -653,7 +757,9 @@ def test_a_mistake_is_named_although_a_later_call_fails():
 
 
 def test_the_readings_of_a_wrong_filter_are_not_called_unwrapped():
-    textbook = textbook_module("np.arctan2(dy, dx)", "np.arctan(dy / dx)")
+    textbook = textbook_module(
+        (PLACES["z"], "nu[2 * k] += np.arctan2(dy, dx) - np.arctan(dy / dx)")
+    )
     messages = [str(each) for each in find_breaches(textbook.TextbookEkf, ("correct",))]
     assert len(messages) == 1
     assert "wrap" not in messages[0]

@@ -654,6 +654,7 @@ def test_two_duplicates_of_a_landmark_are_merged_after_a_scan_of_one():
         apart.update(polar([(5, 1), (-3, 2)]), [k % 3, 9])
     slam.load_state_dict(apart.state_dict())
     assert slam.update(polar([(5, 1)]), [2]).merged_ids == ((0, 2), (0, 1))
+    assert slam.decisions[-1].merged == ((0, 2), (0, 1))
 
 
 @pytest.mark.parametrize("name", MANAGEABLE)
@@ -720,7 +721,7 @@ def test_beyond_its_capacity_a_map_gives_up_what_it_knows_least_of():
     slam.update(scan, [0, 1, 2])
     slam.update(scan[:2], [0, 1])
     report = slam.update(polar([(-3, 2)]), [3])
-    assert report.removed_ids == (2,)  # read once
+    assert report.removed_ids == slam.decisions[-1].removed == (2,)  # read once
     assert slam.belief().landmark_ids == (0, 1, 3)
     report = slam.update(polar([(-3, -2), (-3, 2)]), [4, 3])
     assert report.removed_ids == (0,)  # as often read as 1, but from farther
