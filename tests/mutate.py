@@ -186,7 +186,7 @@ TESTS = {
     "experiments/space_poses": "space_poses",
     "experiments/trajectories": "generate trajectory_formats belief_columns",
     "experiments/trajectories/formats": "trajectory_formats generate",
-    "experiments/trajectories/parquet": "trajectory_formats",
+    "experiments/trajectories/parquet": "trajectory_formats belief_columns",
     "experiments/viewers/rerun_recording": "rerun_recording",
     "experiments/viewers/run_page": "run_page",
     "sim_configs": "scenario layouts controls city randomisation extreme_scenarios",

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from presets import PRESETS
 
+from slamgym.envs.spaces import observation_space
 from slamgym.experiments.logs.importers import read_log
 from slamgym.experiments.logs.slamlog import OdometryRow, write_slamlog
 from slamgym.experiments.run_and_replay.log_replay import replay
@@ -256,6 +257,7 @@ def test_minari_loads_a_shard_and_makes_its_world_again(tmp_path, monkeypatch):
     for episode, drive in zip(data.iterate_episodes(), written, strict=True):
         assert episode.truncations.tolist() == [False] * 59 + [True]
         assert not episode.terminations.any()
+        assert not episode.rewards.any()
         observation, info = env.reset(seed=drive.seed)
         for step in range(61):
             seen = {k: v[step].tolist() for k, v in episode.observations.items()}
@@ -265,6 +267,15 @@ def test_minari_loads_a_shard_and_makes_its_world_again(tmp_path, monkeypatch):
                 observation, *_, info = env.step(episode.actions[step])
     sampled = data.observation_space
     assert all(sampled.contains(seen) for seen in observations(data))
+    changes = {"sensor": {"max_range": 50.0}, "robot": {"max_speed": 3.0}}
+    (other,) = drives("corridor", seeds=(1,), **changes)
+    layout.write([other, written[0]], tmp_path / "shard_00001-v0")
+    common = minari.load_dataset("shard_00001-v0").observation_space
+    each = [observation_space(drive.scenario) for drive in (other, written[0])]
+    for name in "landmarks", "odometry":
+        low = np.minimum(*(space[name].low for space in each))
+        assert (common[name].low == low).all()
+        assert (common[name].high == np.maximum(*(s[name].high for s in each))).all()
 
 
 def test_minari_combines_shards(tmp_path, monkeypatch):
