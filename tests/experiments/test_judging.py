@@ -251,10 +251,6 @@ IN_DEGREES = "headings in degrees instead of radians: "
 OTHER_ORDER = "the order (θ, x, y) instead of (x, y, θ): "
 WRONG = {
     "degrees": (lambda x, P: (x @ DEGREES, P), IN_DEGREES),
-    "degrees everywhere": (
-        lambda x, P: (x @ DEGREES, DEGREES @ P @ DEGREES),
-        IN_DEGREES,
-    ),
     "degrees in the covariance": (
         lambda x, P: (x, DEGREES @ P @ DEGREES),
         "covariances with headings in degrees: ",
@@ -275,33 +271,17 @@ WRONG = {
         lambda x, P: (x, std_of(P)),
         "standard deviations in place of variances: ",
     ),
-    "information": (
-        lambda x, P: (x, np.linalg.inv(P)),
-        "information matrices in place of covariances: ",
-    ),
     "clockwise": (lambda x, P: (x * [1, 1, -1], P), "headings that grow clockwise: "),
     "millimetres": (lambda x, P: (x * [1e3, 1e3, 1], P), "positions in millimetres: "),
     "another truth": (lambda x, P: (x / [100, 100, 1], P), "a truth in centimetres: "),
-    "another scale": (
-        lambda x, P: (x * [0.4, 0.4, 1], P),
-        "positions in a unit of 2.5 m: ",
-    ),
     "another axis": (lambda x, P: (x * [1, -1, 1], P), "y to the right of x: "),
     "left-handed": (
         lambda x, P: (x * [1, -1, -1], P * np.outer([1, -1, -1], [1, -1, -1])),
         "y to the right of x, and headings that grow clockwise: ",
     ),
-    "backward": (
-        lambda x, P: (x + np.array([0, 0, np.pi]), P),
-        "headings that are 180° off: ",
-    ),
     "to the left": (
         lambda x, P: (x + np.array([0, 0, np.pi / 2]), P),
         "headings that are 90° too large: ",
-    ),
-    "to the right": (
-        lambda x, P: (x - np.array([0, 0, np.pi / 2]), P),
-        "headings that are 90° too small: ",
     ),
     "compass": (
         lambda x, P: (np.array([0, 0, np.pi / 2]) + x * FLIP, np.outer(FLIP, FLIP) * P),
@@ -314,10 +294,6 @@ WRONG = {
     "covariance in centimetres": (
         lambda x, P: (x, P * np.outer([100, 100, 1], [100, 100, 1])),
         "covariances with positions in centimetres: ",
-    ),
-    "covariance in metres": (
-        lambda x, P: (x, P / np.outer([100, 100, 1], [100, 100, 1])),
-        "covariances with positions in metres, but poses in centimetres: ",
     ),
     "transposed transport": (
         lambda x, P: (x, transposed(x, P)),
@@ -645,16 +621,6 @@ def test_true_paths_from_elsewhere_give_the_same_nees(elsewhere, study):
 
 
 BAD_TRUTH = {
-    "w first": (
-        lambda rows: rows[:, [0, 1, 2, 3, 7, 4, 5, 6]],
-        "line 3: expected a rotation about z, qx and qy near 0, got qx qy qz qw = "
-        "1 0 0 0.00788: qw comes first; write it last",
-    ),
-    "camera axes": (
-        lambda rows: np.column_stack([rows[:, :4], np.full((30, 4), -0.5)]),
-        "line 1: expected a rotation about z, qx and qy near 0, got qx qy qz qw = "
-        "-0.5 -0.5 -0.5 -0.5, tilted by 90°; --space judges poses in space",
-    ),
     "no rotation": (
         lambda rows: rows * [1, 1, 1, 1, 0, 0, 0, 0],
         "line 1: expected a rotation qx qy qz qw of length 1 in the fields 5 to 8, got "
@@ -690,15 +656,6 @@ def test_a_wrong_true_path_is_refused_with_its_line(wrong, elsewhere):
     with pytest.raises(ValueError, match=re.escape(message)) as refusal:
         judge(mine / path.name, truth=path)
     assert f"drive_{SEED}.tum" in str(refusal.value)
-
-
-def test_comments_above_a_true_path_are_ignored(elsewhere):
-    mine, truth = elsewhere
-    before = judge(mine, truth=truth)
-    for path in truth.iterdir():
-        path.write_text(f"# ground truth trajectory\n#\n{path.read_text()}")
-    after = judge(mine, truth=truth)
-    assert after.pose_nees_invariant.equals(before.pose_nees_invariant)
 
 
 def test_poses_in_a_gap_of_the_truth_are_left_out_and_counted(elsewhere):

@@ -57,15 +57,6 @@ def test_a_run_in_order_gives_no_warning():
     assert run_warnings(run(standing([PLACES] * 30), management=True)) == []
 
 
-def test_many_rejections_are_told():
-    # a table moves by 1 m in the second half, under a gate
-    scans = [PLACES] * 20 + [PLACES + np.array([(1.0, 0.0), (0, 0), (0, 0)])] * 20
-    done = run(standing(scans, ids=[1, 2, 3]), gate_probability=0.999)
-    share = done.readings.rejected / (done.readings.associated + done.readings.rejected)
-    assert share > 0.1
-    assert any(f"rejects {share:.0%} of the readings" in w for w in run_warnings(done))
-
-
 @pytest.mark.parametrize(("factor", "words"), [(10, "too much"), (0.3, "too little")])
 def test_innovations_of_another_size_than_claimed_are_told(factor, words):
     log = standing([PLACES] * 40, ids=[1, 2, 3])

@@ -187,15 +187,6 @@ def test_a_convention_of_the_poses_in_space_is_named(change, folder, name, tmp_p
     assert found["cause"].startswith(f"convention: {name}: read so, the median errors")
 
 
-def test_left_and_right_error_in_space_have_the_same_nees(tmp_path):
-    found = []
-    for kind in "left", "right":
-        (tmp_path / kind).mkdir()
-        places = write(tmp_path / kind, 7, WRITTEN[kind], runs=4)
-        found.append(judge_in_space(*places, covariances=kind)["nees"]["pose"])
-    assert found[0] == pytest.approx(found[1], rel=1e-9)
-
-
 def test_the_truth_in_space_is_interpolated_along_its_twist(tmp_path):
     """A helix of a constant twist, known at half steps, is exact between them."""
     twist = np.array([0.5, 0, 0.2, 0.1, 0, 0.6])
