@@ -66,7 +66,7 @@ def true_path(path: Path) -> Array:
     if is_tum(path):
         lines = content_lines(path)
         rows = np.array([row[:8] for row in tum_rows(lines)])
-        headings = planar_headings(rows[:, 4:8], lines)
+        headings = planar_headings(rows[:, 4:], lines)
         found = np.column_stack([rows[:, :3], headings])
         places = [f"{line.file}, line {line.number}" for line in lines]
     else:
@@ -217,7 +217,7 @@ def near_truth(times: Array, due: Array) -> BoolArray:
     """Whether times (n,) lie within those of a true path, and in none of its gaps."""
     after = np.clip(np.searchsorted(due, times), 1, len(due) - 1)
     spacing = np.median(np.diff(due))
-    nearest = np.minimum(abs(times - due[after - 1]), abs(due[after] - times))
+    nearest = np.minimum(times - due[after - 1], due[after] - times)
     is_gap = (due[after] - due[after - 1] > _GAP * spacing) & (nearest > 0.05 * spacing)
     return np.asarray((times >= due[0]) & (times <= due[-1]) & ~is_gap)
 

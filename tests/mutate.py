@@ -158,7 +158,7 @@ TESTS = {
     ),
     "experiments/consistency_protocol": "consistency_protocol",
     "experiments/estimate_conventions": "estimate_conventions judging",
-    "experiments/estimate_files": "estimate_files judging",
+    "experiments/estimate_files": "estimate_files strangers_files judging",
     "experiments/figures": "figures",
     "experiments/figures/smoothed": "smooth_command",
     "experiments/environment_variables": "generate command_line",

@@ -88,9 +88,10 @@ def test_lines_of_a_csv_are_read_alike_at_once_and_one_by_one(tmp_path):
         wrong.write_text("\r\n".join([*lines[:place], "pose,", *lines[place:]]))
         with pytest.raises(LogError, match=f"line {place + 1}: expected pose,t,x"):
             read_estimates([wrong])
-    wrong.write_text("pose,\n")
-    with pytest.raises(LogError, match="line 1: expected pose,t,x"):
-        read_estimates([wrong])
+    for text in "pose,\n", f"pose{14 * ',1'}\n":
+        wrong.write_text(text)
+        with pytest.raises(LogError, match="line 1: expected pose,t,x"):
+            read_estimates([wrong])
 
 
 @pytest.mark.parametrize("count", [6, 9, 21, 36])
@@ -117,7 +118,7 @@ def test_a_tum_file_is_read_number_by_number(count, tmp_path):
         (0.06, 0, 1, True),
         (0, 0.048, 1, False),
         (0, -0.052, 1, True),
-        (0.06, 0, np.array([1, 1, 0, 1, 1, 1]), False),  # without variance of z
+        *((0.06, 0, np.arange(6) != k, False) for k in (2, 3, 4)),  # one is certain
         (0.06, 0, np.array([[[1]], [[0]], [[0]]]), True),
     ],
 )
@@ -156,7 +157,8 @@ def test_times_outside_a_true_path_or_in_its_gap_are_not_near_it():
     due = np.array([0.0, 1.0, 2.0, 3.0, 9.0, 10.0, 13.0])
     times = np.array([-0.1, 0.0, 2.5, 3.04, 3.07, 5.0, 8.97, 9.5, 11.5, 13.0, 13.1])
     near = [False, True, True, True, False, False, True, True, True, True, False]
-    assert near_truth(times, due).tolist() == near
+    for unit in 0.5, 2.0:
+        assert near_truth(unit * times, unit * due).tolist() == near
 
 
 def test_estimates_keep_the_labels_of_a_mapping(tmp_path):
@@ -167,12 +169,12 @@ def test_estimates_keep_the_labels_of_a_mapping(tmp_path):
         paths_by_label({"a": tmp_path, "b": []})
 
 
-@pytest.mark.parametrize("names", [["run1", "run01", "run2"], ["run1", "run2"]])
+@pytest.mark.parametrize("names", [["run1", "run01", "run2"], ["run2", "run1"]])
 @pytest.mark.parametrize("estimates", [["e1", "e01", "e2"], ["e1", "e2"]])
 def test_names_are_paired_only_if_what_differs_is_unique(names, estimates):
     read = {name: k for k, name in enumerate(estimates)}
     is_unique = len(names) == len(estimates) == 2
-    expected = {"run1": 0, "run2": 1} if is_unique else read
+    expected = {"run2": 1, "run1": 0} if is_unique else read
     assert paired(read, names) == expected
 
 
@@ -203,6 +205,7 @@ def test_a_true_path_is_tilted_by_at_most_30_degrees(turn, message, tmp_path):
     ("counts", "message"),
     [
         ((0, 0, 0), "line 1: expected t x y z .*, got no covariance"),
+        ((1, 1, 1), "line 1: expected t x y z .*, got 9 fields in"),
         ((6, 0, 9), "line 2: expected t x y z .*, got no covariance"),
         ((6, 6, 9), "expected lines t x y z .*, all alike, got lines of several"),
     ],
