@@ -140,7 +140,8 @@ READ_CLAIMS |= {
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("decides", ["additive", "invariant"])
 def test_covariances_are_read_in_every_convention(frame, decides):
-    found = list(_readings("", POSES, CLAIMS, np.eye(3), _Errors(frame, decides)))
+    turned = POSES + 4 * QUARTER  # headings are wrapped
+    found = list(_readings("", turned, CLAIMS, np.eye(3), _Errors(frame, decides)))
     A = {kind: _jacobian(POSES, kind) for kind in FRAMES}
     expected = {
         name: additive_covariances(POSES, read(CLAIMS), frame)
@@ -161,10 +162,9 @@ def test_covariances_are_read_in_every_convention(frame, decides):
             kinds[name] = kind
     assert {each.name for each in found} == set(expected)
     assert len(found) == len(expected) + 3  # two targets of each transport
-    wrapped = POSES - [0, 0, 2 * np.pi] * np.round(POSES / (2 * np.pi))
     for each in found:
         name, wanted = each.name, expected[each.name]
-        np.testing.assert_allclose(each.poses, wrapped, atol=1e-12)
+        np.testing.assert_allclose(each.poses, POSES, atol=1e-12)
         options = wanted if isinstance(wanted, list) else [wanted]
         assert any(np.allclose(each.covariances, C, rtol=1e-9) for C in options), name
         assert each.is_additive == (kinds[name] == decides == "additive")
@@ -241,8 +241,8 @@ def test_a_shift_between_steps_is_that_of_the_nearest_positions(offset):
     # Headings that are not wrapped do not count.
     poses = arcs(steps - offset) + 4 * QUARTER
     estimates = poses, np.broadcast_to(np.eye(3), (6, 3, 3, 3))
-    later = lambda shift: arcs(np.arange(12.0) + shift)  # noqa: E731
-    for truth_at in (None, later):
+    later = lambda shift: arcs(np.arange(12.0) + shift) + 1e-3  # noqa: E731
+    for truth_at, gap in ((None, 0.0), (later, 1e-3)):
         of = _Errors("additive", "invariant", truth_at)
         found = _between_steps(truth, steps, estimates, 3, of)
         if offset == 0.1:  # nearly a whole step
@@ -251,7 +251,7 @@ def test_a_shift_between_steps_is_that_of_the_nearest_positions(offset):
         ((first, *_),) = found
         side = "late" if offset > 0 else "early"
         assert first.name == f"time stamps that are {abs(offset):.1f} steps too {side}"
-        np.testing.assert_allclose(first.truth + 4 * QUARTER, poses, atol=1e-12)
+        np.testing.assert_allclose(first.truth + 4 * QUARTER, poses + gap, atol=1e-12)
 
 
 def as_by_cholesky(truth, reading):
@@ -312,16 +312,17 @@ def test_squares_of_an_honest_reading_have_a_mean_within_a_factor(mean):
     assert fit.is_honest == (1 / 2.5 < mean < 2.5)
 
 
-def test_two_poses_of_a_drive_show_a_convention():
+@pytest.mark.parametrize(("drives", "steps"), [(40, 2), (5, 30)])
+def test_two_poses_and_five_drives_show_a_convention(drives, steps):
     rng = np.random.default_rng(2)
-    truth = rng.uniform(-9, 9, (40, 2, 3))
-    given = (
-        truth + rng.normal(0, 0.1, truth.shape),
-        np.tile(np.eye(3) / 10, (40, 2, 1, 1)),
-    )
+    truth = rng.uniform(-9, 9, (drives, steps, 3))
+    claims = np.broadcast_to(np.eye(3) / 10, (drives, steps, 3, 3))
+    given = truth + rng.normal(0, 0.1, truth.shape), claims
     said = mistake_in_estimates(truth, *given, truth[:, 0])
     assert said.startswith("standard deviations in place of variances: read so, NEES")
-    assert mistake_in_estimates(*(a[:, :1] for a in (truth, *given)), truth[:, 0]) == ""
+    for few in np.s_[:, :1], np.s_[:4]:
+        some = [each[few] for each in (truth, *given)]
+        assert mistake_in_estimates(*some, some[0][:, 0]) == ""
 
 
 def test_far_smaller_errors_are_named_with_both():
@@ -376,6 +377,10 @@ def test_stray_poses_are_counted_between_good_ones():
     assert stray_poses(np.where(ratios == 99, 11.0, ratios), "abc").startswith(
         "4 poses"
     )
+    for ends in np.s_[:2], np.s_[-2:]:  # good neighbours at one side only
+        at_an_end = np.full((3, 20), 0.9)
+        at_an_end[1, ends] = 200.0
+        assert stray_poses(at_an_end, "abc") == ""
     many = np.tile([0.9, 0.9, 0.9, 200.0], (3, 5))
     assert stray_poses(many, "abc") == ""
     lasting = np.where(np.arange(20) > 9, 200.0, 0.9) * np.ones((3, 1))
