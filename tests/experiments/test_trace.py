@@ -19,6 +19,10 @@ from slamgym.experiments.run_and_replay.trace import (
 
 def test_first_steps_are_those_at_which_landmarks_enter():
     np.testing.assert_array_equal(make_trace(count=5).first_steps(), [0, 1, 2, 0, 1])
+    nothing, maps = make_trace(count=0).landmark_history[0], make_trace()
+    assert (make_trace(count=0).step_of_first_map(), maps.step_of_first_map()) == (0, 0)
+    later = (nothing, nothing, *maps.landmark_history[2:])
+    assert make_trace(landmark_history=later).step_of_first_map() == 2
 
 
 def test_landmark_covariances_are_blocks_of_the_final_covariance():
@@ -55,7 +59,9 @@ def test_arrays_that_do_not_fit_together_are_refused(name, value, message):
 
 
 def test_unknown_truth_may_be_missing():
-    assert make_trace(true_poses=None, true_landmarks=None).true_poses is None
+    trace = make_trace(true_poses=None, true_landmarks=None)
+    assert trace.true_poses is None
+    assert trace.every_true_landmark.shape == (0, 2)
 
 
 @pytest.mark.parametrize("frame", ["additive", "invariant"])
