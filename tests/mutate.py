@@ -106,6 +106,9 @@ TESTS = {
     "estimator/filters/batch": "batch",
     "estimator/filters/delayed_landmarks": "sensors saved_states",
     "estimator/filters/drive_likelihood": "drive_likelihood",
+    "estimator/filters/ekf": (
+        "ekf_slam filter_family sensors pose_readings errors_change_nothing"
+    ),
     "estimator/filters/imagine": "imagine",
     "estimator/filters/pose_readings": "pose_readings map_editor loop_closing",
     "estimator/filters/gaussian_map": (
@@ -124,7 +127,9 @@ TESTS = {
     f"{LARGE}/elimination": "submaps sparse_information smoother",
     f"{LARGE}/multifrontal": "sparse_information",
     f"{LARGE}/sparse_information": "sparse_information large_maps",
-    f"{LARGE}/submaps": "submaps submap_editing joining large_maps",
+    f"{LARGE}/submaps": (
+        "submaps submap_editing joining large_maps errors_change_nothing sensors"
+    ),
     "estimator/peers": "peers",
     "estimator/registry": (
         "representations models_of_logs filter_family ekf_slam large_maps peers"

@@ -120,7 +120,7 @@ FAR = np.inf
     [
         ([[1, FAR], [FAR, 2]], 0, 0, [0, 1]),
         ([[FAR, FAR]], 0, 0, [NEW]),
-        ([[12, FAR]], 0, 0, [AMBIGUOUS]),  # neither near enough nor far enough
+        ([[12, FAR]], 40, 0, [AMBIGUOUS]),  # neither near enough nor far enough
         ([[1, FAR], [4, FAR]], 0, 0, [0, AMBIGUOUS]),  # a landmark is seen but once
         ([[1, 2]], 0, 0, [0]),
         ([[1, 2]], 0, 3, [AMBIGUOUS]),
@@ -380,6 +380,19 @@ def test_the_share_of_landmarks_is_that_of_the_readings_which_prove_to_be_one():
         density = density.after(scan, range(4), landmarks=1)
     assert density.landmark_share == pytest.approx(0.25)
     assert density.after(scan, [], landmarks=999).landmark_share == 1.0
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_readings_of_tentative_landmarks_do_not_count_as_unexplained(row):
+    management = {"association": "nearest", "confirm": (3, 3)}
+    std = {"motion_std": (0.01,) * 3, "measurement_std": (0.05, 0.1)}
+    slam = make_estimator("ekf", **std, management=management)
+    scan, sums = np.array([(0.3, 4.6), (-0.5, 5.0)]), []
+    for readings in (scan, scan[[row]]):
+        slam.update(readings)
+        sums.append(slam.state_dict()["0.tentative.density"][:2])
+    (count, scans), (later, more) = sums
+    assert later / count == pytest.approx((more - 1) / scans)  # both fade alike
 
 
 def test_bearings_of_many_turns_count_in_their_sector():

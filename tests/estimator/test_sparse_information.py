@@ -592,6 +592,7 @@ def test_what_is_kept_of_the_elimination_is_that_of_the_whole_map_at_any_time(
     store(known)
     deepest = world.elimination.nodes.max()
     assert deepest > 8
+    assert np.bincount(world.elimination.nodes[:400]).max() < 70  # small separators
     for turn in range(12):
         centre = rng.integers(400)
         far = ((places[known] - places[centre]) ** 2).sum(axis=1)

@@ -475,8 +475,11 @@ def test_retraction_makes_the_error_it_is_given(frame):
 
 def test_the_inverse_spread_has_no_jump_where_its_series_ends():
     for turn in (1e-6, 1.9e-3, 2.1e-3, 1.0, -3.0):
-        exact = 1j * turn / (np.exp(1j * turn) - 1)
-        assert inverse_spread(turn)[0] == pytest.approx(exact, abs=1e-9)
+        t = turn + np.array([0.0, 1e-4, -1e-4])
+        exact, ahead, behind = 1j * t / (np.exp(1j * t) - 1)
+        spread, slope = inverse_spread(turn)
+        assert spread == pytest.approx(exact, abs=1e-9)
+        assert slope == pytest.approx((ahead - behind) / 2e-4, abs=1e-7)
 
 
 def random_problem(rng, count=9, size=40):
@@ -886,7 +889,7 @@ def test_a_neighbourhood_is_renewed_for_the_farthest_of_recent_distances():
 
     def joined_region(reach):
         asked.append(reach)
-        return pose, Region(np.full(2, 99.0), reach, 0.0)  # the robot has left it
+        return pose, Region(np.full(2, 99.0), reach, 0.25)  # the robot has left it
 
     near = Neighbourhood(
         lambda: InvariantEkfSlam(MOTION_STD, MEASUREMENT_STD), joined_region
@@ -896,6 +899,8 @@ def test_a_neighbourhood_is_renewed_for_the_farthest_of_recent_distances():
     near.forget()
     near.view(1.0)
     assert asked == [5.0, 5.0, 1.0]
+    saved = near.state_dict()
+    np.testing.assert_equal(near.restored(saved).state_dict(), saved)
 
 
 @pytest.mark.parametrize(
