@@ -27,6 +27,7 @@ import resource
 import signal
 import sys
 import tempfile
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -351,6 +352,8 @@ def _run(tests: Tests, file: str, text: str, function: str, failed: str) -> None
         _load_instead(ROOT / file, text)
         _compile_anew(file, function)
     os.chdir(ROOT)
+    # matplotlib compares this thread with the main one, whose number a fork keeps.
+    threading.main_thread()._set_native_id()
     # pytest would rewrite the assertions of a file that is named, from the disk.
     options = ["-x", "-q", "-p", "no:cacheprovider", "--tb=no", "--assert=plain"]
     options += [] if tests.slow else ["-m", "not slow"]

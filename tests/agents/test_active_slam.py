@@ -171,6 +171,7 @@ def test_knowing_every_landmark_ends_the_episode_with_a_reward():
     gain = before - env.task.episodes.uncertainty.item()
     left = 1 - steps / env.scenario.steps
     assert reward == pytest.approx(gain - 0.02 + 5 * (1 + left))
+    assert not env.reset()[1]["success"]
 
 
 def test_time_is_up_after_the_steps_of_the_scenario():

@@ -211,10 +211,12 @@ def test_clock_tells_step_and_time(renderer):
 
 def ink(artist):
     """Draw one artist alone; return the darkness of its pixels."""
-    figure = Figure(figsize=(6, 1), dpi=100)
+    figure = Figure(figsize=(6, 1))
     canvas = FigureCanvasAgg(figure)
     figure.add_artist(artist)
-    canvas.draw()
+    for dpi in (50, 100):
+        figure.set_dpi(dpi)
+        canvas.draw()
     return 255.0 - np.asarray(canvas.buffer_rgba())[..., 0]
 
 

@@ -21,6 +21,7 @@ from slamgym.estimator.map_management.loop_closing import (
     is_astray,
     lost,
     places_of_scan,
+    same_landmarks,
     with_readings,
 )
 from slamgym.estimator.map_management.map_editor import MapEditor
@@ -233,6 +234,13 @@ def test_landmarks_are_lost_only_where_a_constellation_can_be_recognised(local):
     assert always.tolist() == [True] * 14 + [False] * local
     found = lost(view, Constellations())
     assert found.tolist() == (always.tolist() if local >= 6 else [False] * count)
+
+
+def test_a_landmark_is_merged_only_into_an_older_one():
+    view = MapView(np.array([0, 0, 0, 5, 0, 5, 0.0]), 1e-4 * np.eye(7), (4, 9))
+    for doubtful, pairs in (({9}, [(4, 9)]), ({4}, [])):
+        found = same_landmarks(view, Constellations(), (), doubtful, within=8.0)
+        assert found == (doubtful, pairs)
 
 
 def lost_alone(places, where, options=MappingProxyType({}), *, name="ekf", **changes):

@@ -664,9 +664,12 @@ def test_a_log_of_unknown_noise_asks_for_it(log):
 def test_the_noise_of_a_log_is_noted_unless_it_is_given(log, without_pictures):
     noise = "note: noise of little: motion_std 0.1"
     assert noise in slamgym("replay", log).stderr.replace("\n", " ")
-    given = slamgym("replay", log, "--motion-std", "1,1,1").stderr
-    assert "motion_std" not in given
-    assert "measurement_std" in given
+    for command in ("replay", "smooth", "noise-study"):
+        options = "--motion-std", "1,1,1", "--range-std-per-metre", ".02"
+        given = slamgym(command, log, *options).stderr
+        assert "motion_std" not in given
+        assert "range_std_per_metre" not in given
+        assert "measurement_std" in given
 
 
 @pytest.mark.parametrize(

@@ -147,6 +147,7 @@ def test_a_filter_is_judged_through_files_as_in_a_monte_carlo(
     folder = tmp_path / "estimates"
     folder.mkdir()
     if way == "data set":
+        request.getfixturevalue("monkeypatch").delattr(judging, "_deciding")
         results = judge(drives)
     elif way == "npz":
         results = judge(written(poses, covariances), drives)

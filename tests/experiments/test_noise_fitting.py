@@ -25,6 +25,7 @@ from slamgym.experiments.logs.ground_truth import without_identities
 from slamgym.experiments.noise_fitting import (
     fit_noise,
     noise_fit_figure,
+    search,
     summarise_fit,
     write_noise,
 )
@@ -34,7 +35,7 @@ from slamgym.experiments.noise_fitting.fit import (
     nees_bounds,
     positive_sum,
 )
-from slamgym.experiments.noise_fitting.intervals import profile_crossing
+from slamgym.experiments.noise_fitting.intervals import Interval, profile_crossing
 from slamgym.experiments.noise_fitting.scoring import (
     associated_log,
     curvature,
@@ -315,10 +316,15 @@ def test_at_rest_without_noise_at_rest_the_motion_noise_is_unknown():
     fit = fitted(replace(log, events=tuple(standing), header=header))
     by_name = {noise.name: noise for noise in fit.noise}
     assert by_name["σβ"].verdict == by_name["σr"].verdict == "fitted"
-    for name, before in (("σx", 0.2), ("σy", 0.2), ("σα", 0.2)):
+    for name in ("σx", "σy", "σα"):
         assert by_name[name].verdict in {"unknown", "zero"}
-        if by_name[name].verdict == "unknown":
-            assert by_name[name].value == before
+
+
+def test_a_noise_that_the_readings_do_not_determine_keeps_its_value(monkeypatch):
+    unknown = Interval("unknown", 0.0, np.inf)
+    monkeypatch.setattr(search, "intervals", lambda _, at, *__: [unknown] * len(at))
+    noise = fitted(a_log(steps=30)).noise[:5]
+    assert [each.value for each in noise] == [0.2, 0.2, 0.2, 0.1, 0.3]
 
 
 def test_scoring_finds_the_spread_of_normal_numbers_and_its_interval():

@@ -99,7 +99,12 @@ def test_the_smoother_is_closer_to_the_truth_than_the_filter(example):
 
 
 def repaired(log):
-    return smooth_log(log, settings_for(log, estimator=SMOOTHER), associate=True)
+    told, settings = [], settings_for(log, estimator=SMOOTHER)
+    found = smooth_log(
+        log, settings, associate=True, repairing=lambda *done: told.append(done)
+    )
+    assert told[-1][0] == told[-1][1]
+    return found
 
 
 def hidden(events):

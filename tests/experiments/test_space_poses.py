@@ -313,7 +313,8 @@ def test_the_figure_in_space_shows_steps_without_nees_as_gaps(tmp_path):
     lines = {line.get_label(): line.get_ydata() for line in axes.lines}
     shown = np.asarray(lines["pose"], dtype=float)
     assert np.nanmean(shown) == pytest.approx(found["nees"]["pose"])
-    assert {"pose", "position", "rotation"} <= set(lines)
+    band = f"95 % band, {found['tested_steps']} steps"
+    assert {"pose", "position", "rotation", band} <= set(lines)
     assert axes.get_yscale() == "linear"
     found["nees_over_time"]["rotation"][9] = 5.0
     assert nees_in_space_figure(found).axes[0].get_yscale() == "log"

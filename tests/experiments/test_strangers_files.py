@@ -89,7 +89,7 @@ def test_a_folder_of_two_tables_is_a_log(folder):
         ('"t","d","alpha","battery"\n1,1,0,9\n2,1,0.5,9\n3,2,0,9\n', MEASUREMENTS),
         (ODOMETRY, "Timestamp,Range_mm,Phi,landmark_id\n0,5000,.1,4\n1,4000,.1,4.0\n"
          "1,3000,-.2,7.0\n3,1000,0,7\n"),
-        (ODOMETRY, MEASUREMENTS + "2,,,\n2,7,nan,nan\n"),
+        (ODOMETRY, MEASUREMENTS + "2,,,\n2,7,NaN,nan\n"),
         (ODOMETRY, "t,id,bearing,range\n3,7,0,1\n1,4,.1,4\n1,7,-.2,3\n0,4,.1,5\n"),
         (ODOMETRY, MEASUREMENTS.replace("\n", "  # seen\n").replace("range  #", "r #")),
     ],

@@ -360,6 +360,7 @@ def test_a_graph_begins_where_an_invariant_filter_is(tmp_path):
     (drive,) = drives("loop", steps=40, seeds=(3,), motion={"noise_at_rest": True})
     poses, landmarks = filtered_path(drive)
     run = replay(to_slamlog(drive), "invariant")
+    assert poses[0].tolist() == drive.start_estimate.tolist()
     gaps = poses - run.trace.poses
     gaps[:, 2] = wrapped(gaps[:, 2])
     np.testing.assert_allclose(gaps[1:], 0, atol=1e-12)
