@@ -84,19 +84,6 @@ def test_options_are_those_of_one_reset(sb3):
 
 
 @pytest.mark.slow
-def test_flat_worlds_have_flat_terminal_observations(sb3):
-    vector = to_stable_baselines(FlattenBatch(native(steps=2)))
-    vector.reset()
-    vector.step(np.zeros((3, 2)))
-    observations, _, dones, infos = vector.step(np.zeros((3, 2)))
-    assert dones.all()
-    assert observations.shape == (3, 20)
-    for info in infos:
-        assert info["terminal_observation"].shape == (20,)
-        assert info["TimeLimit.truncated"] is True
-
-
-@pytest.mark.slow
 def test_an_info_that_some_worlds_lack_is_missing_there(sb3):
     vector = RecordEpisodeStatistics(native(max_episode_steps=5))
     adapted = to_stable_baselines(vector)

@@ -1,6 +1,5 @@
 """The native vector world, held against Gymnasium's own vector of single worlds."""
 
-import copy
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -236,15 +235,6 @@ def leaves(value):
             yield from leaves(part)
     else:
         yield value
-
-
-def test_a_deep_copy_goes_on_as_the_original_would():
-    vector = native(**EVERYTHING)
-    vector.reset(seed=0)
-    vector.step(np.full((WORLDS, 2), 0.3))
-    other = copy.deepcopy(vector)
-    for _ in range(150):
-        same(*(each.step(np.full((WORLDS, 2), 0.4)) for each in (vector, other)))
 
 
 # --- pictures ---
