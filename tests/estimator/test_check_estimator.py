@@ -609,7 +609,7 @@ F | the motion noise is multiplied by d² | dt *= d**2
 F | the motion noise is missing where d = 0 | dt *= d != 0
 F | the motion noise is missing | dt = 0.0
 F | the variance of the motion noise is multiplied by 0.5 | dt /= 2
-F | the variance of the motion noise in εy is multiplied by 3 | F[:, 1] *= 3**0.5
+F | the variance of the motion noise in εy is multiplied by 0.25 | F[:, 1] /= 2
 R | standard deviations of the motion noise are used as variances | self.R **= 0.5
 R | standard deviations of the motion noise are in another order | self.R = self.R[::-1, ::-1]
 P | the covariance of pose and landmarks is not multiplied by G | self.P[:3, 3:], self.P[3:, :3] = P[:3, 3:], P[3:, :3]
@@ -719,6 +719,9 @@ def test_a_mistake_is_named_with_its_method(mistake):
     findings = find_breaches(textbook.TextbookEkf, ("correct",))
     start = f"{METHODS[place]}: {cause}: "
     assert any(each.message.startswith(start) for each in findings), findings
+    if place in "zν":
+        others = [each for each in findings if "of new landmarks: " in each.message]
+        assert not others
 
 
 @pytest.mark.parametrize(
@@ -730,6 +733,9 @@ def test_a_mistake_is_named_with_its_method(mistake):
             "mean[0], x, must be 4.15658, got 3.50634 (in steps 8, 16 of 20)"),
         ("+", "self.P[0, 1] *= 1.001",
             "belief(): the covariance is not symmetric: so it is in step 1"),
+        *(("b", f"{SHORT['o']}self.P = (self.P / o).round({k}) * o",
+            f"belief(): correlations are rounded to {k} decimals: so they are in step ")
+            for k in (2, 3, 4)),
         ("e", "nis *= 2", "update().nis must be νᵀ S⁻¹ ν = "),
     ],
 )  # fmt: skip
