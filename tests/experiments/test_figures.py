@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from drawn import check_looks
 from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.patches import Polygon
 from matplotlib.text import Text
 from PIL import Image
 from run_traces import make_trace
@@ -34,6 +35,7 @@ from slamgym.experiments.figures.maps import (
     PREDICTED,
     UPDATED,
     box_around,
+    map_limits,
     pose_stride,
     shared_limits,
 )
@@ -231,6 +233,21 @@ def test_a_long_run_may_have_ellipses_without_an_area():
     flat = np.ones((3, 3)) - 1e-9 * np.eye(3)  # its determinant is below 0
     covariances = np.broadcast_to(flat, trace.pose_covariances.shape)
     assert pose_stride(replace(trace, pose_covariances=covariances)) == 5
+    equal = np.broadcast_to(np.diag([1.0, 0.25, 0.1]), (300, 3, 3))  # √|P| is ½
+    sized = replace(trace, pose_covariances=equal)
+    drawn = 0.35 * np.prod(np.ptp(map_limits(sized), axis=0)) / (4.5 * np.pi)
+    assert 12 < drawn < 60
+    assert pose_stride(sized) == np.ceil(300 / int(drawn))
+
+
+def test_the_robot_is_as_large_in_a_wide_map_as_in_a_high_one():
+    sizes = []
+    for scale in (1, 5), (5, 1):
+        axes = map_figure(make_trace(poses=make_trace().poses * [*scale, 1])).axes[0]
+        (robot,) = (patch for patch in axes.patches if isinstance(patch, Polygon))
+        side = max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
+        sizes.append(np.linalg.norm(np.ptp(robot.get_xy(), axis=0)) / side)
+    assert sizes[0] == pytest.approx(sizes[1], rel=0.3)
 
 
 @pytest.mark.parametrize("draw", [map_figure, truth_figure])
@@ -345,12 +362,15 @@ def test_distances_are_euclidean_and_mahalanobis():
     )
     names = [label.get_text() for label in metres.get_yticklabels()]
     assert names == ["l10", "l11", "l12", "l13", "l14", "l15"]
+    sure = replace(trace, final_covariance=1e-3 * trace.final_covariance)
+    axes = truth_figure(sure).axes[2]
+    assert axes.get_xlim()[1] > axes.lines[0].get_xdata().max() > 3
 
 
 def test_unknown_truth_is_left_out():
     trace = make_trace()
     poses, landmarks = trace.true_poses.copy(), trace.true_landmarks.copy()
-    poses[3:], landmarks[2:] = np.nan, np.nan
+    poses[3:], landmarks[2:], landmarks[3, 0] = np.nan, np.nan, 1.0
     partly = truth_figure(make_trace(true_poses=poses, true_landmarks=landmarks))
     assert len(partly.axes[1].lines[0].get_xdata()) == 2
     assert "nan" not in " ".join(text.get_text() for text in partly.findobj(Text))

@@ -257,10 +257,6 @@ WRONG = {
         "covariances with headings in degrees: ",
     ),
     "order": (lambda x, P: (x @ ORDER.T, ORDER @ P @ ORDER.T), OTHER_ORDER),
-    "order in the covariance": (
-        lambda x, P: (x, ORDER @ P @ ORDER.T),
-        f"covariances with {OTHER_ORDER}",
-    ),
     "triangle": (
         lambda x, P: (x, lower_as_upper(P)),
         "the lower triangle of the covariance, row by row: ",
@@ -272,10 +268,8 @@ WRONG = {
         lambda x, P: (x, std_of(P)),
         "standard deviations in place of variances: ",
     ),
-    "clockwise": (lambda x, P: (x * [1, 1, -1], P), "headings that grow clockwise: "),
     "millimetres": (lambda x, P: (x * [1e3, 1e3, 1], P), "positions in millimetres: "),
     "another truth": (lambda x, P: (x / [100, 100, 1], P), "a truth in centimetres: "),
-    "another axis": (lambda x, P: (x * [1, -1, 1], P), "y to the right of x: "),
     "left-handed": (
         lambda x, P: (x * [1, -1, -1], P * np.outer([1, -1, -1], [1, -1, -1])),
         "y to the right of x, and headings that grow clockwise: ",
@@ -291,10 +285,6 @@ WRONG = {
     "inverse": (
         lambda x, P: (inverse_of(x), inverse_jacobian(x) @ P @ inverse_jacobian(x).mT),
         "poses of the world as the robot sees it (inverse): ",
-    ),
-    "covariance in centimetres": (
-        lambda x, P: (x, P * np.outer([100, 100, 1], [100, 100, 1])),
-        "covariances with positions in centimetres: ",
     ),
     "transposed transport": (
         lambda x, P: (x, transposed(x, P)),
@@ -470,6 +460,9 @@ def test_a_drive_without_usable_estimates_is_a_failed_run(
     assert found["failed_runs"][0]["step"] == steps.get(what, -1)
     assert found["verdict"] == "not shown"
     assert found["reason"].startswith(f"1 of {RUNS} runs failed; of the others, ")
+    for name in ("ate", "ate_aligned", "pose_area"):  # an unknown landmark is no pose
+        is_none = results.failed & (what != "unknown landmark")
+        assert (np.isnan(results[name]) == is_none).all(), name
 
 
 REFUSED = {
@@ -709,33 +702,6 @@ def test_converted_times_beyond_the_truth_stay_beyond_it(unit):
     assert found[-1] == path[-1, 0]
 
 
-def test_names_are_paired_by_what_differs(elsewhere):
-    mine, truth = elsewhere
-    before = judge(mine, truth=truth)
-    for folder, form in ((mine, "est_run{}"), (truth, "run{:02d}_gt")):
-        for k, path in enumerate(sorted(folder.iterdir())):
-            path.rename(folder / f"{form.format(k)}.tum")
-    results = judge(mine, truth=truth)
-    assert not results.failed.any()
-    assert results.position_error.sum() == pytest.approx(before.position_error.sum())
-
-
-def test_a_robot_at_rest_is_not_turned_by_a_fit(elsewhere):
-    mine, truth = elsewhere
-    rng = np.random.default_rng(3)
-    for path in truth.iterdir():
-        rows = np.loadtxt(path)
-        still = rows.copy()
-        still[:, 1:] = [0.1, 0.2, 0, 0, 0, np.sin(0.15), np.cos(0.15)]
-        still[:, 1:3] += rng.normal(0, 1e-4, (30, 2))
-        np.savetxt(path, still, fmt="%.17g")
-        theirs = np.loadtxt(mine / path.name)
-        theirs[:, 1:8] = still[:, 1:]
-        theirs[:, 1:3] += rng.normal(0, 0.1, (30, 2))
-        np.savetxt(mine / path.name, theirs, fmt="%.17g")
-    assert abs(judge(mine, truth=truth, align="fit").heading_error).max() < 1e-9
-
-
 @pytest.mark.parametrize(("noise", "turn"), [(0.41, -0.5), (0.46, 0.0)])
 def test_a_fit_turns_what_it_explains_most_of(noise, turn):
     rng = np.random.default_rng(1)
@@ -771,20 +737,6 @@ def test_two_runs_are_enough_to_reject_and_one_is_not():
     assert judging._is_rejected(nees)
     assert not judging._is_rejected(nees[:1])
     assert not judging._is_rejected(np.full((3, 21), 3.0))
-
-
-def test_an_indefinite_covariance_is_a_failed_run(elsewhere):
-    mine, truth = elsewhere
-    path = mine / f"drive_{SEED}.tum"
-    rows = np.loadtxt(path)
-    rows[7, 8:] = np.array([[1, 0.9, 0.9], [0.9, 1, -0.9], [0.9, -0.9, 1]]).ravel()
-    np.savetxt(path, rows, fmt="%.17g")
-    results = judge(mine, truth=truth)
-    (failed,) = entry_of(results)["failed_runs"]
-    assert "the covariance is indefinite" in failed["message"]
-    assert failed["step"] == 7
-    for name in ("ate", "ate_aligned", "pose_area"):
-        assert (np.isnan(results[name]) == results.failed).all(), name
 
 
 def additive_studies(rng, runs, steps=30, turn=0.1):

@@ -9,6 +9,7 @@ import zlib
 import numpy as np
 import pytest
 from recordings import recorded
+from scipy.stats import chi2
 
 from slamgym.estimator import EkfSlam, make_estimator
 from slamgym.estimator.interface import MapView, UpdateReport
@@ -122,7 +123,7 @@ def test_the_page_holds_the_beliefs_of_every_step(page, viewed, loop):
     facts, arrays = arrays_of(page)
     assert facts["filters"] == ["ekf", "invariant"]
     assert arrays["step"].tolist() == list(range(61))
-    for number, (trace, _) in enumerate(viewed):
+    for number, (trace, frames) in enumerate(viewed):
         for k, name in enumerate(("x", "y", "theta")):
             pose = arrays[f"{number}.pose.{name}"]
             np.testing.assert_allclose(pose, trace.poses[:, k], atol=1e-5)
@@ -132,6 +133,8 @@ def test_the_page_holds_the_beliefs_of_every_step(page, viewed, loop):
         for step in (0, 30, 60):
             ids, means, covariances = trace.map_at(step)
             assert arrays[f"{number}.id"][step].tolist() == ids.tolist()
+            rows = frames.maps[step].row_ids.tolist()
+            assert arrays[f"{number}.row_id"][step].tolist() == rows
             x, y = (arrays[f"{number}.{axis}"][step] / 1e4 for axis in "xy")
             np.testing.assert_allclose(np.column_stack([x, y]), means, atol=1e-4)
             u, v = (
@@ -155,6 +158,10 @@ def test_the_page_holds_nees_and_nis_by_their_degrees(page, viewed):
     expected = trace.nis[used] / trace.nis_dof[used]
     np.testing.assert_allclose(arrays["1.nis"][used], expected, rtol=1e-5)
     assert np.isnan(arrays["1.nis"][~used]).all()
+    for name, share in (("low", 0.025), ("high", 0.975)):
+        dof = trace.nis_dof[used]
+        bound = arrays[f"1.nis_{name}"][used]
+        np.testing.assert_allclose(bound, chi2.ppf(share, dof) / dof, rtol=1e-5)
     np.testing.assert_allclose(facts["bands"]["nees"], [0.0719, 3.1161], atol=1e-4)
 
 

@@ -172,6 +172,14 @@ def test_increments_with_a_part_to_the_left_turn_drive_and_turn(folder):
     assert turn.alpha + drive.alpha == pytest.approx(0.5)
 
 
+def test_the_durations_of_motions_are_those_of_their_column(folder):
+    head, *rows = ODOMETRY.split()
+    timed = [f"{head},dt", *(f"{row},{k}" for k, row in enumerate(rows, 1))]
+    events = own(folder, odometry="\n".join([*timed, ""])).events
+    durations = [event.dt for event in events if isinstance(event, OdometryRow)]
+    assert sum(durations) == sum(range(len(rows) + 1))
+
+
 def test_the_first_increment_is_not_divided_by_earlier_readings(folder):
     odometry = "t,d,alpha\n0.1,1,0.5\n0.2,1,0\n0.3,1,0\n"
     readings = "t,id,bearing,range\n0,4,0.1,5\n0.1,4,0.1,5\n"
