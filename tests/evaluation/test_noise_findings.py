@@ -8,6 +8,7 @@ from scipy import stats
 from slamgym.evaluation.noise_findings import (
     CHANNELS,
     HEAVY_TAILS,
+    MOMENTS,
     _growth,
     _size_beside_tails,
     _spread_of_variance,
@@ -172,12 +173,14 @@ def test_noise_where_none_is_assumed_counts_in_units_of_a_millionth():
     odometry = np.zeros((1, 3, 2))
     poses = np.zeros((1, 3, 3))
     poses[0, 2] = 0.0, -0.003, 0.0  # after a step without noise
-    drive = poses, np.ones((1, 1, 2)), odometry, np.ones((1, 3, 1, 2))
+    drive = poses, np.ones((1, 2, 2)), odometry, np.ones((1, 3, 2, 2))
+    seen = np.array([[[True, False], [False, True], [False, False]]])
     assumed = {"motion_std": (0.1, 0.0, 0.1), "measurement_std": (0.1, 0.1)}
-    sums = noise_sums(*drive, np.zeros((1, 3, 1), dtype=bool), **assumed)
+    sums = noise_sums(*drive, seen, **assumed)
     assert sums[0, 1, 1] == pytest.approx(-3000.0)
+    assert not sums[0, 3:, MOMENTS.index("pairs")].any()  # of one landmark
     with pytest.raises(ValueError, match="noise_in must be 'motion' or 'odometry'"):
-        noise_sums(*drive, np.zeros((1, 3, 1)), **assumed, noise_in="wheels")
+        noise_sums(*drive, seen, **assumed, noise_in="wheels")
 
 
 @far_origins
