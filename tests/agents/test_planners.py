@@ -86,9 +86,11 @@ def value_of(now, plan, chance, settings):
     return value if is_free else -math.inf
 
 
-@pytest.mark.parametrize("is_complete", [False, True])
-def test_the_value_of_a_plan_is_its_expected_gain(knowledge, is_complete):
-    now, chance = knowledge, some_chance(knowledge)
+@pytest.mark.parametrize(
+    ("is_complete", "accuracy"), [(False, 0.049), (True, 0.049), (True, 9.0)]
+)
+def test_the_value_of_a_plan_is_its_expected_gain(knowledge, is_complete, accuracy):
+    now, chance = knowledge._replace(accuracy=accuracy), some_chance(knowledge)
     if is_complete:  # no landmark is missing, and no cell can hold one
         known = knowledge.known[list(now.belief.landmark_ids)]
         now, chance = now._replace(known=known), 0.0 * chance
