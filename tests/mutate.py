@@ -68,7 +68,8 @@ TESTS = {
     "agents/wall_routes": "planners wall_routes active_slam",
     "envs/": "landmark_world streams world_batch models_of_worlds",
     "envs/bearing_range": (
-        "bearing_range_sensor world_batch landmark_world simulated_runs"
+        "bearing_range_sensor world_batch landmark_world simulated_runs "
+        "models_of_worlds"
     ),
     "envs/controllers": "controllers vector_controllers drawn_worlds",
     "envs/landmark_world": (
@@ -83,7 +84,10 @@ TESTS = {
     "envs/spaces": "faults landmark_world drawn_worlds models_of_worlds world_batch",
     "envs/specs": "gymnasium_contract every_environment",
     "envs/robot": "unicycle_body world_batch landmark_world models_of_worlds",
-    "envs/vector": "landmark_world_vector world_batch vector_controllers",
+    "envs/vector": (
+        "landmark_world_vector world_batch vector_controllers pose_sensors "
+        "drawn_worlds state_and_restore models_of_worlds"
+    ),
     "envs/vector/wrappers": "landmark_world_vector stable_baselines",
     "estimator/": "ekf_slam filter_family errors_change_nothing",
     "estimator/models/bearing_range": "motions bearing_range ekf_slam",
@@ -208,7 +212,9 @@ TESTS = {
         "batch"
     ),
     "src/slamgym/restorable": "state_and_restore",
-    "src/slamgym/suggestions": "scenario command_line check_estimator",
+    "src/slamgym/suggestions": (
+        "scenario command_line check_estimator models_of_worlds"
+    ),
 }
 PLAIN = (
     *("estimator/models", "estimator/kernels", "evaluation/error_bound"),

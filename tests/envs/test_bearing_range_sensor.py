@@ -330,12 +330,15 @@ def test_every_order_of_the_rows_is_equally_likely():
     assert real.max() < 1.3 * real.mean()
 
 
-def test_clutter_is_uniform_over_what_the_sensor_sees_and_poisson_in_number():
-    bearings, ranges = np.moveaxis(noise_of_steps(HIDDEN, 20000)[2], -1, 0)
+@pytest.mark.parametrize("mean", [0.5, 1.0, 2.0])
+def test_clutter_is_uniform_over_what_the_sensor_sees_and_poisson_in_number(mean):
+    world = HIDDEN.with_changes(sensor={"clutter": mean})
+    bearings, ranges = np.moveaxis(noise_of_steps(world, 20000)[2], -1, 0)
     present = ranges > 0
     counts = present.sum(axis=1)
-    assert counts.mean() == pytest.approx(2.0, abs=0.03)
-    assert counts.var() == pytest.approx(2.0, abs=0.06)
+    assert counts.mean() == pytest.approx(mean, abs=0.03)
+    assert counts.var() == pytest.approx(mean, abs=0.06)
+    assert len(np.unique(bearings[present])) == counts.sum()
     assert (bearings[~present] == 0.0).all()
     for values, low, high in ((bearings, -1.0, 1.0), (ranges, 0.05, 6.0)):
         share = np.sort((values[present] - low) / (high - low))

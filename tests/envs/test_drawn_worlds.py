@@ -70,6 +70,11 @@ def test_every_episode_draws_and_a_seed_repeats_all_of_them():
     assert episodes[0] == episodes[3]
     assert episodes[1] == episodes[4]
     assert len({each[0].motion.std for each in episodes[:3]}) == 3
+    several = LandmarkWorldVectorEnv(num_envs=2, scenario=FAMILY)
+    several.reset(seed=4)
+    assert several.drawn_scenarios[1] == episodes[0][0]
+    with pytest.raises(ScenarioError, match="did you mean 'num_envs'"):
+        LandmarkWorldVectorEnv(num_env=2, scenario=FAMILY)
 
 
 def test_the_world_has_the_noise_start_and_range_that_it_drew():

@@ -35,15 +35,6 @@ def test_outline_has_constant_mahalanobis_distance():
     np.testing.assert_allclose(distance, 3.0, rtol=1e-12)
 
 
-def test_angle_follows_a_rotation():
-    for turned in (-1.2, -0.3, 0.0, 0.7, 1.5):
-        C = np.array(
-            [[np.cos(turned), -np.sin(turned)], [np.sin(turned), np.cos(turned)]]
-        )
-        P = C @ np.diag([4.0, 1.0]) @ C.T
-        assert covariance_ellipses(P).angles == pytest.approx(turned)
-
-
 def test_batch_shape_is_kept_and_rows_are_independent():
     P = covariance_of(np.random.default_rng(0).normal(size=(4, 5, 2, 2)))
     outline = covariance_ellipses(P)

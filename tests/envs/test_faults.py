@@ -117,7 +117,7 @@ def test_observation_bounds_follow_from_the_largest_errors(noise_in, kind, reach
     ranges = {  # those of one kind lack an end
         name: ends
         for name, ends in RANGES.items()
-        if (kind, name) not in (("position", "start_x"), ("bearing", "start_y"))
+        if (kind, name) not in (("position", "start_x"), ("bearing_range", "start_y"))
     }
     stds = {"bearing_range": [0.2, 0.3], "position": [0.4, 0.3]}.get(kind, [0.3, 0])
     is_of_range = kind in ("bearing_range", "range")

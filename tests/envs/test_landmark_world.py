@@ -475,6 +475,10 @@ def test_wrong_settings_are_refused_by_name(changes, message):
         ({"landmarks": [[1, 2]]}, r"\['landmarks'\] must be .* of shape \(30, 2\)"),
         ({"scenario": "nowhere"}, "scenario must be a preset"),
         ({"scenario": "loop"}, r"\['scenario'\] must have dt = 0.5, as the env.* 1.0"),
+        (
+            {"scenario": make(sensor={"std": (0.1, 900.0)}).scenario},
+            "keep 'landmarks' in the observation space",
+        ),
     ],
 )
 def test_wrong_options_are_refused_and_leave_the_episode_alone(options, message):
@@ -617,12 +621,18 @@ def test_the_window_shows_every_moment_as_it_is(recorder):
         assert snapshot.collision == info["collision"]
         assert (snapshot.step, snapshot.time) == (k, k * 0.5)
         assert snapshot.belief is None
+    hidden = LandmarkWorldEnv("hidden_identities", render_mode="human")
+    observation, info = hidden.reset(seed=2)
+    clutter = info["landmark_ids"][observation["mask"]] < 0
+    shown = recorder.made[-1].snapshots[0].clutter
+    np.testing.assert_array_equal(shown, clutter)
 
 
 def test_a_belief_is_shown_until_the_episode_ends(recorder):
     env = make(render_mode="human")
     env.reset(seed=0)
     belief = SimpleNamespace()
+    make(render_mode="human").show_belief(belief)  # before an episode
     env.show_belief(belief)
     env.step([1.0, 0.0])
     env.reset()
@@ -634,11 +644,16 @@ def test_a_new_map_gets_a_new_view_and_the_same_map_keeps_it(recorder):
     same = make(render_mode="human", landmarks={**RANDOM_MAP, "seed": 1})
     same.reset(seed=0)
     same.reset()
+    same.reset(options={"scenario": same.scenario.with_changes(dt=0.5)})
     assert len(recorder.made) == 1
     new = make(render_mode="human")
     new.reset(seed=0)
+    state, places = new.state(), new.landmarks
     new.reset()
-    assert [view.closed for view in recorder.made] == [False, True, False]
+    new.restore(state)
+    new.step((0.0, 0.0))
+    np.testing.assert_array_equal(recorder.made[-1].landmarks, places)
+    assert [view.closed for view in recorder.made] == [False, True, True, False]
     new.close()
     new.close()
     assert recorder.made[-1].closed

@@ -128,6 +128,12 @@ def test_a_car_turns_only_while_it_drives_and_within_its_steering():
     observation, *_, info = env.step([0.1, 1.0])
     assert observation["odometry"][1] == pytest.approx(0.6)
     assert info["pose"][2] == pytest.approx(0.1 * np.tan(0.6) / 0.4)
+    narrowest = 0.1 * np.tan(0.6) / 0.4
+    backwards = drive_of(env.scenario.robot).feasible(-0.1, 1.0)
+    assert backwards == pytest.approx((-0.1, narrowest))
+    env.scenario.with_changes(controls={"commands": [(0.1, narrowest, 1)]})
+    with pytest.raises(ScenarioError, match="controls must turn by at most"):
+        env.scenario.with_changes(controls={"commands": [(0.1, narrowest + 1e-9, 1)]})
 
 
 def test_the_planned_path_is_that_of_the_drive():
@@ -200,8 +206,12 @@ def test_scenario_and_drive_have_the_same_label():
     for name in ("differential", "bicycle"):
         label = load_scenario(name).models["motion"]
         assert find_motion(label).name == label
-    car = load_scenario("bicycle").with_changes(robot={"reference": None})
-    assert car.models["motion"] == f"bicycle[wheelbase={car.robot.wheelbase}]"
+    for ahead in (None, (0.5, 0.0), (0.0, 0.25)):
+        car = load_scenario("bicycle").with_changes(robot={"reference": ahead})
+        where = f", reference=[{ahead[0]}, {ahead[1]}]" if ahead else ""
+        label = f"bicycle[wheelbase={car.robot.wheelbase}{where}]"
+        assert car.models["motion"] == label
+        assert drive_of(car.robot).reference == (ahead or (0.0, 0.0))
 
 
 @pytest.mark.parametrize("name", list_presets())
@@ -350,5 +360,13 @@ def test_noise_of_a_number_that_is_no_range_hides_no_landmark():
 
 def test_a_sensor_that_cannot_be_imported_is_named():
     own = {"kind": "no_such_module:ECHO", "std": (0.02, 2e-4)}
-    with pytest.raises(ValueError, match="no_such_module"):
-        LandmarkWorldEnv("six_landmarks", sensor=own)
+    for module, hint in (
+        ("no_such", "; run in the folder of no_such.py,"),
+        ("json", ""),
+    ):
+        own["kind"] = f"{module}.part:ECHO"
+        with pytest.raises(
+            ValueError, match=rf"named '{module}[a-z_.']*{hint}"
+        ) as error:
+            LandmarkWorldEnv("six_landmarks", sensor=own)
+        assert ("run in the folder" in str(error.value)) == bool(hint)

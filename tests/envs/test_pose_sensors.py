@@ -62,6 +62,9 @@ def test_they_change_no_other_noise():
 
 
 def test_errors_are_normal_with_the_given_deviations():
+    alone = PoseSensors(scenario(gps={"std": 0.5}))
+    one = np.zeros((1, 2), np.uint64), np.zeros(1, np.int64), np.zeros((1, 3))
+    assert np.isnan(alone.read(*one)[0]).tolist() == [False, False, True]
     sensors = PoseSensors(scenario(compass={"std": 0.05}, gps={"std": 0.5}))
     keys = np.random.default_rng(0).integers(0, 2**63, (4000, 2)).astype(np.uint64)
     poses = np.tile([3.0, -2.0, 3.1], (4000, 1))

@@ -107,12 +107,6 @@ def test_the_round_end_of_a_wall_is_met_from_the_side(side):
     assert share < 0.5
 
 
-def test_a_long_step_does_not_jump_a_wall():
-    body = UnicycleBody(RADIUS, [(2.0, -1.0, 2.0, 1.0)])
-    body.drive((1000.0, 0.0))
-    assert body.pose[0] < 2.0
-
-
 def test_at_a_wall_the_robot_can_turn_and_leave():
     body = UnicycleBody(RADIUS, [(2.0, -1.0, 2.0, 1.0)])
     body.drive((4.0, 0.0))

@@ -97,13 +97,6 @@ def test_wrong_covariances_are_rejected_soon(ratio, most):
     assert np.median(np.argmax(looks, axis=1)) + 1 <= most
 
 
-def test_an_error_at_a_single_step_is_found():
-    rng = np.random.default_rng(4)
-    nees = correlated(rng, 0.0)
-    nees[:, 4] *= 2
-    assert EProcess().update(nees, 3)[-1] > REJECTED
-
-
 def test_runs_added_in_blocks_give_the_same_evidence_and_intervals_to_the_bit():
     rng = np.random.default_rng(5)
     nees, freedom = correlated(rng, 0.5), rng.integers(0, 40, RUNS)
@@ -120,19 +113,6 @@ def test_runs_added_in_blocks_give_the_same_evidence_and_intervals_to_the_bit():
     assert np.array_equal(np.concatenate(ends, axis=1), expected)
 
 
-def test_evidence_counts_the_degrees_of_freedom_of_each_run():
-    rng = np.random.default_rng(6)
-    freedom = rng.integers(2, 60, 400)
-    nees = rng.chisquare(freedom)[:, None]
-    assert EProcess().update(nees, freedom).max() < REJECTED
-    assert EProcess().update(nees, freedom + 10).max() > REJECTED
-
-
-def test_a_run_without_degrees_of_freedom_adds_no_evidence():
-    found = EProcess().update([[30.0], [0.0], [30.0]], [3, 0, 3])
-    assert found[0] == found[1] < found[2]
-
-
 def test_steps_without_degrees_of_freedom_and_unknown_errors_add_no_evidence():
     with_gap = EProcess().update([[30.0, 3.0]], [[3, 0]])
     np.testing.assert_allclose(with_gap, EProcess().update([[30.0, 0.0]], [[3, 0]]))
@@ -142,10 +122,13 @@ def test_steps_without_degrees_of_freedom_and_unknown_errors_add_no_evidence():
 
 
 def test_evidence_and_intervals_are_those_of_their_formulas():
-    for x, n in ((7.0, 1), (0.2, 1), (9.0, 3)):
-        ratios = SCALES ** (-n / 2) * np.exp(-x * (1 / SCALES - 1) / 2)
-        assert EProcess().update([[x]], n) == pytest.approx([np.log(ratios.mean())])
-    ratios = np.random.default_rng(9).gamma(4.0, 0.25, 200)
+    rng = np.random.default_rng(9)
+    nees, freedom = rng.chisquare(3, (8, 5)), rng.integers(0, 5, (8, 5))
+    gains = -freedom[..., None] * np.log(SCALES) / 2
+    gains -= np.where(freedom, nees, 0.0)[..., None] * (1 / SCALES - 1) / 2
+    expected = np.log(np.exp(gains.cumsum(axis=0)).mean(axis=(1, 2)))
+    np.testing.assert_allclose(EProcess().update(nees, freedom), expected)
+    ratios = rng.gamma(4.0, 0.25, 200)
     low, high = ConfidenceSequence().update(ratios)
     assert len(low) == len(high) == 200
     for m in (30, 75, 200):

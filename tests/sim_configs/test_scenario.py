@@ -204,6 +204,8 @@ NO_CLUTTER = "sensor.clutter must be 0 unless"
          r"sensor.max_clutter must be >= clutter = 2.0"),
         ({"robot": {"max_speed": 0.5}},
          r"controls must stay within robot.max_speed = 0.5 m/s, got 1 m/s$"),
+        ({"controls": {"commands": [(-9.0, 0.0, 1), (0.1, 0.0, 1)]}},
+         r"controls must stay within robot.max_speed = 1.0 m/s, got 3 m/s$"),
         ({"robot": {"max_turn_rate": 0.1}},
          r"controls must stay within robot.max_turn_rate = 0.1 rad/s"),
         ({"steps": LARGEST_EPISODE + 1},
