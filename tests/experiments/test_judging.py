@@ -209,13 +209,6 @@ def swapped(array):
     return array[[0, 1, 5, 3, 4, 2, *range(6, len(array))]]
 
 
-def relative(poses):
-    """Poses as seen from (5, -3, 1), a start that they are then relative to."""
-    cos, sin = np.cos(1.0), np.sin(1.0)
-    x, y = poses[..., 0] - 5, poses[..., 1] + 3
-    return np.stack([cos * x + sin * y, cos * y - sin * x, poses[..., 2] - 1], axis=-1)
-
-
 def inverse_of(poses):
     """Pose of the world in the robot's frame."""
     x, y, turn = np.moveaxis(poses, -1, 0)
@@ -308,20 +301,6 @@ def test_a_broken_convention_is_named_in_one_sentence(
         right = float(study["pose_nees_invariant"].mean() / 3)
         stated = float(said.partition("NEES / 3 is ")[2].partition(",")[0])
         assert stated == pytest.approx(right, rel=0.2)
-
-
-def test_poses_relative_to_the_start_are_named(tmp_path):
-    start = {"pose": [5.0, -3.0, 1.0], "drawn": "estimate"}
-    world = load_scenario("six_landmarks").with_changes(start=start)
-    drives = tmp_path / "drives"
-    generate_trajectories(world, drives, episodes=8, estimator="invariant")
-    names = ("seed", "belief_poses", "belief_pose_covariances")
-    data = list(load_trajectories(drives))
-    arrays = {name: np.stack([getattr(d, name) for d in data]) for name in names}
-    arrays["belief_poses"] = relative(arrays["belief_poses"])
-    np.savez(tmp_path / "mine.npz", **arrays)
-    found = entry_of(judge(tmp_path / "mine.npz", drives))["diagnosis"]
-    assert found["sentence"].startswith("convention: poses in the frame of the start: ")
 
 
 @pytest.mark.parametrize(
