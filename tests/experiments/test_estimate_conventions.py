@@ -254,6 +254,14 @@ def test_a_shift_between_steps_is_that_of_the_nearest_positions(offset):
         np.testing.assert_allclose(first.truth + 4 * QUARTER, poses + gap, atol=1e-12)
 
 
+def test_a_shift_between_steps_is_named_without_a_truth_between_them():
+    rng, truth = np.random.default_rng(3), arcs(np.arange(30.0))
+    poses = arcs(np.arange(30.0) - 0.5) + rng.normal(0, 0.01, truth.shape)
+    claims = np.broadcast_to(1e-4 * np.eye(3), (6, 30, 3, 3))
+    said = mistake_in_estimates(truth, poses, claims, truth[:, 0])
+    assert said.startswith("time stamps that are 0.5 steps too late: read so, NEES / 3")
+
+
 def as_by_cholesky(truth, reading):
     """Return mean squares per component and the log likelihood, pose by pose."""
     white, logs = np.empty((B, T, 3)), np.empty((B, T))
@@ -324,7 +332,8 @@ def test_squares_of_an_honest_reading_have_a_mean_within_a_factor(
 def test_two_poses_and_five_drives_show_a_convention(drives, steps):
     rng = np.random.default_rng(2)
     truth = rng.uniform(-9, 9, (drives, steps, 3))
-    claims = np.broadcast_to(np.eye(3) / 10, (drives, steps, 3, 3))
+    claims = np.tile(np.eye(3) / 10, (drives, steps, 1, 1))
+    claims[:, 0] = 0.0  # the start is certain
     given = truth + rng.normal(0, 0.1, truth.shape), claims
     said = mistake_in_estimates(truth, *given, truth[:, 0])
     assert said.startswith("standard deviations in place of variances: read so, NEES")
