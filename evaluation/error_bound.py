@@ -1,8 +1,7 @@
 """Lower bound of the errors of any filter: the posterior Cramér-Rao bound.
 
 The bound of Tichavský, Muravchik and Nehorai [1]_ is the covariance of a Kalman filter
-that is linearised at the truth. An EKF that gets the true motion and exact readings is
-such a filter, because its estimate is the truth. Many runs are filtered at once. The
+that is linearised at the truth. Many runs are filtered at once, without estimates. The
 bound is about the errors in the invariant frame. With p the position, l each landmark
 and J = [0 −1; 1 0], these are to first order ::
 
@@ -24,9 +23,10 @@ from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
 from .. import argument_checks
-from ..arrays import SMALLEST, Array, BoolArray, IntArray
-from ..estimator.filters.batch import BatchSlam
-from ..estimator.filters.ekf import EkfSlam
+from ..argument_checks import usable_cores
+from ..arrays import Array, BoolArray, IntArray
+from ..estimator.beliefs import columns_of
+from ..estimator.filters.batch import durations_of, filter_at_truth
 from ..estimator.models.rigid_motion import invariant_covariance, seen_from
 from ..estimator.models.sensors import BEARING_RANGE, POSITION, Sensor, find_sensor
 
@@ -69,6 +69,7 @@ def posterior_bound(
     pose_std: ArrayLike = (np.inf, np.inf, np.inf),
     sensor: str | Sensor = "bearing_range",
     origin: tuple[float, float] = (0.0, 0.0),
+    with_covariances: bool = True,
     threads: int | None = None,
 ) -> PosteriorBound:
     """Return the bound of many runs, each along its own true path.
@@ -96,6 +97,8 @@ def posterior_bound(
     origin : (float, float)
         Origin of the invariant frame [m].  It must lie near the path: about a distant
         one, the heading error dominates, and the other errors lose their digits.
+    with_covariances : bool
+        Whether to return the final covariances, too.
     threads : int, optional
         By default, the number of cores.
 
@@ -124,25 +127,23 @@ def posterior_bound(
         check("motion_std", motion_std, 3),
         check("measurement_std", measurement_std, 2),
     )
-    position, heading, raw = (np.full((count, steps), np.nan) for _ in range(3))
-    spread, covariances = np.full(count, np.nan), list[Array]()
-    slam = EkfSlam(*stds, sensor=read, min_range=SMALLEST)
-    durations = np.broadcast_to(np.asarray(dt, dtype=np.float64), (count, steps))
-    fixes = np.broadcast_to(np.asarray(pose_std, dtype=np.float64), poses.shape)
+    least, spread = np.full((count, 3, steps), np.nan), np.full(count, np.nan)
+    covariances = list[Array]()
+    dt, fixes = (
+        np.ascontiguousarray(np.broadcast_to(array, shape))
+        for array, shape in (
+            (durations_of(dt), (count, steps)),
+            (np.asarray(pose_std, dtype=np.float64), poses.shape),
+        )
+    )
+    arrays = poses, places, seen, dt, fixes, least, spread
     for some in _pieces(seen) if read in (BEARING_RANGE, POSITION) else ():
-        part = _Drives(
-            poses[some], places[some], seen[some], durations[some], fixes[some]
-        )
-        P, whole, known = _filtered(part, slam, start, threads)
-        x, y = poses[some, :, 0], poses[some, :, 1]
-        lever = (
-            2 * (y * P[..., 0, 2] - x * P[..., 1, 2]) + (x * x + y * y) * P[..., 2, 2]
-        )
-        raw[some], heading[some] = P[..., 0, 0] + P[..., 1, 1], P[..., 2, 2]
-        position[some] = raw[some] + lever
-        spread[some] = _about_centre(whole, known)
-        sizes = (3 + 2 * known).tolist()
-        covariances += [each[:n, :n] for each, n in zip(whole, sizes, strict=True)]
+        piece = [array[some] for array in arrays]
+        P, slots = filter_at_truth(piece, start, *stds, read, threads)
+        if with_covariances:
+            last = poses[some, -1], places[some]
+            covariances += _invariant_covariances(P, slots, *last)
+    position, heading, raw = np.moveaxis(least, 1, 0)
     return PosteriorBound(position, heading, raw, spread, tuple(covariances), origin)
 
 
@@ -177,27 +178,16 @@ def efficiency(bound: Array, squared_error: Array) -> Efficiency:
     return Efficiency(value, (value - reach, value + reach))
 
 
-def map_error_squared(error: Array) -> Array:
-    """Return the square of invariant errors (..., 3 + 2n) that the bound is about.
+def map_error_squared(errors: Array) -> Array:
+    """Return the square of invariant errors (..., n, 2) that the bound is about.
 
     Returns
     -------
     ndarray, shape (...)
         Mean over the n > 0 landmarks about the centre of the map [m²].
     """
-    points = error[..., 3:].reshape(*error.shape[:-1], -1, 2)
-    apart = points - points.mean(axis=-2, keepdims=True)
+    apart = errors - errors.mean(axis=-2, keepdims=True)
     return np.asarray((apart**2).sum(axis=-1).mean(axis=-1))
-
-
-class _Drives(NamedTuple):
-    """What B runs of T scans do and read, without noise."""
-
-    poses: Array  # (B, T, 3)
-    places: Array  # (B, L, 2) of landmarks
-    visible: BoolArray  # (B, T, L)
-    dt: Array  # (B, T)
-    pose_std: Array  # (B, T, 3), of readings of the poses, infinite where there is none
 
 
 _MOST_BYTES = 2**22  # of the covariances of the runs that are filtered at once
@@ -206,104 +196,17 @@ _MOST_BYTES = 2**22  # of the covariances of the runs that are filtered at once
 def _pieces(visible: BoolArray) -> Iterator[slice]:
     """Cut runs into pieces that fit into memory."""
     most = int(visible.any(axis=1).sum(axis=1).max(initial=0))
-    size = max(argument_checks.usable_cores(), _MOST_BYTES // (8 * (3 + 2 * most) ** 2))
+    size = max(usable_cores(), _MOST_BYTES // (8 * (3 + 2 * most) ** 2))
     for begin in range(0, len(visible), size):
         yield slice(begin, begin + size)
 
 
-def _filtered(
-    drives: _Drives, slam: EkfSlam, start_std: Array, threads: int | None
-) -> tuple[Array, Array, IntArray]:
-    """Filter runs at the truth.
-
-    Returns
-    -------
-    pose_covariances : ndarray, shape (B, T, 3, 3)
-        In the additive frame.
-    covariances : ndarray, shape (B, 3 + 2n, 3 + 2n)
-        At the end, in the invariant frame.
-    known : ndarray of int, shape (B,)
-        The number of landmarks that each run reads, n at most.
-    """
-    is_read = drives.visible.any(axis=1)
-    known = is_read.sum(axis=1)
-    rows = np.argsort(~is_read, axis=1, kind="stable")[:, : known.max(initial=0)]
-    if not is_read.all():
-        drives = drives._replace(
-            places=np.take_along_axis(drives.places, rows[..., None], axis=1),
-            visible=np.take_along_axis(drives.visible, rows[:, None], axis=2),
-        )
-    batch = BatchSlam(
-        slam,
-        *rows.shape,
-        initial_poses=drives.poses[:, 0],
-        initial_pose_std=start_std,
-        threads=threads,
-    )
-    pose_covariances = _pose_covariances(batch, drives, slam.sensor)
-    beliefs = batch.beliefs()
-    whole = invariant_covariance(beliefs.means, beliefs.covariances)
-    whole[batch.failed_at >= 0] = np.nan
-    return pose_covariances, whole, known
-
-
-def _pose_covariances(batch: BatchSlam, drives: _Drives, sensor: Sensor) -> Array:
-    """Take a batch through exact drives, in pieces that end where poses are read."""
-    poses, _, visible, dt, pose_std = drives
-    moved, z = _displacements(poses), _readings(drives, sensor)
-    dt = np.array(dt)
-    dt[:, :1] = 0.0
-    P, begin = np.empty((*dt.shape, 3, 3)), 0
-    due = np.flatnonzero(np.isfinite(pose_std).any(axis=(0, 2)))
-    for end in sorted({*(due + 1).tolist(), P.shape[1]}):
-        part = np.s_[:, begin:end]
-        P[part] = batch.run(
-            moved[part], z[part], visible[part], dt[part]
-        ).pose_covariances
-        last, begin = end - 1, end
-        stds, going = pose_std[:, last], batch.failed_at < 0
-        for std in np.unique(stds[going], axis=0):
-            if (here := np.isfinite(std)).any():
-                runs, R = going & (stds == std).all(axis=1), np.diag(std[here] ** 2)
-                batch.observe_pose(poses[:, last, here], np.eye(3)[here], R, runs=runs)
-                P[runs, last] = batch.storage().covariances[runs, :3, :3]
-    return P
-
-
-def _displacements(poses: Array) -> Array:
-    """Return the motion before each pose in the frame of the robot, (B, T, 3)."""
-    step, heading = np.diff(poses, axis=1, prepend=poses[:, :1]), poses[:, :-1, 2]
-    dx, dy = step[:, 1:, 0], step[:, 1:, 1]
-    cos, sin = np.cos(heading), np.sin(heading)
-    step[:, 1:, 0], step[:, 1:, 1] = cos * dx + sin * dy, cos * dy - sin * dx
-    return step
-
-
-def _readings(drives: _Drives, sensor: Sensor) -> Array:
-    """Return the exact readings, shape (B, T, L, 2), zeros where not visible."""
-    visible, (x, y, heading) = drives.visible, drives.poses.reshape(-1, 3).T
-    at = np.flatnonzero(visible)  # a third of the time of three numbers for each
-    scan, row = np.divmod(at, visible.shape[2])
-    landmark = scan // visible.shape[1] * visible.shape[2] + row
-    lx, ly = drives.places.reshape(-1, 2).T
-    dx, dy = lx[landmark] - x[scan], ly[landmark] - y[scan]
-    cos, sin = np.cos(heading)[scan], np.sin(heading)[scan]
-    z = np.zeros((visible.size, 2))
-    z[at] = sensor.read(cos * dx + sin * dy, cos * dy - sin * dx)
-    return z.reshape(*visible.shape, 2)
-
-
-def _about_centre(covariances: Array, known: IntArray) -> Array:
-    """Return the mean variance of the landmarks about their centre, shape (B,).
-
-    Runs with equally many landmarks are computed together: a sum of more numbers, even
-    zeros, has other last bits.
-    """
-    found = np.where(known > 0, 0.0, np.nan)
-    for n in np.unique(known[known > 0]).tolist():
-        runs = np.flatnonzero(known == n)
-        for axis in (3, 4):
-            block = covariances[runs, axis : 3 + 2 * n : 2, axis : 3 + 2 * n : 2]
-            own = np.ascontiguousarray(block.diagonal(axis1=1, axis2=2))
-            found[runs] += own.mean(axis=1) - block.reshape(len(runs), -1).mean(axis=1)
-    return found
+def _invariant_covariances(
+    covariances: Array, slots: IntArray, poses: Array, places: Array
+) -> Iterator[Array]:
+    """Yield the whole final covariances of runs, landmarks in the order of rows."""
+    for P, slot, pose, points in zip(covariances, slots, poses, places, strict=True):
+        read = slot >= 0
+        at = columns_of(slot[read].tolist())
+        whole = (np.tril(P) + np.tril(P, -1).T)[np.ix_(at, at)]
+        yield invariant_covariance(np.append(pose, points[read]), whole)

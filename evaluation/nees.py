@@ -10,17 +10,20 @@ rejects even a consistent filter if the heading is uncertain.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import NamedTuple
+
 import numpy as np
 
 from ..argument_checks import one_of
-from ..arrays import Array
+from ..arrays import Array, BoolArray
 from ..estimator.models.rigid_motion import (
     ERROR_FRAMES,
     ErrorFrame,
     additive_error,
     invariant_covariance,
     invariant_error,
-    rotations,
+    left_jacobian,
     seen_from,
 )
 
@@ -59,24 +62,25 @@ def whitened(errors: Array, covariances: Array) -> Array:
     Parameters
     ----------
     errors : ndarray, shape (..., n)
+        They may have more leading axes than the covariances.
     covariances : ndarray, shape (..., n, n)
 
     Returns
     -------
     ndarray, shape (..., n)
-        nan where a covariance is singular or anything is nan.
+        nan from the first entry on that is singular given those before, or nan.
 
     Examples
     --------
     >>> whitened(np.array([2.0, 0.0]), np.eye(2) * 4)
     array([1., 0.])
     """
-    std = np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0))
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        scaled = errors / std
+        if errors.shape[-1] > _FEW:
+            return _whiten_each(errors, covariances)
+        std = np.sqrt(np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0))
         correlations = covariances / std[..., :, None] / std[..., None, :]
-        whiten = _whiten_few if std.shape[-1] <= _FEW else _whiten_each
-        return whiten(scaled, correlations)
+        return _whiten_few(errors / std, correlations)
 
 
 def pose_nees(
@@ -165,20 +169,24 @@ def landmark_nees(
     return normalised_squared_error(*parts_of_landmarks(*states))
 
 
-def parts_of_landmarks(errors: Array, covariances: Array) -> tuple[Array, Array]:
+def parts_of_landmarks(
+    errors: Array, covariances: Array, first: int = 3
+) -> tuple[Array, Array]:
     """Return the errors (..., n, 2) of landmarks, and their own covariances.
 
     Parameters
     ----------
     errors : ndarray, shape (..., 3 + 2n)
     covariances : ndarray, shape (..., 3 + 2n, 3 + 2n)
+    first : {3, 0}
+        Where the landmarks begin.
 
     Returns
     -------
     errors : ndarray, shape (..., n, 2)
     covariances : ndarray, shape (..., n, 2, 2)
     """
-    rows = np.arange(3, errors.shape[-1]).reshape(-1, 2)
+    rows = np.arange(first, errors.shape[-1] - 3 + first).reshape(-1, 2)
     blocks = covariances[..., rows[:, :, None], rows[:, None, :]]
     return errors[..., rows], np.ascontiguousarray(blocks)
 
@@ -201,43 +209,10 @@ def relative_map_nees(true_states: Array, means: Array, covariances: Array) -> A
     -------
     ndarray, shape (...)
     """
-    return normalised_squared_error(*relative_map(true_states, means, covariances))
-
-
-def relative_landmark_deviations(
-    true_states: Array, means: Array, covariances: Array
-) -> Array:
-    """Return the whitened error of each landmark, as seen from the robot.
-
-    ::
-
-        w = L⁻¹ R(θ̂) (m − m̂),   L Lᵀ = R(θ̂) P R(θ̂)ᵀ,   P the covariance of m − m̂
-
-    with m as in :func:`relative_map_nees`. The axes are those of the map. If the
-    covariances are correct, w has the mean 0 and the covariance I, and its square is
-    the NEES of the landmark, 2 degrees of freedom.
-
-    Parameters
-    ----------
-    true_states, means, covariances
-        As in :func:`state_nees`.
-
-    Returns
-    -------
-    ndarray, shape (..., n, 2)
-        nan where the covariance of a landmark is singular.
-    """
-    relative = relative_map(true_states, means, covariances)
-    return deviations_of_landmarks(*relative, means[..., 2])
-
-
-def deviations_of_landmarks(errors: Array, claimed: Array, headings: Array) -> Array:
-    """Return the deviations from what `relative_map` returns, and θ̂ (...)."""
-    rows = np.arange(errors.shape[-1]).reshape(-1, 2)
-    turn = np.swapaxes(rotations(-headings), -1, -2)[..., None, :, :]
-    blocks = turn @ claimed[..., rows[:, :, None], rows[:, None, :]]
-    blocks = blocks @ np.swapaxes(turn, -1, -2)
-    return whitened(np.einsum("...ij,...j->...i", turn, errors[..., rows]), blocks)
+    found = relative_state(true_states, means, covariances)
+    return normalised_squared_error(
+        found.errors[0, ..., :-3], found.covariance[..., :-3, :-3]
+    )
 
 
 def is_indefinite(covariance: Array) -> bool:
@@ -256,22 +231,69 @@ def is_indefinite(covariance: Array) -> bool:
     return bool(least < -_ROUNDING * len(std))
 
 
-def relative_map(
+class RelativeState(NamedTuple):
+    """Errors of a map in the robot's frame, turned by θ̂, and then of the pose.
+
+    ::
+
+        R(θ̂) (m − m̂),    m = R(θ)ᵀ (l − p)
+    """
+
+    #: That of the map, without the pose; then what the errors of the state become by
+    #: w = e_l − e_p − J (l̂ − p̂) e_θ, the additive and the invariant one.
+    errors: Array  # (3, ..., 2n + 3)
+    covariance: Array  # (..., 2n + 3, 2n + 3)
+    #: The same three of each landmark, now relative to the robot, additive, invariant.
+    landmarks: Array  # (3, ..., n, 2)
+    landmark_covariances: Array  # (3, ..., n, 2, 2)
+
+
+def relative_state(
     true_states: Array, means: Array, covariances: Array
-) -> tuple[Array, Array]:
-    """Return the errors of the map in the robot's frame, and their covariance."""
-    local = _landmarks_from_robot(means)
-    errors = _landmarks_from_robot(true_states) - local
-    n = errors.shape[-1] // 2
-    turn = rotations(-means[..., 2])
-    jacobian = np.zeros((*turn.shape[:-2], 2 * n, 3 + 2 * n))
-    for row in range(0, 2 * n, 2):
-        jacobian[..., row : row + 2, :2] = -turn
-        jacobian[..., row : row + 2, 3 + row : 5 + row] = turn
-    jacobian[..., 0::2, 2] = local[..., 1::2]
-    jacobian[..., 1::2, 2] = -local[..., 0::2]
-    claimed = jacobian @ covariances @ np.swapaxes(jacobian, -1, -2)
-    return errors, claimed
+) -> RelativeState:
+    """Return a linear transform of states in which one factor serves three NEES.
+
+    The covariance of the map is W P Wᵀ with W = [−B I], B the columns of the pose ::
+
+        P_ll − B Yᵀ − Y Bᵀ,    Y = P_lp − B P_pp / 2
+
+    The invariant error ξ about p̂ has w = ξ_l − ξ_p, and that of the map is V(t) R(t)ᵀ w
+    (:mod:`slamgym.estimator.models.rigid_motion`).
+    """
+    truth, near = (seen_from(means[..., :2], each) for each in (true_states, means))
+    n, pose = means.shape[-1] - 3, covariances[..., :3, :3]
+    B = np.zeros((*near.shape[:-1], n, 3))
+    B[..., 0::2, 0] = B[..., 1::2, 1] = 1.0
+    B[..., 0::2, 2], B[..., 1::2, 2] = -near[..., 4::2], near[..., 3::2]
+    e, xi = additive_error(truth, near), invariant_error(truth, near)
+    errors = np.zeros((3, *means.shape))
+    errors[1, ..., n:], errors[2, ..., n:] = e[..., :3], xi[..., :3]
+    errors[1, ..., :n] = e[..., 3:] - (B @ e[..., :3, None])[..., 0]
+    errors[2, ..., :n] = xi[..., 3:] - (B[..., :2] @ xi[..., :2, None])[..., 0]
+    turn = left_jacobian(-e[..., 2])[..., None]  # V(t) R(t)ᵀ
+    errors[0, ..., :n] = (turn * errors[2, ..., :n].copy().view(complex)).view(float)
+    across = covariances[..., 3:, :3] - B @ pose
+    half = across + B @ pose / 2
+    Q = np.empty(covariances.shape)
+    np.matmul(
+        np.concatenate([-B, -half], axis=-1),
+        np.concatenate([half, B], axis=-1).mT,
+        out=Q[..., :n, :n],
+    )
+    Q[..., :n, :n] += covariances[..., 3:, 3:]
+    Q[..., :n, n:], Q[..., n:, :n] = across, across.mT
+    Q[..., n:, n:] = without_rounding(pose)
+    each, own = parts_of_landmarks(e, covariances)
+    _, seen = parts_of_landmarks(e, Q, 0)
+    lever = B[..., 2].reshape(each.shape)
+    slope = covariances[..., 3:, 2] - B[..., 2] * pose[..., 2, 2, None] / 2
+    turned = lever[..., :, None] * slope.reshape(each.shape)[..., None, :]
+    return RelativeState(
+        errors,
+        Q,
+        np.stack([errors[0, ..., :n], e[..., 3:], xi[..., 3:]]).reshape(3, *each.shape),
+        np.stack([seen, own, own - turned - turned.mT]),
+    )
 
 
 def _whiten_few(errors: Array, correlations: Array) -> Array:
@@ -299,20 +321,28 @@ def _whiten_few(errors: Array, correlations: Array) -> Array:
     return white
 
 
-def _whiten_each(errors: Array, correlations: Array) -> Array:
-    """Solve L w = e, C = L Lᵀ, one by one; nan where C is singular."""
+def _whiten_each(errors: Array, covariances: Array) -> Array:
+    """Solve L w = e, P = L Lᵀ, one by one.
+
+    A pivot of P, as a share of its variance, is that of the correlations.
+    """
     from scipy.linalg.lapack import dpotrf, dtrtrs  # noqa: PLC0415 (slow to import)
 
     n = errors.shape[-1]
-    e, C = errors.reshape(-1, n), correlations.reshape(-1, n, n)
-    white, pivots = np.full((2, *e.shape), np.nan)
-    for index in range(len(white)):
-        factor, failed = dpotrf(C[index], lower=1)
+    factors = covariances.reshape(-1, n, n).copy()
+    variances = factors.diagonal(axis1=1, axis2=2).copy()
+    white = errors.reshape(-1, len(factors), n).swapaxes(0, 1).copy()
+    for L, w in zip(factors.mT, white.mT, strict=True):
+        _, failed = dpotrf(L, lower=1, clean=0, overwrite_a=1)
         if not failed:
-            pivots[index] = factor.diagonal()
-            white[index] = dtrtrs(factor, e[index], lower=1)[0]
-    white[~(pivots**2 > SINGULAR).all(axis=1)] = np.nan
-    return white.reshape(errors.shape)
+            dtrtrs(L, w, lower=1, overwrite_b=1)
+            continue
+        size = failed - 1
+        w[:size] = dtrtrs(L[:size, :size], w[:size], lower=1)[0] if size else 0.0
+        w[size:] = np.nan
+    good = factors.diagonal(axis1=1, axis2=2) ** 2 > SINGULAR * variances
+    known = np.logical_and.accumulate(good, axis=1)[:, None]
+    return np.where(known, white, np.nan).swapaxes(0, 1).reshape(errors.shape)
 
 
 def in_frame(
@@ -323,14 +353,7 @@ def in_frame(
     The origin of the invariant frame is the estimated position, so that the NEES has
     the same digits wherever the world's origin lies.
     """
-    cleared = without_rounding(covariances)
-    return of_cleared(true_states, means, cleared, frame)
-
-
-def of_cleared(
-    true_states: Array, means: Array, covariances: Array, frame: ErrorFrame
-) -> tuple[Array, Array]:
-    """Return what `in_frame` returns, of covariances from `without_rounding`."""
+    covariances = without_rounding(covariances)
     if one_of("frame", frame, ERROR_FRAMES) == "invariant":
         origins = means[..., :2]
         truth, means = seen_from(origins, true_states), seen_from(origins, means)
@@ -346,14 +369,8 @@ def without_rounding(covariances: Array) -> Array:
     1e-18 times the variance of x, in any direction.  Therefore, the smallest variance
     of the position given the heading decides.
     """
-    position, heading = covariances[..., :2, :2], covariances[..., 2, 2]
-    inverse = np.divide(1, heading, out=np.zeros(heading.shape), where=heading > 0)
-    cross = covariances[..., :2, 2, None]
-    given = position - cross * cross.mT * inverse[..., None, None]
-    x, y = given[..., 0, 0], given[..., 1, 1]
-    largest = np.diagonal(position, axis1=-2, axis2=-1).max(axis=-1)
-    area = x * y - given[..., 0, 1] * given[..., 1, 0]
-    rounded = area < _ROUNDED * largest * (x + y)
+    P = np.moveaxis(covariances[..., :3, :3], (-2, -1), (0, 1))
+    rounded = is_rounded(P)
     if not rounded.any():
         return covariances
     cleared = covariances.copy()
@@ -361,9 +378,41 @@ def without_rounding(covariances: Array) -> Array:
     return cleared
 
 
-def _landmarks_from_robot(states: Array) -> Array:
-    """Return the landmarks in the robot's frame, shape (..., 2n)."""
-    dx, dy = states[..., 3::2] - states[..., :1], states[..., 4::2] - states[..., 1:2]
-    cos, sin = np.cos(states[..., 2:3]), np.sin(states[..., 2:3])
-    pairs = np.stack([cos * dx + sin * dy, cos * dy - sin * dx], axis=-1)
-    return np.asarray(pairs.reshape(*states.shape[:-1], -1))
+def is_rounded(P: Array) -> BoolArray:
+    """Return where `without_rounding` clears covariances P (3, 3, ...)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(P[2, 2] > 0, 1 / P[2, 2], 0.0)
+    a, b = P[2, 0] * share, P[2, 1] * share
+    x, y, xy = P[0, 0] - P[2, 0] * a, P[1, 1] - P[2, 1] * b, P[1, 0] - P[2, 1] * a
+    largest = np.maximum(P[0, 0], P[1, 1])
+    return np.asarray(x * y - xy * xy < _ROUNDED * largest * (x + y))
+
+
+def nees_of_poses(
+    P: Array, *errors: tuple[Array, Array, Array]
+) -> Iterator[tuple[Array, Array]]:
+    """Yield the NEES of the position and of the pose for each kind of error.
+
+    They are those of `whitened` for covariances without rounding, entry by entry.
+
+    Parameters
+    ----------
+    P : ndarray, shape (3, 3, ...)
+    errors : three arrays of shape (...)
+        x, y and the heading, of each kind.
+    """
+    (xx, *_), (xy, yy, _), (xt, yt, tt) = P
+    sx, sy, st = np.sqrt(xx), np.sqrt(yy), np.sqrt(tt)
+    a, b, c = xy / (sx * sy), xt / (sx * st), yt / (sy * st)
+    left, rest = 1 - a * a, c - a * b
+    known = (left > SINGULAR) & (xx + yy < np.inf) & ~is_rounded(P)
+    left = np.where(known, left, np.nan)
+    slope = rest / left
+    last = 1 - b * b - rest * slope
+    last = np.where((last > SINGULAR) & (tt < np.inf), last, np.nan)
+    for x, y, turn in errors:
+        u = x / sx
+        v = y / sy - a * u
+        w = turn / st - b * u - slope * v
+        position = u * u + v * v / left
+        yield position, position + w * w / last

@@ -177,27 +177,36 @@ def position_accuracy(estimate: ArrayLike, truth: ArrayLike) -> PositionAccuracy
     )
 
 
-def distances(estimate: Array, truth: Array) -> tuple[Array, Array]:
-    """Return the raw and the aligned distances of `position_accuracy`, unchecked.
+def aligned_rms(truth: Array, errors: Array) -> Array:
+    """Return the aligned RMSE of `position_accuracy`, without distances and checks.
+
+    With g and e true and estimated positions about their means, C the best rotation::
+
+        Σ |C e − g|² = Σ |e − g|² + 2 (a − √(a² + b²)),    a = Σ e · g,  b = Σ e × g
 
     Parameters
     ----------
-    estimate, truth : ndarray, shape (..., n, 2)
-        Of each path or map [m]; n >= 1.
+    truth, errors : ndarray, shape (2, ..., n)
+        x and y of true positions, and of estimated ones minus these [m].
 
     Returns
     -------
-    raw, aligned : ndarray, shape (..., n)
+    ndarray, shape (...)
         [m]
     """
-    *_, moved = _aligned(estimate, truth)
-    return lengths(estimate - truth), lengths(moved - truth)
-
-
-def lengths(vectors: Array) -> Array:
-    """Return the lengths (...) of the first two components of vectors (..., n)."""
-    x, y = vectors[..., 0], vectors[..., 1]
-    return np.asarray(np.sqrt(x * x + y * y))
+    given = np.stack([truth, errors])  # in the order in which numpy adds up quickly
+    (gx, gy), (dx, dy) = given - given.mean(axis=-1, keepdims=True)
+    dot, cross, raw = (
+        np.vecdot(a, b) + np.vecdot(c, d)
+        for a, b, c, d in (
+            (gx + dx, gx, gy + dy, gy),
+            (dx, gy, -dy, gx),
+            (dx, dx, dy, dy),
+        )
+    )
+    length = np.hypot(dot, cross)
+    gain = np.where(dot > 0, cross * cross / (length + dot), length - dot)
+    return np.asarray(np.sqrt(np.maximum(raw - 2 * gain, 0.0) / gx.shape[-1]))
 
 
 def exchanged_positions(estimate: ArrayLike, truth: ArrayLike) -> Exchange:
@@ -405,8 +414,8 @@ def ellipse_areas(covariances: NDArray[np.floating]) -> Array:
     >>> ellipse_areas(np.eye(2)[None]) / np.pi
     array([9.])
     """
-    determinants = np.maximum(np.linalg.det(covariances), 0.0)
-    return np.asarray(9 * np.pi * np.sqrt(determinants))
+    (xx, xy), (yx, yy) = np.moveaxis(covariances, (-2, -1), (0, 1))
+    return np.asarray(9 * np.pi * np.sqrt(np.maximum(xx * yy - xy * yx, 0.0)))
 
 
 def poses_at(times: ArrayLike, ground_truth: ArrayLike) -> Array:

@@ -20,9 +20,9 @@ import numpy as np
 from .. import argument_checks
 from ..arrays import AnyArray, Array
 from ..estimator.filters.batch import BatchTrace
-from ..estimator.models.rigid_motion import pose_rotation
+from ..estimator.models.rigid_motion import invariant_error, pose_rotation, seen_from
 from ..evaluation.consistency_report import evaluate_consistency
-from ..evaluation.error_bound import PosteriorBound
+from ..evaluation.error_bound import PosteriorBound, map_error_squared
 from ..evaluation.nees import normalised_squared_error, whitened
 from ..evaluation.noise_findings import CHANNELS, MOMENTS
 from ..evaluation.trajectory_error import Alignment, align_positions, poses_at
@@ -660,13 +660,17 @@ def _add_map(
         return f"its map has landmark {ids.max()}, the world has {count} from 0 on"
     truth, claims = runs.landmarks[run], estimate.landmark_covariances
     measured = measure_landmarks(
-        runs.true_poses[[run], -1],
-        truth[None],
-        pose[None],
-        ids[None],
-        estimate.landmarks[None],
-        claims[None],
+        truth[None], ids[None], estimate.landmarks[None], claims[None]
     )
+    near = (
+        seen_from(pose[:2], np.append(at, points))
+        for at, points in (
+            (runs.true_poses[run, -1], truth[ids]),
+            (pose, estimate.landmarks),
+        )
+    )
+    errors = invariant_error(*near)[3:].reshape(-1, 2)
+    measured["map_error_centred"] = np.sqrt(map_error_squared(errors))[None]
     squares = normalised_squared_error(truth[ids] - estimate.landmarks, claims)
     measured["landmark_nees_additive"] = by_id(squares[None], ids[None], count)
     measured["landmark_mahalanobis"] = np.sqrt(measured["landmark_nees_additive"])

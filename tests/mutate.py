@@ -102,7 +102,7 @@ TESTS = {
     "estimator/check_estimator": "check_estimator",
     "estimator/covariance_checks": "check_estimator",
     "estimator/kernels/assignment_search": "joint_assignment constellations",
-    "estimator/kernels/batch": "batch",
+    "estimator/kernels/batch": "batch error_bound",
     "estimator/kernels/imagine": "imagine association map_management",
     "estimator/kernels/sizes_of_covariances": "imagine",
     "estimator/kernels/scan_update": (

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ... import argument_checks
 from ...argument_checks import aligned_zeros, shaped, usable_cores
-from ...arrays import LARGEST, AnyArray, Array, BoolArray, IntArray
+from ...arrays import LARGEST, SMALLEST, AnyArray, Array, BoolArray, IntArray
 from ...restorable import Restorable, State
 from ..beliefs import Belief, columns_of
 from ..guards import saved_states
@@ -24,13 +24,21 @@ from ..kernels.batch import (
     RunArrays,
     StepData,
     begin_runs,
+    drive_at_truth,
     drive_runs,
     share_out,
 )
-from ..kernels.scan_update import FRAMES, Workspace, workspace_for
+from ..kernels.scan_update import (
+    AFTER_STDS,
+    FIRST_STD,
+    FRAMES,
+    Rules,
+    Workspace,
+    workspace_for,
+)
 from ..models.bearing_range import wrap_angle
 from ..models.sensor_kernels import for_sensor
-from ..models.sensors import only_placing
+from ..models.sensors import Sensor, only_placing
 from .ekf import EkfSlam
 from .gaussian_map import GaussianMap
 from .pose_readings import ObservedMap, PoseReading, gate_of
@@ -254,7 +262,7 @@ class BatchSlam(Restorable):
         u = argument_checks.as_floats("odometry", odometry)
         steps = u.shape[1] if u.ndim == 3 else 0
         u = self._displacements(u, (self.runs, steps))
-        durations = _durations(dt)
+        durations = durations_of(dt)
         if durations.shape not in ((), (1,), (steps,), (self.runs, steps)):
             raise ValueError(
                 f"dt must be one number or {steps}, got shape {durations.shape}"
@@ -285,7 +293,7 @@ class BatchSlam(Restorable):
         dt : array_like, shape (B,)
             Duration of the step of each run.
         """
-        durations = _durations(dt)
+        durations = durations_of(dt)
         data = self._checked((self.runs,), odometry, measurements, visible, durations)
         one_step = tuple([part[:, None] for part in data])
         self._drive(one_step, self._last_step, runs)
@@ -410,11 +418,44 @@ def _of(part: slice, arrays: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple([array[part] for array in arrays])
 
 
+def filter_at_truth(
+    piece: Sequence[AnyArray],
+    start_std: Array,
+    motion_std: Array,
+    measurement_std: Array,
+    sensor: Sensor,
+    threads: int | None,
+) -> tuple[Array, IntArray]:
+    """Fill bounds of errors; return covariances and slots as `drive_at_truth` does.
+
+    The piece holds its `TrueDrives`, and its two arrays of bounds.
+    """
+    visible = piece[2]
+    known = int(visible.any(axis=1).sum(axis=1).max(initial=0))
+    readings = int(visible.sum(axis=2).max(initial=0)) + 3
+    capacity = GaussianMap.capacity_for(known)
+    P = aligned_zeros(len(visible), capacity, capacity)
+    P[:, range(3), range(3)] = start_std**2
+    slots = np.full(visible[:, 0].shape, NEVER)
+    rules = np.array(Rules(min_range=SMALLEST))
+    rules[FIRST_STD:AFTER_STDS] = sensor.noise(measurement_std)
+
+    def drive(part: slice) -> None:
+        own, known, *drives, least, spread = [each[part] for each in (P, slots, *piece)]
+        rows = workspace_for(Rules(), readings, capacity).rows
+        for_sensor(drive_at_truth, sensor)(
+            *(own, known, tuple(drives), least, spread, motion_std**2, rules, rows)
+        )
+
+    share_out(drive, len(visible), threads or usable_cores())
+    return P, slots
+
+
 # --------------------------------------------------------------------------------------
 # The arguments of a batch of runs, checked, and its results.
 
 
-def _durations(dt: ArrayLike) -> Array:
+def durations_of(dt: ArrayLike) -> Array:
     """Return durations, or refuse such as are not finite or below 0."""
     durations = argument_checks.as_floats("dt", dt)
     few = durations.size < 100  # numpy needs longer for a few numbers

@@ -8,16 +8,30 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, jit_in_place, njit_allocating, njit_internal
-from ..models.rigid_motion import predict
+from ..models.bearing_range import expected_reading_jit, pose_slopes_jit
+from ..models.rigid_motion import predict, propagate
 from .scan_update import (
     ADDED,
+    BLOCK,
     DONE,
+    FIRST,
+    JACOBIAN,
+    LARGE,
     LEDGER_HEIGHT,
+    MEAN_BEFORE,
     OUTCOME,
     SLOT,
+    VARIANCE,
+    BeliefArrays,
+    Rules,
+    absorb,
+    add_landmark,
     as_rules,
+    refresh,
+    refresh_pose,
     update_belief,
     usable,
+    variances,
 )
 
 NEVER = -1
@@ -204,6 +218,140 @@ def gather(
     return m
 
 
+# --------------------------------------------------------------------------------------
+# Covariances alone, linearised at the truth: the bound of the errors of any filter.
+
+
+class TrueDrives(NamedTuple):
+    """What B runs of T scans do and read, without noise."""
+
+    poses: Array  # (B, T, 3)
+    places: Array  # (B, L, 2) of landmarks
+    visible: BoolArray  # (B, T, L)
+    dt: Array  # (B, T), duration of the motion before each scan
+    pose_std: Array  # (B, T, 3), of readings of the poses, infinite where there is none
+
+
+@jit
+def drive_at_truth(
+    covariances: Array,
+    all_slots: IntArray,
+    true_drives: tuple[Array, Array, BoolArray, Array, Array],
+    least: Array,
+    spread: Array,
+    motion_variance: Array,
+    rule_values: Array,
+    rows: Array,
+) -> None:
+    """Take the covariance of each run through its true drive, in place.
+
+    Parameters
+    ----------
+    covariances : ndarray, shape (B, capacity, capacity)
+        On return the lower halves and the rows of the pose, landmarks in the order of
+        their first readings; nan where an innovation covariance is not positive
+        definite.
+    all_slots : ndarray, shape (B, L)
+        On return the place of each landmark in the map, NEVER if it was not read.
+    true_drives : TrueDrives
+        As a plain tuple.
+    least : ndarray, shape (B, 3, T)
+        On return the variance of the position in the invariant frame, that of the
+        heading, and that of the position in the additive frame.
+    spread : ndarray, shape (B,)
+        On return the mean variance of a landmark about the centre of the map.
+    motion_variance, rule_values
+        (σx², σy², σα²), and rules as :func:`.scan_update.as_rules` reads them.
+    rows
+        As in :class:`.scan_update.Workspace`, for three more readings than in any scan.
+    """
+    drives, variance, truth = TrueDrives(*true_drives), np.empty(3), rows[MEAN_BEFORE]
+    columns, rules = np.empty(all_slots.shape[1] + 3, np.int64), as_rules(rule_values)
+    for b in range(len(spread)):
+        P, slots, size = covariances[b], all_slots[b], 3
+        for t in range(least.shape[2]):
+            before, pose = drives.poses[b, max(t - 1, 0)], drives.poses[b, t]
+            x, y = pose[0], pose[1]
+            for i in range(3):
+                truth[i], variance[i] = pose[i], motion_variance[i] * drives.dt[b, t]
+            if t > 0:
+                cos, sin = np.cos(before[2]), np.sin(before[2])
+                propagate(P, size, before[1] - y, x - before[0], cos, sin, variance)
+            scan = drives.places[b], drives.visible[b, t], drives.pose_std[b, t]
+            size, used = linearise_at_truth(P, size, slots, scan, rules, rows, columns)
+            if used > 0:
+                block = BLOCK if size <= LARGE else used
+                if absorb(P, size, rows, columns, used, block) >= 0:
+                    P[:] = np.nan
+                    break
+                refresh_pose(P, size)
+            least[b, 1, t], least[b, 2, t] = P[2, 2], P[0, 0] + P[1, 1]
+            lever = 2 * (y * P[0, 2] - x * P[1, 2]) + (x * x + y * y) * P[2, 2]
+            least[b, 0, t] = least[b, 2, t] + lever
+        spread[b] = about_centre(P, size, truth)
+
+
+@njit_internal
+def linearise_at_truth(
+    P: Array,
+    size: int,
+    slots: IntArray,
+    scan: tuple[Array, BoolArray, Array],
+    rules: Rules,
+    rows: Array,
+    columns: IntArray,
+) -> tuple[int, int]:
+    """Fill H and Q of one scan and of the readings of the pose; append new landmarks.
+
+    Returns the length of the state, and the number of readings for `absorb`.
+    """
+    used, truth = 0, rows[MEAN_BEFORE]
+    x, y, heading = truth[0], truth[1], truth[2]
+    places, visible, pose_std = scan
+    for k in range(len(slots)):
+        if not visible[k]:
+            continue
+        dx, dy = places[k, 0] - x, places[k, 1] - y
+        distance, row = np.sqrt(dx * dx + dy * dy), FIRST + 2 * used
+        if distance < rules.min_range:
+            continue
+        if slots[k] == NEVER:
+            z0, z1 = expected_reading_jit(dx, dy, heading)
+            add_landmark(BeliefArrays(truth, P, truth), size, z0, z1, rules)
+            slots[k], size = (size - 3) // 2, size + 2
+            continue
+        columns[used], used = 3 + 2 * slots[k], used + 1
+        refresh(P, size, columns[used - 1])
+        ax, ay, bx, by, a_turn, b_turn = pose_slopes_jit(dx, dy, heading)
+        H = rows[row : row + 2, JACOBIAN : JACOBIAN + 5]
+        H[0, 0], H[0, 1], H[0, 2], H[0, 3], H[0, 4] = -ax, -ay, a_turn, ax, ay
+        H[1, 0], H[1, 1], H[1, 2], H[1, 3], H[1, 4] = -bx, -by, b_turn, bx, by
+        rows[row, VARIANCE], rows[row + 1, VARIANCE] = variances(rules, distance)
+    for axis in range(3):
+        if pose_std[axis] < np.inf:
+            row, columns[used], used = FIRST + 2 * used, 0, used + 1
+            rows[row : row + 2, JACOBIAN : JACOBIAN + 5] = 0.0
+            rows[row, JACOBIAN + axis] = 1.0
+            rows[row, VARIANCE] = pose_std[axis] ** 2
+            rows[row + 1, VARIANCE] = 1.0  # of a void row
+    return size, used
+
+
+@njit_internal
+def about_centre(P: Array, size: int, mean: Array) -> float:
+    """Return the mean variance of the landmarks about their centre, invariant frame."""
+    own, of_sum, count = 0.0, 0.0, (size - 3) / 2
+    for i in range(3, size):
+        u = mean[i + 1] if i % 2 else -mean[i - 1]  # of −J l
+        for j in range(4 - i % 2, i + 1, 2):  # of the same axis
+            v = mean[j + 1] if i % 2 else -mean[j - 1]
+            shared = P[i, j] + u * P[2, j] + v * P[2, i] + u * v * P[2, 2]
+            own += shared * (i == j)
+            of_sum += shared * (2 - (i == j))
+    return float((own - of_sum / count) / count)
+
+
+# --------------------------------------------------------------------------------------
 # Small shares: a thread whose core is busy then delays the others little.
 SHARES_PER_THREAD = 8
 

@@ -354,7 +354,7 @@ def bound_runs(
     dt = np.tile(runs.dt, (len(runs.odometry), 1))
     if not scenario.motion.noise_at_rest:
         dt *= runs.odometry.any(axis=2)
-    bound = posterior_bound(
+    return posterior_bound(
         runs.true_poses,
         identified.landmarks_of_rows,
         identified.visible,
@@ -365,9 +365,9 @@ def bound_runs(
         pose_std=runs.fix_std,
         sensor=sensor_with_noise(scenario.sensor.kind, scenario),
         origin=scenario.start.pose[:2],
+        with_covariances=False,
         threads=threads,
     )
-    return bound._replace(covariances=())
 
 
 def sensor_with_noise(kind: str, scenario: Scenario) -> Sensor:

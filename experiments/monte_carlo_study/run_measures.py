@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...arrays import AnyArray, Array, BoolArray, IntArray
 from ...estimator.interface import Belief
 from ...estimator.models.bearing_range import wrap_angle
-from ...estimator.models.rigid_motion import ERROR_FRAMES, invariant_error, seen_from
+from ...estimator.models.rigid_motion import ERROR_FRAMES
 from ...evaluation import nees
 from ...evaluation.association_scores import (
     AssociationScores,
@@ -26,7 +26,7 @@ from ...evaluation.association_scores import (
 )
 from ...evaluation.error_bound import PosteriorBound, map_error_squared
 from ...evaluation.noise_findings import CHANNELS, MOMENTS
-from ...evaluation.trajectory_error import distances, ellipse_areas, lengths
+from ...evaluation.trajectory_error import aligned_rms, ellipse_areas
 from ...sim_configs import Scenario
 from ..logs.ground_truth import TrueLandmarks
 from ..logs.slamlog import NO_LANDMARK
@@ -212,7 +212,8 @@ def measure_runs(
     block, failures = _empty_block(runs), dict(filtered.failures)
     count, steps, _ = runs.visible.shape
     with np.errstate(all="ignore"):  # a diverged run may overflow
-        for some in _pieces(range(count), 9 * steps):
+        for piece in _pieces(range(count), 18 * steps):
+            some = slice(piece[0], piece[-1] + 1)
             measured = _measure_paths(runs.true_poses[some], filtered, some, bound)
             _write(block, some, measured)
         for name in ("ate", "ate_aligned", "pose_area"):
@@ -244,7 +245,9 @@ def _pieces(rows: Sequence[int], numbers: int) -> Iterator[list[int]]:
         yield list(rows[begin : begin + size])
 
 
-def _write(block: Block, rows: list[int], measured: Mapping[str, Value]) -> None:
+def _write(
+    block: Block, rows: list[int] | slice, measured: Mapping[str, Value]
+) -> None:
     for name, values in measured.items():
         block[name][rows] = values
 
@@ -391,35 +394,41 @@ def _empty_block(runs: SimulatedRuns) -> Block:
 
 
 def _measure_paths(
-    truth: Array, filtered: FilteredRuns, some: list[int], bound: PosteriorBound
+    truth: Array, filtered: FilteredRuns, some: slice, bound: PosteriorBound
 ) -> dict[str, Value]:
     """Measure the paths of some runs, whose true poses are given."""
-    poses = filtered.trace.poses[some]
-    covariances = filtered.trace.pose_covariances[some]
-    errors, origin = truth - poses, np.array(bound.origin)
-    variances = np.diagonal(covariances, axis1=-2, axis2=-1)
-    about = seen_from(origin, truth), seen_from(origin, poses)
-    raw, aligned = distances(poses[..., :2], truth[..., :2])
+    trace, origin = filtered.trace, np.array(bound.origin)
+    poses, covariances = trace.poses[some], trace.pose_covariances[some]
+    x, y, _ = np.moveaxis(poses, -1, 0)
+    ex, ey, turn = np.moveaxis(truth - poses, -1, 0).copy()
+    P = np.moveaxis(covariances, (-2, -1), (0, 1)).copy()
+    turn = wrap_angle(turn)
+    half = turn / 2
+    along = np.where(half == 0, 1.0, half / np.tan(half))
+    # ξ about the estimated position, where both frames have the same covariance
+    xi = along * ex + half * ey, along * ey - half * ex, turn
+    about = xi[0] + turn * (y - origin[1]), xi[1] - turn * (x - origin[0])
+    raw = np.sqrt(ex * ex + ey * ey)
     measured: dict[str, Value] = {
-        "heading_nees": nees.heading_nees(truth, poses, covariances),
-        "nis": filtered.trace.nis[some],
-        "nis_dof": filtered.trace.degrees_of_freedom[some],
-        "position_error": np.hypot(errors[..., 0], errors[..., 1]),
-        "position_error_invariant": lengths(invariant_error(*about)),
-        "heading_error": wrap_angle(errors[..., 2]),
-        "heading_std": np.sqrt(variances[..., 2]),
-        "position_std": np.sqrt(variances[..., 0] + variances[..., 1]),
+        "heading_nees": turn * turn / P[2, 2],
+        "nis": trace.nis[some],
+        "nis_dof": trace.degrees_of_freedom[some],
+        "position_error": raw,
+        "position_error_invariant": np.sqrt(about[0] ** 2 + about[1] ** 2),
+        "heading_error": turn,
+        "heading_std": np.sqrt(P[2, 2]),
+        "position_std": np.sqrt(P[0, 0] + P[1, 1]),
         "failed_at": -1,
         "ate": _rms(raw),
-        "ate_aligned": _rms(aligned),
+        "ate_aligned": aligned_rms(
+            np.moveaxis(truth[..., :2], -1, 0), np.stack([-ex, -ey])
+        ),
         "pose_area": ellipse_areas(covariances[:, -1, :2, :2]),
     }
-    cleared = nees.without_rounding(covariances)
-    for frame in ERROR_FRAMES:
-        claimed = nees.of_cleared(truth, poses, cleared, frame)
-        x, y, turn = np.moveaxis(nees.whitened(*claimed) ** 2, -1, 0)
-        measured[f"pose_nees_{frame}"] = x + y + turn
-        measured[f"position_nees_{frame}"] = x + y
+    found = nees.nees_of_poses(P, (ex, ey, turn), xi)
+    for frame, (position, pose) in zip(ERROR_FRAMES, found, strict=True):
+        measured[f"position_nees_{frame}"] = position
+        measured[f"pose_nees_{frame}"] = pose
     return measured
 
 
@@ -431,14 +440,15 @@ def _measure_map(
     true_poses: Array, truth: Array, beliefs: list[Belief]
 ) -> dict[str, Value]:
     """Measure the final maps of B runs, with n landmarks each."""
-    count, every = truth.shape[1], [list(belief.landmark_ids) for belief in beliefs]
-    for listed in every:
-        if len(set(listed)) < len(listed) or not set(listed) <= set(range(count)):
-            raise ValueError(
-                f"landmark_ids must be distinct and from 0 to {count - 1}, "
-                f"got {tuple(listed)}"
-            )
-    ids, size = np.array(every, dtype=np.int64), 2 * len(every[0])
+    ids = np.array([belief.landmark_ids for belief in beliefs], dtype=np.int64)
+    count, size = truth.shape[1], 2 * ids.shape[1]
+    wrong = (ids < 0) | (ids >= count)
+    wrong[:, 1:] |= np.diff(np.sort(ids, axis=1)) == 0
+    if wrong.any():
+        raise ValueError(
+            f"landmark_ids must be distinct and from 0 to {count - 1}, "
+            f"got {beliefs[int(wrong.any(axis=1).argmax())].landmark_ids}"
+        )
     true_landmarks = np.take_along_axis(truth, ids[..., None], axis=1)
     states = (
         np.hstack([true_poses, true_landmarks.reshape(len(ids), size)]),
@@ -446,44 +456,36 @@ def _measure_map(
         np.stack([belief.covariance for belief in beliefs]),
     )
     measured: dict[str, Value] = {"state_dof": 3 + size, "relative_map_dof": size}
-    for frame in ERROR_FRAMES:
-        errors, claimed = nees.in_frame(*states, frame)
-        measured[f"state_nees_{frame}"] = nees.normalised_squared_error(errors, claimed)
-        values = nees.normalised_squared_error(
-            *nees.parts_of_landmarks(errors, claimed)
-        )
+    seen = nees.relative_state(*states)
+    squares = nees.whitened(seen.errors, seen.covariance) ** 2
+    deviations = nees.whitened(seen.landmarks, seen.landmark_covariances)
+    for k, frame in enumerate(ERROR_FRAMES, start=1):
+        values = (deviations[k] ** 2).sum(axis=-1)
         measured[f"landmark_nees_{frame}"] = by_id(values, ids, count)
+        measured[f"state_nees_{frame}"] = squares[k].sum(axis=-1)
     if not size:
         return measured
-    errors, claimed = nees.relative_map(*states)
-    deviations = nees.deviations_of_landmarks(errors, claimed, states[1][:, 2])
-    measured |= deviations_by_id(deviations, ids, count)
-    relative = nees.normalised_squared_error(errors, claimed)
+    measured |= deviations_by_id(deviations[0], ids, count)
+    relative = squares[0, :, :size].sum(axis=-1)
     for row in np.flatnonzero(np.isnan(relative)).tolist():
         if nees.is_indefinite(states[2][row]):
             relative[row] = math.inf
-    landmarks, own = nees.parts_of_landmarks(*states[1:])
+    landmarks = states[1][:, 3:].reshape(-1, size // 2, 2)
     return measured | {
         "relative_map_nees": relative,
-        **measure_landmarks(true_poses, truth, states[1][:, :3], ids, landmarks, own),
+        **measure_landmarks(truth, ids, landmarks, seen.landmark_covariances[1]),
+        "map_error_centred": np.sqrt(map_error_squared(seen.landmarks[2])),
         "landmark_mahalanobis": np.sqrt(measured["landmark_nees_additive"]),
     }
 
 
 def measure_landmarks(
-    true_poses: Array,
-    true_landmarks: Array,
-    poses: Array,
-    ids: IntArray,
-    landmarks: Array,
-    covariances: Array,
+    true_landmarks: Array, ids: IntArray, landmarks: Array, covariances: Array
 ) -> dict[str, Value]:
     """Measure what final maps are worth without their correlations.
 
     Parameters
     ----------
-    true_poses, poses : ndarray, shape (B, 3)
-        The final poses and their estimates [m, m, rad].
     true_landmarks : ndarray, shape (B, L, 2)
         All of them [m].
     ids : ndarray of int, shape (B, n)
@@ -497,15 +499,11 @@ def measure_landmarks(
         true_landmarks.shape[1],
         np.take_along_axis(true_landmarks, ids[..., None], axis=1),
     )
-    near = (
-        seen_from(poses[:, :2], np.hstack([pose, points.reshape(len(pose), -1)]))
-        for pose, points in ((true_poses, truth), (poses, landmarks))
-    )
-    raw, aligned = distances(landmarks, truth)
+    g, error = np.moveaxis(truth, -1, 0), np.moveaxis(landmarks - truth, -1, 0)
+    raw = np.sqrt(error[0] ** 2 + error[1] ** 2)
     return {
-        "map_error_centred": np.sqrt(map_error_squared(invariant_error(*near))),
         "landmark_rmse": _rms(raw),
-        "landmark_rmse_aligned": _rms(aligned),
+        "landmark_rmse_aligned": aligned_rms(g, error),
         "landmark_area": ellipse_areas(covariances).mean(axis=-1),
         "landmark_error": by_id(raw, ids, count),
     }

@@ -200,9 +200,9 @@ def test_no_landmark_leaves_dead_reckoning():
 
 
 def test_the_error_of_a_map_is_about_its_centre():
-    error = np.array([1, 2, 3, 4, 0, 6, 0, 5, 3.0])
+    error = np.array([[4, 0], [6, 0], [5, 3.0]])
     assert map_error_squared(error) == pytest.approx((1 + 1 + 1 + 1 + 0 + 4) / 3)
-    many = error * np.arange(20).reshape(4, 5, 1)
+    many = error * np.arange(20).reshape(4, 5, 1, 1)
     expected = [[map_error_squared(each) for each in row] for row in many]
     np.testing.assert_allclose(map_error_squared(many), expected)
 

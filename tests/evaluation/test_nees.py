@@ -10,13 +10,15 @@ from slamgym.evaluation.nees import (
     in_frame,
     is_indefinite,
     landmark_nees,
+    nees_of_poses,
     normalised_squared_error,
     parts_of_landmarks,
     pose_nees,
     position_nees,
-    relative_landmark_deviations,
     relative_map_nees,
+    relative_state,
     state_nees,
+    whitened,
 )
 
 RUNS = 20_000
@@ -153,6 +155,22 @@ def test_a_variance_of_one_axis_that_is_rounding_gives_no_nees(axis, frame):
     nees = state_nees(states + 0.01, states, covariances, frame=frame)
     np.testing.assert_array_equal(np.isfinite(nees), [False, False, True, False])
     np.testing.assert_array_equal(covariances, before)
+    with np.errstate(all="ignore"):
+        P, errors = np.moveaxis(covariances[:, :3, :3], 0, -1), np.full((3, 4), 0.01)
+        position, pose = next(nees_of_poses(P, errors))
+    expected = [False, False, True, True], [False, False, True, False]
+    np.testing.assert_array_equal(np.isfinite([position, pose]), expected)
+
+
+def test_the_map_has_a_nees_where_the_pose_is_certain_and_the_state_has_none():
+    rng = np.random.default_rng(6)
+    means, root = rng.normal(0, 3, (2, 7)), rng.normal(0, 0.1, (2, 7, 7))
+    root[:, :3], truth = 0.0, means + rng.normal(0, 0.1, (2, 7))
+    state = relative_state(truth, means, root @ root.mT)
+    squares = whitened(state.errors, state.covariance) ** 2
+    expected = relative_map_nees(truth, means, root @ root.mT)
+    np.testing.assert_allclose(squares[0, :, :4].sum(axis=-1), expected, rtol=1e-9)
+    assert np.isnan(squares[:, :, 4:]).all()
 
 
 def test_a_position_certain_in_a_slanted_direction_has_no_nees():
@@ -196,7 +214,8 @@ def test_a_singular_covariance_is_not_indefinite_by_rounding():
 
 def test_deviations_of_landmarks_are_whitened_in_the_axes_of_the_map():
     truth, means, P = large_errors()
-    found = relative_landmark_deviations(truth, means, P)
+    state = relative_state(truth, means, P)
+    found = whitened(state.landmarks[0], state.landmark_covariances[0])
     nees = relative_map_nees(truth, means, P)
     errors, blocks = parts_of_landmarks(truth - means, P)
 

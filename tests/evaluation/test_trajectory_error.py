@@ -10,7 +10,7 @@ from slamgym.estimator.models.rigid_motion import rotation
 from slamgym.evaluation.trajectory_error import (
     Alignment,
     align_positions,
-    distances,
+    aligned_rms,
     ellipse_areas,
     exchanged_positions,
     landmark_covariances,
@@ -279,16 +279,14 @@ def test_a_few_others_that_are_far_off_leave_an_exchange_in_doubt():
     assert exchanged_positions(estimate, truth).cycles == ()
 
 
-def test_many_maps_at_once_have_the_distances_of_each():
-    rng = np.random.default_rng(3)
-    truth = 10 * rng.standard_normal((4, 6, 2))
-    estimates = truth + rng.standard_normal((4, 6, 2))
-    raw, aligned = distances(estimates, truth)
-    for row in range(4):
-        one = position_accuracy(estimates[row], truth[row])
-        np.testing.assert_array_equal(
-            one.aligned_errors,
-            np.linalg.norm(one.alignment.apply(estimates[row]) - truth[row], axis=1),
-        )
-        assert raw[row].tolist() == one.raw_errors.tolist()
-        assert aligned[row].tolist() == one.aligned_errors.tolist()
+@pytest.mark.parametrize(("scale", "noise"), [(1, 1e-4), (1, 0.1), (-1, 0.1), (0, 3)])
+def test_many_maps_at_once_have_the_aligned_error_of_each(scale, noise):
+    truth, errors = np.random.default_rng(3).standard_normal((2, 4, 6, 2))
+    estimates = Alignment(0.2, np.array([30.0, 0.0])).apply(scale * truth)
+    estimates += noise * errors
+    pair = (np.moveaxis(each, -1, 0) for each in (truth, estimates - truth))
+    for found, e, g in zip(aligned_rms(*pair), estimates, truth, strict=True):
+        one = position_accuracy(e, g)
+        apart = np.linalg.norm(one.alignment.apply(e) - g, axis=1)
+        np.testing.assert_array_equal(one.aligned_errors, apart)
+        assert found == pytest.approx(one.aligned_rmse, rel=1e-9)
