@@ -192,6 +192,7 @@ TESTS = {
     "experiments/noise_study": "noise_study noise_effects_of_many_runs",
     "experiments/progress_bar": "progress_bar",
     "experiments/run_and_replay": "replay run_warnings trace simulated_runs",
+    "experiments/run_and_replay/log_replay": "replay run_warnings map_management",
     "experiments/run_and_replay/log_smoothing": "smooth_command pose_rows",
     "experiments/space_poses": "space_poses",
     "experiments/trajectories": "generate trajectory_formats belief_columns",
