@@ -134,6 +134,9 @@ def test_each_test_has_the_degrees_of_freedom_of_the_nees(scores):
     assert found.equivalence == hypothesis_tests.equivalence_test(averages, 2)
     grid = hypothesis_tests.family_test(nees[:, found.family_steps], 2)
     np.testing.assert_array_equal(found.family.statistic, grid.statistic)
+    nis = [part[:, :2] for part in scores[1:]]  # of two steps: one lag
+    white = hypothesis_tests.whiteness_test(*nis, lags=1)
+    assert report(nees[:, :2], *nis).whiteness == white
     assert found.mean_ratio == pytest.approx(averages.mean() / 2)
     assert found.runs_needed[0][1] == hypothesis_tests.runs_to_detect(
         found.runs_needed[0][0], 2
