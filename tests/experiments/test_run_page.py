@@ -123,6 +123,7 @@ def test_the_page_holds_the_beliefs_of_every_step(page, viewed, loop):
     facts, arrays = arrays_of(page)
     assert facts["filters"] == ["ekf", "invariant"]
     assert arrays["step"].tolist() == list(range(61))
+    assert arrays["t"].tolist() == viewed[0].trace.t.tolist()
     for number, (trace, _) in enumerate(viewed):
         for k, name in enumerate(("x", "y", "theta")):
             pose = arrays[f"{number}.pose.{name}"]
@@ -130,6 +131,11 @@ def test_the_page_holds_the_beliefs_of_every_step(page, viewed, loop):
             std = np.sqrt(trace.pose_covariances[:, k, k])
             found = arrays[f"{number}.pose.std_{name}"]
             np.testing.assert_allclose(found, std, atol=1e-6)
+        xx, xy, yy = (
+            trace.pose_covariances[1:, *ij] for ij in ((0, 0), (0, 1), (1, 1))
+        )
+        rho = arrays[f"{number}.pose.rho"][1:]
+        np.testing.assert_allclose(rho, xy / np.sqrt(xx * yy), rtol=1e-4, atol=1e-6)
         for step in (0, 30, 60):
             ids, means, covariances = trace.map_at(step)
             assert arrays[f"{number}.id"][step].tolist() == ids.tolist()
