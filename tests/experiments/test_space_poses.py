@@ -171,7 +171,7 @@ def late(rows):
     [
         (inverse, "t", f"{INVERSE}, in the truth"),
         (first_w, "t", "quaternions that begin with qw, in the truth"),
-        (centimetres, "t", "a truth in centimetres"),
+        (centimetres, "e", "positions in centimetres"),
         (late, "e", "time stamps that are 0.5 steps too late"),
     ],
 )
