@@ -10,6 +10,7 @@ of another landmark: they are dropped, and the scans are repeated once more.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from copy import deepcopy
 from itertools import chain, islice
 from typing import Any, NamedTuple
 
@@ -349,7 +350,7 @@ class RecentScan(NamedTuple):
         """Return all as arrays."""
         row_ids = [NO_LANDMARK if i is None else i for i in self.row_ids]
         saved = saved_states.write(self._asdict() | {"row_ids": row_ids}, SCAN)
-        return saved | with_prefix("before", self.before or {})
+        return saved | with_prefix("before", deepcopy(self.before or {}))
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Any]) -> RecentScan:
@@ -357,7 +358,7 @@ class RecentScan(NamedTuple):
         saved = saved_states.read(state, SCAN)
         found = {key: _as_tuples(array.tolist()) for key, array in saved.items()}
         row_ids = tuple(None if i == NO_LANDMARK else i for i in found["row_ids"])
-        before = without_prefix(state, "before") or None
+        before = deepcopy(without_prefix(state, "before")) or None
         kept = {"readings": saved["readings"], "row_ids": row_ids, "before": before}
         return cls(**found | kept)
 

@@ -29,7 +29,7 @@ def closest(word: str, words: Iterable[str], *, else_all: bool = False) -> str:
     "; did you mean 'min_range' or 'max_range'?"
     >>> closest("EKF", ["ekf", "invariant"])
     "; did you mean 'ekf'?"
-    >>> closest("gate", ["range", "gate_probability"])
+    >>> closest("GATE", ["range", "gate_probability"])
     "; did you mean 'gate_probability'?"
     >>> closest("zzz", ["min_range", "max_range"])
     ''

@@ -36,6 +36,7 @@ from slamgym.agents.active_slam_scores import (
     score_table,
 )
 from slamgym.agents.belief_features import belief_storage
+from slamgym.agents.belief_space_planner import GREEDY, MPC, BeliefSpacePlanner
 from slamgym.agents.information_reward import effort, map_covariances
 from slamgym.agents.wall_routes import SECTORS, CoverageGrid
 from slamgym.envs import LandmarkWorldEnv
@@ -792,6 +793,20 @@ def test_greedy_turns_to_the_side_where_something_can_be_learnt():
     everything = np.ones(len(env.task.grid.cells), dtype=bool)
     now = env.knowledge._replace(explored=everything)
     assert baseline.act(now)[1] < 0
+
+
+def test_a_planner_plans_as_far_as_its_name_says():
+    env, rng = ActiveSlamEnv("active_easy"), np.random.default_rng(0)
+    env.reset(seed=0)
+    named, made = (
+        [each.act(env.knowledge).tolist() for each in planners]
+        for planners in (
+            [make_baseline(name, env.scenario, rng) for name in ("greedy", "mpc")],
+            [BeliefSpacePlanner(settings) for settings in (GREEDY, MPC)],
+        )
+    )
+    assert named == made
+    assert made[0] != made[1]
 
 
 @pytest.fixture

@@ -319,6 +319,9 @@ def test_beliefs_that_cannot_be_are_not_loaded(part, change, message):
     batch = make_batch("ekf", runs=1, landmarks=8, **NOISE)
     with pytest.raises(ValueError, match=message):
         batch.load(broken(part, change))
+    beliefs = BatchBeliefs.of([driven("ekf").belief()], 8)
+    with pytest.raises(ValueError, match="references must be finite"):
+        batch.load(beliefs, references=np.full(beliefs.means.shape, np.nan))
     assert batch.belief(0).landmark_ids == ()
 
 

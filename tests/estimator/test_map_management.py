@@ -639,6 +639,14 @@ def test_landmarks_seen_side_by_side_are_never_one():
         assert slam.update(pair, [0, 1]).merged_ids == ()
 
 
+@pytest.mark.parametrize("names", [(3, 7), (7, 3)])
+def test_landmarks_seen_together_are_never_merged(names):
+    slam = make(management={"merge_within": 1.0})
+    for _ in range(60):
+        report = slam.update(polar([(5, 1), (5, 1), (-3, 2)]), [*names, 9])
+        assert report.merged_ids == ()
+
+
 @pytest.mark.parametrize("name", ["ekf", "compressed"])
 def test_landmarks_seen_together_are_apart_up_to_twice_the_distance_of_a_merge(name):
     slam, other = (make(name, {"merge_within": 1.25}) for _ in range(2))

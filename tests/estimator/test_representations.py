@@ -39,6 +39,7 @@ def test_the_error_of_a_marginal_is_additive_by_default():
     whole = np.arange(7.0), np.diag(np.arange(1.0, 8.0))
     part = Belief.marginal(*whole, {3: 0, 5: 1}, [5])
     assert part.frame == "additive"
+    assert Belief.marginal(*whole, {3: 0}, [3], "invariant").frame == "invariant"
     np.testing.assert_array_equal(part.landmarks, [(5.0, 6.0)])
     np.testing.assert_array_equal(part.covariance.diagonal(), [1, 2, 3, 6, 7])
 

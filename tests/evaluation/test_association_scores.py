@@ -84,6 +84,8 @@ def test_merging_ends_a_duplicate():
     decisions = [*twice, given(0)]
     scores = score_association(decisions, [[A], [A], [A]])
     assert (scores.duplicate, scores.correct, scores.map_size) == (1, 1, 1)
+    wrongly = [given(0, 1, added=(0, 1), merged=((0, 1),)), given(None, None)]
+    assert counts(wrongly, [[A, B], [A, A]])["missed"] == 2  # the place of the first
 
 
 def test_two_new_landmarks_of_one_place_in_one_scan_are_a_duplicate():

@@ -749,6 +749,7 @@ def test_warnings_name_unused_readings_and_innovations_of_another_size():
     assert warning.startswith("mine: its reports list no reading that corrected")
     managed = entry | {"options": {"management": True}, "nis": 1.0}
     assert run_warnings({"ekf": managed}, 40) == []
+    assert run_warnings({"ekf": managed | {"good_runs": 20}}, 20) == []
     split = {"map_size": 25.0, "true_map_size": 20.0}
     (warning,) = run_warnings({"ekf": managed | {"association": split}}, 40)
     assert "25.0 landmarks on average, but 20.0 were seen" in warning

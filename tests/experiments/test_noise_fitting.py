@@ -574,6 +574,9 @@ def test_the_associations_of_a_filter_become_identities_of_the_log():
     assert len(pairs) == len(dict(pairs)) == len({i for _, i in pairs}) == 6
     motions = [e for e in known.events if isinstance(e, OdometryRow)]
     assert motions == [e for e in log.events if isinstance(e, OdometryRow)]
+    assert associated_log(replace(hidden, motion="midpoint"), settings).motion == (
+        "turn-last"  # as the rows of its drive are
+    )
 
 
 def test_the_comparison_of_a_log_without_identities_is_on_its_associations():
