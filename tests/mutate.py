@@ -140,6 +140,7 @@ TESTS = {
         "representations models_of_logs filter_family ekf_slam large_maps peers"
     ),
     "estimator/smoother": "smoother reassociation symmetries pose_readings",
+    "estimator/smoother/batch_smoother": "smoother reassociation smooth_command",
     "evaluation/association_scores": "association_scores gospa",
     "evaluation/consistency_report": "consistency_report",
     "evaluation/diagnosis": "diagnosis noise_findings",
