@@ -69,7 +69,7 @@ TESTS = {
     "envs/": "landmark_world streams world_batch models_of_worlds",
     "envs/bearing_range": (
         "bearing_range_sensor world_batch landmark_world simulated_runs "
-        "models_of_worlds"
+        "models_of_worlds faults"
     ),
     "envs/controllers": "controllers vector_controllers drawn_worlds",
     "envs/landmark_world": (
@@ -83,7 +83,7 @@ TESTS = {
     "envs/rendering/video": "video",
     "envs/spaces": "faults landmark_world drawn_worlds models_of_worlds world_batch",
     "envs/specs": "gymnasium_contract every_environment",
-    "envs/robot": "unicycle_body world_batch landmark_world models_of_worlds",
+    "envs/robot": "unicycle_body world_batch landmark_world models_of_worlds faults",
     "envs/vector": (
         "landmark_world_vector world_batch vector_controllers pose_sensors "
         "drawn_worlds state_and_restore models_of_worlds"

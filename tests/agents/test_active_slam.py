@@ -618,10 +618,12 @@ def test_paths_see_what_any_of_their_poses_sees(grid):
 
 def test_walls_hide_cells_where_they_hide_landmarks():
     scenario = load_scenario("corridor")
+    clear = CoverageGrid(scenario.with_changes(sensor={"occlusion": False}))
     seen = CoverageGrid(scenario).visible_from(np.zeros((1, 3)))[0]
     cells = CoverageGrid(scenario).cells
     behind = (cells.real > 1.5) & (cells.imag > 3.0) & (cells.imag < 9.0)
     assert not seen[behind].any()
+    assert clear.visible_from(np.zeros((1, 3)))[0, behind].sum() > 20
     assert seen[(np.abs(cells.imag) < 1.0) & (cells.real < 7.5)].all()
 
 

@@ -33,11 +33,12 @@ def same(one, other):
 
 
 def shown(env):
-    """Return what the properties of an environment show of its state."""
-    kind = type(env)
+    """Return the arrays that an environment and its worlds show of their state."""
+    kind, worlds = type(env), getattr(env, "_worlds", env)
     names = [name for name in dir(kind) if isinstance(getattr(kind, name), property)]
-    values = {name: getattr(env, name) for name in names}
-    return {n: value for n, value in values.items() if isinstance(value, np.ndarray)}
+    values = {name: getattr(env, name) for name in names} | vars(worlds)
+    arrays = {n: value for n, value in values.items() if isinstance(value, np.ndarray)}
+    return {n: np.nan_to_num(value) for n, value in arrays.items()}  # copies
 
 
 def check(env, seed, *, before=7, after=50):
@@ -79,9 +80,9 @@ def test_worlds_with_filters_continue_from_a_state_to_the_bit(name, monkeypatch)
 
 def test_worlds_that_draw_their_settings_return_to_them():
     ranges = {"motion_std": [0.5, 2.0], "measurement_std": [0.5, 2.0]}
-    check(LandmarkWorldEnv("loop", randomise=ranges), 8)
-    check(LandmarkWorldVectorEnv(3, "loop", randomise=ranges), 8)
-    check(LandmarkWorldEnv("loop", compass={"std": 0.1, "every": 2}), 8)
+    for changes in ({"randomise": ranges}, {"compass": {"std": 0.1, "every": 2}}):
+        check(LandmarkWorldEnv("loop", **changes), 8)
+        check(LandmarkWorldVectorEnv(3, "loop", **changes), 8)
 
 
 def test_filters_of_any_kind_return_with_their_world():

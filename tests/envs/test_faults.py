@@ -52,9 +52,12 @@ def test_odometry_faults_change_nothing_but_the_odometry_of_steps_that_move(moti
 
 def test_a_robot_at_rest_reads_no_fault():
     resting = BASE.with_changes(faults={"odometry_scale": 0.1, "odometry_turn": 0.02})
-    env = LandmarkWorldEnv(resting)
+    env, worlds = LandmarkWorldEnv(resting), WorldBatch(resting, 1)
     env.reset(seed=0)
-    assert env.step([0.0, 0.0])[0]["odometry"].tolist() == [0.0, 0.0]
+    worlds.reset([seeding.np_random(0)[0]])
+    worlds.step([[0.0, 0.0]])
+    odometry = env.step([0.0, 0.0])[0]["odometry"], *worlds.odometry
+    np.testing.assert_array_equal(odometry, 0.0)
 
 
 def test_a_biased_sensor_adds_to_every_reading_and_moves_no_robot():

@@ -1,9 +1,11 @@
 """The tests of the tests: error rates on a filter that is exactly consistent."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from linear_filter import kalman_scores
-from scipy.stats import chi2, norm, skew
+from scipy.stats import chi2, norm, skew, ttest_1samp
 from scipy.stats import t as student
 
 from slamgym.evaluation.hypothesis_tests import (
@@ -137,15 +139,18 @@ def test_the_bootstrap_of_few_runs_is_finite_or_decides_nothing(runs):
             assert np.abs(decision.interval).max() < 1e6
 
 
-def test_the_bootstrap_of_runs_around_the_expected_mean_has_p_one():
-    averages = DOF * np.array([0.5, 0.8, 1.0, 1.2, 1.5])
-    assert bootstrap_test(averages, DOF, rng=np.random.default_rng(3)).p_value == 1
-
-
-def test_the_bootstrap_of_runs_that_are_all_equal_decides_nothing():
-    averages = np.full(7, 0.1)  # whose mean is not 0.1 to the last bit
-    decision = bootstrap_test(averages, DOF, rng=np.random.default_rng(9))
-    assert np.isnan(decision.p_value)
+@pytest.mark.parametrize(
+    ("averages", "p_value"),
+    [
+        (DOF * np.array([0.5, 0.8, 1.0, 1.2, 1.5]), 1.0),
+        (0.03 * np.linspace(0.9, 1.1, 10), 2 / 2000),
+        (300 * np.linspace(0.9, 1.1, 10), 2 / 2000),
+        (np.full(7, 0.1), np.nan),  # their mean is not 0.1 to the last bit
+    ],
+)
+def test_the_bootstrap_of_extreme_means_and_of_equal_runs(averages, p_value):
+    found = bootstrap_test(averages, DOF, rng=np.random.default_rng(3))
+    np.testing.assert_equal(found.p_value, p_value)
 
 
 def test_normal_scores_have_the_quantiles_of_a_normal():
@@ -166,9 +171,13 @@ def test_no_interval_of_a_ratio_holds_negative_numbers(averages):
 def test_equivalence_has_three_verdicts():
     rng = np.random.default_rng(6)
     averages = rng.chisquare(DOF, 400)
-    assert equivalence_test(averages, DOF).verdict == "consistent"
-    assert equivalence_test(2 * averages, DOF).verdict == "not consistent"
-    assert equivalence_test(averages[:10], DOF).verdict == "not shown"
+    near = 1.24 * DOF * np.linspace(0.9, 1.1, 10)
+    unsure, wrong = [averages[:10], near], [averages / 2, averages * 2]
+    cases = {"consistent": [averages], "not shown": unsure, "not consistent": wrong}
+    for verdict, given in cases.items():
+        found = [equivalence_test(values, DOF) for values in given]
+        assert {each.verdict for each in found} == {verdict}
+        assert {each.accepted for each in found} == {verdict == "consistent"}
 
 
 def test_ljung_box_finds_correlated_innovations():
@@ -211,22 +220,13 @@ def test_the_time_averages_have_the_p_value_of_halls_cubic(runs, sign):
     assert cubic(near) == pytest.approx([limit, -limit])
     drawn = bootstrap_test(averages, DOF, rng=np.random.default_rng(0))
     assert drawn.p_value == pytest.approx(p_value, abs=0.05)
-    assert (np.array(drawn.interval) - 1) / error == pytest.approx(ends, abs=0.5)
-
-
-@pytest.mark.parametrize("factor", [0.01, 100])
-def test_the_bootstrap_never_reports_an_impossible_mean(factor):
-    averages = factor * DOF * np.linspace(0.9, 1.1, 10)
-    found = bootstrap_test(averages, DOF, rng=np.random.default_rng(0))
-    assert found.p_value == 2 / 2000
-
-
-@pytest.mark.parametrize(
-    ("factor", "accepted"), [(1.0, True), (1.24, False), (2, False)]
-)
-def test_equivalence_is_accepted_where_it_is_shown(factor, accepted):
-    averages = factor * DOF * np.linspace(0.9, 1.1, 10)
-    assert equivalence_test(averages, DOF).accepted is accepted
+    found = (np.array(drawn.interval) - 1) / error
+    assert found == pytest.approx(ends, abs=0.5)
+    rows = np.random.default_rng(0).integers(0, runs, (1999, runs))
+    scores = ttest_1samp(ratios[rows], ratios.mean(), axis=1).statistic
+    assert found == pytest.approx(np.quantile(scores, [0.025, 0.975]))
+    beyond = min((scores <= score).sum(), (scores >= score).sum())
+    assert drawn.p_value == pytest.approx(2 * (1 + beyond) / 2000)
 
 
 @pytest.mark.parametrize("scale", [0.7, 1.0, 1.3])
@@ -253,7 +253,20 @@ def test_pooled_tests_are_those_of_scipy(scale):
     assert white.statistic == pytest.approx(statistic)
     assert white.p_value == pytest.approx(chi2.sf(statistic, 5))
     assert white.interval == pytest.approx((0, chi2.ppf(0.95, 5)))
-    assert (found.error_rate, white.error_rate) == (0.05, 0.05)
+
+
+def test_every_test_rejects_as_often_as_it_is_asked_to():
+    nees = np.random.default_rng(5).chisquare(DOF, (30, 20))
+    drawn = partial(bootstrap_test, rng=np.random.default_rng(0))
+    of_runs = final_step_test, time_average_test, equivalence_test, drawn
+    freedom = np.full(nees.shape, DOF)
+    cases = [(test, nees[:, -1], DOF) for test in of_runs]
+    cases += [(test, nees, freedom) for test in (nis_test, whiteness_test)]
+    for test, *given in (*cases, (family_test, nees, DOF)):
+        usual, strict = (test(*given, error_rate=rate) for rate in (0.05, 0.01))
+        assert (usual.error_rate, strict.error_rate) == (0.05, 0.01)
+        assert strict.interval.low <= usual.interval.low
+        assert strict.interval.high > usual.interval.high
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.25, 1.5, 2.0])
