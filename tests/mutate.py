@@ -108,7 +108,7 @@ TESTS = {
     "estimator/kernels/scan_update": (
         "ekf_slam filter_family association joint_assignment map_management"
     ),
-    "estimator/filters/batch": "batch",
+    "estimator/filters/batch": "batch imagine",
     "estimator/filters/delayed_landmarks": "sensors saved_states",
     "estimator/filters/drive_likelihood": "drive_likelihood",
     "estimator/filters/ekf": (

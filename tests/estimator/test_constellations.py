@@ -406,10 +406,6 @@ def test_a_covariance_without_rank_recognises_no_place(others):
     assert match_constellations(certain, may, rules) is None
 
 
-def test_the_smallest_rules_are_accepted():
-    assert Constellations(least=3, margin=1, search_nodes=1).least == 3
-
-
 @pytest.mark.parametrize("crowded", [None, "far", "local", "older"])
 @pytest.mark.parametrize("count", [2, 3])
 def test_a_place_is_filled_where_neither_map_has_many_landmarks_more(crowded, count):

@@ -152,6 +152,12 @@ def test_an_interrupt_leaves_no_filter_mixed_without_a_mark(name, managed):
     slam.predict((0.2, 0.1))
     found = found_after_interrupts(slam, lambda s: s.update(READINGS, ids), some)
     assert found >= {"before", "marked"}
+    slam.interrupted_in = "update"
+    for refused in ("reset None", "load nothing"):  # the mark stays
+        with pytest.raises(ValueError, match=r"pose|state"):
+            INSANE[refused](slam)
+        with pytest.raises(RuntimeError, match="was interrupted in update"):
+            slam.belief()
 
 
 TOLD = {i: (r * np.cos(b), r * np.sin(b)) for i, (b, r) in enumerate(READINGS)}

@@ -718,6 +718,9 @@ def test_records_of_merged_landmarks_are_those_of_one_with_all_their_names():
     assert records.aliases == {7: 4, 9: 4}
     records.follow([4, 11])
     assert records.apart == {(4, 11)}
+    records.doubtful, there = {11}, LandmarkRecords()
+    there.restore(records.state())
+    np.testing.assert_equal(vars(there), vars(records))
 
 
 # --- capacity ---

@@ -91,7 +91,7 @@ def test_an_angle_just_below_minus_pi_stays_in_the_interval():
 NOISE = {"motion_std": (0.03, 0.02, 0.02), "measurement_std": (0.02, 0.05)}
 
 CAR = bicycle(2.8, reference=(3.7, 0.5))
-DRIVES = [find_motion("unicycle"), differential(0.4), bicycle(0.6), CAR]
+DRIVES = [motions.UNICYCLE, differential(0.4), bicycle(0.6), bicycle(1, (0, 2)), CAR]
 
 
 def rolled(wheel_speeds, point, steps=20_000):
@@ -122,7 +122,7 @@ def test_a_bicycle_rolls_on_its_rear_axle_and_carries_its_sensor():
     )
 
 
-@pytest.mark.parametrize("motion", DRIVES, ids=lambda motion: motion.name)
+@pytest.mark.parametrize("motion", DRIVES)
 def test_a_drive_passes_its_check_and_is_found_by_its_name(motion):
     check_motion(motion)
     check_motion(motion, trials=0)  # at rest only

@@ -305,12 +305,16 @@ def test_a_batch_refuses_readings_of_another_number_of_runs():
         batch.observe_pose(np.zeros((2, 1)), [0, 0, 1], 1.0)
 
 
-def test_a_drive_with_other_readings_has_its_own_readings_of_the_pose():
+def test_a_drive_with_other_readings_has_its_own_odometry_and_readings_of_the_pose():
     made = Drive(MOTION_STD, MEASUREMENT_STD)
     made.observe_pose(0.1, [0, 0, 1], 1.0)
+    made.predict((1.0, 0.0))
     other = made.with_scans([])
+    other.predict((2.0, 0.0))
     other.observe_pose(0.2, [0, 0, 1], 1.0)
+    made.end_motion()
     assert (made.pose_components, other.pose_components) == (1, 2)
+    assert [each.motions[1].increment[0] for each in (made, other)] == [1.0, 3.0]
 
 
 def test_a_drive_keeps_a_reading_of_the_pose_whose_arrays_the_caller_fills_again():

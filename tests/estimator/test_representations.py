@@ -10,7 +10,7 @@ from slamgym.estimator import (
     make_batch,
     make_estimator,
 )
-from slamgym.estimator.interface import MapView
+from slamgym.estimator.interface import MapView, marginal_without_joining
 from slamgym.estimator.registry import split_labels
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.02, 0.1)}
@@ -24,6 +24,9 @@ def test_a_filter_shows_class_landmarks_and_pose_and_stays_as_it_is(name):
     shown = repr(slam)
     assert shown.startswith(f"{type(slam).__name__} of 2 landmarks, pose (0.000 ± 0.1")
     assert "\n" not in shown
+    near = marginal_without_joining(slam, [5])
+    assert near.frame == before.frame
+    np.testing.assert_allclose(near.landmarks, before.landmarks[1:], atol=1e-12)
     np.testing.assert_array_equal(slam.belief().covariance, before.covariance)
 
 

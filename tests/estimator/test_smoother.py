@@ -12,7 +12,7 @@ from far_origins import far_origins, rounding, shifted
 from numeric_jacobian import numeric_jacobian
 from own_noise import OWN_NOISE, SHIPPED_NOISE
 
-from slamgym.estimator import EkfSlam, make_estimator
+from slamgym.estimator import EkfSlam, UpdateReport, make_estimator
 from slamgym.estimator.map_management import ManagedSlam
 from slamgym.estimator.models.bearing_range import wrap_angle
 from slamgym.estimator.models.motions import MotionNoise, predict_pose
@@ -171,6 +171,8 @@ def test_other_sensors_are_smoothed_as_by_dense_least_squares(sensor, std):
     assert made.cost_per_degree == pytest.approx(2 * made.cost / freedom)
     with pytest.raises(ValueError, match="an association accepts only sensor"):
         reassociate(slam.recorded())
+    with pytest.raises(ValueError, match=r"start must be finite poses \(31, 3\)"):
+        smooth(slam.recorded(), start=made.poses[1:])
 
 
 def test_scans_without_a_motion_between_them_are_those_of_one_pose():
@@ -761,6 +763,7 @@ def test_a_filter_that_goes_back_takes_its_drive_back():
     for load in (slam.load_state_dict, slam.restore):
         load(before)
         assert repr(slam.smoothed()) == repr(expected)
+        assert slam.report() == UpdateReport()
         slam.predict((0.5, 0.0))
 
 
