@@ -154,9 +154,9 @@ TESTS = {
     "experiments/command_line": "command_line replay generate",
     "experiments/command_line/benchmark": "consistency_protocol",
     "experiments/command_line/explore": "noise_explorer",
-    "experiments/command_line/fit_noise": "noise_fitting",
+    "experiments/command_line/fit_noise": "noise_fitting log_conventions",
     "experiments/command_line/generate": "generate",
-    "experiments/command_line/judge": "judging strangers_files",
+    "experiments/command_line/judge": "judging strangers_files space_poses",
     "experiments/command_line/monte_carlo": "monte_carlo_command monte_carlo_folder",
     "experiments/command_line/noise_study": (
         "noise_study noise_effects_of_many_runs command_line"

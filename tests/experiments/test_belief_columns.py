@@ -9,6 +9,7 @@ from slamgym.estimator import EkfSlam, make_estimator
 from slamgym.estimator.registry import register_estimator
 from slamgym.experiments.trajectories import (
     drive_episodes,
+    generate,
     generate_trajectories,
     load_trajectories,
 )
@@ -111,8 +112,7 @@ def test_formats_return_every_bit_and_workers_write_equal_bytes(
         expected = with_beliefs(drive, "ekf")
         for array in BELIEFS:
             before, after = getattr(expected, array), getattr(read, array)
-            assert after.dtype == before.dtype
-            assert after.shape == before.shape
+            assert (after.dtype, after.shape) == (before.dtype, before.shape)
             assert after.tobytes() == before.tobytes()
 
 
@@ -125,8 +125,11 @@ def test_without_a_filter_neither_manifest_nor_files_name_beliefs(tmp_path):
         assert not set(BELIEFS) & set(arrays.files)
 
 
-def test_another_filter_is_another_job(tmp_path):
-    generate_trajectories(KNOWN, tmp_path, episodes=1, estimator="ekf")
+def test_a_filter_makes_another_job_of_smaller_shards(tmp_path, monkeypatch):
+    monkeypatch.setattr(generate, "_MOST_MEMORY", 1e5)
+    job = generate_trajectories(KNOWN, tmp_path, episodes=1, estimator="ekf").job
+    sizes = [generate.default_episodes_per_shard(KNOWN, beliefs=b) for b in (1, 0)]
+    assert job.episodes_per_shard == sizes[0] < sizes[1]
     with pytest.raises(ValueError, match=r"another job, with estimator = 'ekf', not"):
         generate_trajectories(KNOWN, tmp_path, episodes=1, estimator="invariant")
 

@@ -94,6 +94,7 @@ def test_the_page_says_verdicts_numbers_and_how_to_do_it_again(report):
     for words in (
         "six_landmarks: ekf not consistent; invariant consistent",
         "1 of 40 runs failed; of the others",
+        "averaged over 40 runs",
         "LinAlgError: <lost>",
         "slamgym monte-carlo six_landmarks --estimators ekf,invariant --runs 40",
         'name = "six_landmarks"',

@@ -57,11 +57,6 @@ def test_results_summary_and_report_are_written_and_told(here):
     assert b"/FontFile2" in printed  # the fonts themselves, as TrueType
 
 
-def test_figures_of_an_unknown_format_are_refused():
-    message = refused("monte-carlo", "six_landmarks", "--figures", "gif")
-    assert "--figures must be one of pdf, svg, png" in message
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("_no_figures_in_reports")
 def test_a_world_without_identities_is_scored_by_places(here):
@@ -124,23 +119,13 @@ def test_filters_may_be_told_another_noise():
         (("loop", "--scheduler", "tcp://a:1"), "--scheduler requires"),
         (("loop", "--backend", "spark"), "backend must be one of"),
         (("loop", "--assume", "motion.sdt=1"), "sdt"),
+        (("loop", "--until", "done"), "until must be 'decided'"),
+        (("loop", "--figures", "gif"), "--figures must be one of pdf, svg, png"),
     ],
 )
 def test_what_cannot_be_done_is_said_in_one_line(here, arguments, message):
     assert message in refused("monte-carlo", *arguments, "--out", "out")
     assert not (here / "out").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("_no_figures_in_reports")
-def test_a_folder_of_another_scenario_is_refused(here):
-    assert (
-        slamgym("monte-carlo", "anchored", "--runs", 2, "--out", "out").exit_code == 0
-    )
-    before = (here / "out" / "results.nc").read_bytes()
-    told = refused("monte-carlo", "six_landmarks", "--runs", 2, "--out", "out")
-    assert "holds results of scenario" in told
-    assert (here / "out" / "results.nc").read_bytes() == before
 
 
 @pytest.mark.slow
@@ -230,8 +215,3 @@ def test_a_study_until_decided_stops_and_states_its_runs_and_evidence(here):
     assert found["verdict"] == "not consistent"
     assert found["sequential"]["rejected_after"] <= summary["runs"]
     assert "an anytime-valid test rejects it (e " in found["sentence"]
-
-
-def test_a_misspelt_until_is_told():
-    message = refused("monte-carlo", "six_landmarks", "--until", "done")
-    assert "until must be 'decided'" in message

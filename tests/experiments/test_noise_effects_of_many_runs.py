@@ -131,7 +131,9 @@ def test_table_csv_and_summary_show_the_error_where_there_is_one(
     runs, tmp_path, capsys
 ):
     world = load_scenario("six_landmarks")
-    given = NoiseStudyOptions(estimator="ekf", runs=runs, seed=0, change="filter")
+    given = NoiseStudyOptions(
+        estimator="ekf", option_texts=["min_range=2"], runs=runs, change="filter"
+    )
     study = effects_study(world, given)
     write_study(study, tmp_path / "study", Reporter(as_json=True))
     with (tmp_path / "study" / "noise_study.csv").open(encoding="utf-8") as stream:
@@ -141,6 +143,7 @@ def test_table_csv_and_summary_show_the_error_where_there_is_one(
         error = float(row["nees_per_degree_error"])
         assert np.isnan(error) == (entry["nees_per_degree_error"] is None)
         assert np.isnan(error) == (runs == 1)
+        assert row["estimator"] == "ekf[min_range=2]"
 
 
 def test_another_place_is_refused():

@@ -12,7 +12,7 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from slamgym.experiments.command_line.tables import advice
+from slamgym.experiments.command_line.tables import advice, noise_comparison_table
 from slamgym.experiments.job_folders import files_below
 from slamgym.experiments.logs import (
     OdometryRow,
@@ -441,14 +441,21 @@ def test_a_climb_ends_beside_a_jump_of_the_likelihood():
     assert len(calls) < 16
 
 
-def test_the_whiteness_is_that_of_the_readings_used(example):
+def test_the_summary_and_its_table_are_those_of_replays(example):
     assert all(white.p_value > 1e-3 for white in example.fitted.whiteness)
-
-
-def test_the_summary_is_that_of_replays(example):
-    summary = summarise_fit(example)
+    white = (each._replace(inflation=k) for k, each in enumerate(example.fitted[3], 2))
+    fit = replace(example, fitted=example.fitted._replace(whiteness=tuple(white)))
+    summary = summarise_fit(fit)
+    assert summary["inflation"] == {"bearing": 2, "range": 3}
     runs = summary["runs"]
     assert list(runs) == ["before", "fitted", "suggested"]
+    table = noise_comparison_table(summary)
+    for run, column in zip(runs.values(), table.columns[1:], strict=True):
+        numbers = [run["log_likelihood"], run["readings"]["rejected"]]
+        numbers += [run[key]["per_degree"] for key in ("nis", "nees")]
+        numbers += [*run["ate"].values(), run["landmark_rmse"]["aligned"]]
+        numbers += [run["whiteness"][key]["p"] for key in ("bearing", "range")]
+        assert [*column.cells] == [f"{x:.4g}" for x in numbers]
     assert 0.9 < runs["fitted"]["nis"]["per_degree"] < 1.1
     assert runs["fitted"]["log_likelihood"] > runs["before"]["log_likelihood"]
     assert runs["fitted"]["ate"]["raw"] > 0

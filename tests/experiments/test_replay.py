@@ -39,6 +39,7 @@ from slamgym.experiments.run_and_replay.log_replay import MapHistory, replay
 from slamgym.experiments.run_and_replay.log_smoothing import smooth_log
 from slamgym.experiments.run_and_replay.summary import (
     LOST,
+    never_placed,
     nis_summary,
     pose_nees,
     summarise,
@@ -494,6 +495,13 @@ def test_the_interval_of_the_nis_covers_95_percent_of_honest_scans():
     inside = (nis[dof > 0] > limits[0]) & (nis[dof > 0] < limits[1])
     assert found["inside_95"] == inside.mean() == pytest.approx(0.95, abs=0.01)
     assert found["scans"] == np.count_nonzero(dof)
+
+
+def test_a_landmark_that_is_in_the_map_or_was_removed_was_placed():
+    log = SlamLog("three", events=(Scan(0.0, [(0.0, 1.0)] * 3, [0, 4, 7]),))
+    held = SimpleNamespace(landmark_ids=np.array([0]))
+    run = SimpleNamespace(log=log, last_seen={4: 0}, trace=held)
+    assert never_placed(run) == [7]
 
 
 def test_settings_come_from_the_caller_then_the_log():

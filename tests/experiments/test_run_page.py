@@ -5,6 +5,7 @@ import json
 import re
 import time
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -262,13 +263,9 @@ def test_clutter_is_marked():
 
 def test_names_cannot_break_out_of_the_page(loop, viewed, tmp_path):
     log = SlamLog(HOSTILE, events=loop.events, ground_truth=loop.ground_truth)
-    page = page_of(log, viewed, tmp_path)
     trace, frames = viewed[0]
-    object.__setattr__(trace, "estimator", HOSTILE)
-    try:
-        page = page_of(log, [ViewedRun(trace, frames)], tmp_path)
-    finally:
-        object.__setattr__(trace, "estimator", "ekf")
+    named = ViewedRun(replace(trace, estimator=HOSTILE), frames)
+    page = page_of(log, [named], tmp_path)
     assert page.count("<script") == page.count("</script>") == 3
     assert HOSTILE not in page
     assert json.loads(element(page, "facts"))["filters"] == [HOSTILE]
@@ -349,11 +346,13 @@ def test_watching_does_not_change_a_run(loop, viewed):
     np.testing.assert_array_equal(alone.final_covariance, final)
 
 
-def test_a_log_without_truth_or_landmarks_has_a_page(tmp_path):
-    log = SlamLog("blind", events=(OdometryRow(1.0, 1.0, 0.0, 1.0),))
+@pytest.mark.parametrize("scans", [(), (Scan(1.0, [(0.1, 2.0)], [7]),)])
+def test_a_log_without_truth_has_a_page_with_or_without_landmarks(scans, tmp_path):
+    log = SlamLog("blind", events=(OdometryRow(1.0, 1.0, 0.0, 1.0), *scans))
     page = page_of(log, [followed(log)], tmp_path, walls=[(0, 0, 3, 4)])
     facts, arrays = arrays_of(page)
-    assert np.isnan(arrays["true.x"]).all()
+    assert np.isnan([*arrays["true.x"], *arrays["0.final.x"]]).all()
+    assert len(arrays["0.final.x"]) == len(scans)
     assert facts["walls"] == [[0, 0, 3, 4]]
 
 

@@ -68,7 +68,17 @@ def wrapped(angles):
 @pytest.mark.parametrize("preset", WORLDS)
 @pytest.mark.parametrize("name", FORMATS)
 def test_what_was_written_comes_back(name, preset, tmp_path):
-    layout, written = fmt(name), drives(preset)
+    layout = fmt(name)
+    written = [  # no two have anything in common
+        replace(
+            each,
+            scenario=each.scenario.with_changes(name=f"world {k}"),
+            controller=f"controller {k}",
+            start_estimate=each.start_estimate + k / 8,
+            landmarks=each.landmarks - k / 8,
+        )
+        for k, each in enumerate(drives(preset))
+    ]
     if name == "g2o" and preset == "hidden_identities":
         pytest.skip("a graph must know identities: refused, see below")
     layout.write(written, shard(layout, tmp_path))
@@ -80,8 +90,7 @@ def test_what_was_written_comes_back(name, preset, tmp_path):
         for array in ARRAYS:
             before, after = getattr(one, array), getattr(other, array)
             if array in EXACT[name] and before is not None:
-                assert after.dtype == before.dtype
-                assert after.shape == before.shape
+                assert (after.dtype, after.shape) == (before.dtype, before.shape)
                 assert after.tobytes() == before.tobytes(), array  # every bit
             elif array in NEARLY.get(name, ()):
                 gaps = after - before
