@@ -24,12 +24,7 @@ class Shifted(InvariantEkfSlam):
 
 
 def stand_until_the_end(env, seed=0):
-    env.reset(seed=seed)
-    ended = False
-    while not ended:
-        _, _, terminated, truncated, info = env.step([0.0, 0.0])
-        ended = terminated or truncated
-    return info
+    return run_episode(env, lambda *_: np.zeros(2), seed)
 
 
 def test_the_error_is_that_of_the_belief_against_the_true_landmarks():
@@ -49,7 +44,7 @@ def test_an_empty_map_has_no_error():
         "active_easy", landmarks=RING, sensor={"max_range": 0.5}, steps=2
     )
     assert env.reset(seed=0)[1]["true_rmse"] == 0.0
-    episode = run_episode(env, lambda *_: np.zeros(2), 0)
+    episode = stand_until_the_end(env)
     assert math.isnan(episode.true_rmse)
     assert (episode.steps, episode.path.shape) == (2, (3, 2))
 
@@ -57,18 +52,18 @@ def test_an_empty_map_has_no_error():
 def test_a_success_is_honest_where_the_truth_agrees():
     settings = {"landmarks": RING, "accuracy": 0.08}
     env = ActiveSlamEnv("active_easy", **settings)
-    info = stand_until_the_end(env, seed=1)
-    assert info["success"]
-    assert info["honest_success"]
-    assert info["true_rmse"] <= 0.08
+    episode = stand_until_the_end(env, seed=1)
+    assert episode.success
+    assert episode.honest
+    assert episode.true_rmse <= 0.08
 
 
 def test_a_filter_that_errs_and_does_not_know_it_has_no_honest_success():
     settings = {"landmarks": RING, "accuracy": 0.08, "estimator": Shifted}
-    info = stand_until_the_end(ActiveSlamEnv("active_easy", **settings))
-    assert info["success"]
-    assert not info["honest_success"]
-    assert info["true_rmse"] > 0.3
+    episode = stand_until_the_end(ActiveSlamEnv("active_easy", **settings))
+    assert episode.success
+    assert not episode.honest
+    assert episode.true_rmse > 0.3
 
 
 def test_success_far_from_the_truth_is_told_apart_in_many_worlds():

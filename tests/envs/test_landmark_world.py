@@ -20,6 +20,10 @@ from slamgym.sim_configs import (
     place_landmarks,
 )
 
+DIFFERENTIAL = {
+    "robot": {"drive": "differential", "track_width": 0.5},
+    "motion": {"noise_in": "motion"},
+}
 WALLS = [[5.0, -2.0, 5.0, 2.0], [-4.0, 4.0, 9.0, 4.5]]
 ROAMING = {
     "dt": 0.5,
@@ -410,9 +414,8 @@ def test_known_identities_are_not_repeated_in_info():
 )
 @pytest.mark.parametrize("render_mode", [None, "rgb_array"])
 def test_a_copied_environment_continues_alike(duplicate, render_mode):
-    env = LandmarkWorldEnv(
-        "hidden_identities", walls=WALLS, render_mode=render_mode, landmarks=RANDOM_MAP
-    )
+    settings = {"walls": WALLS, "landmarks": RANDOM_MAP, **DIFFERENTIAL}
+    env = LandmarkWorldEnv("hidden_identities", render_mode=render_mode, **settings)
     episode(env, count=150)
     if render_mode:
         env.render()

@@ -173,11 +173,14 @@ def test_arrow_points_along_the_heading(renderer):
 
 
 def test_collision_is_shown(renderer):
-    calm = renderer.render(snapshot())
-    hit = renderer.render(snapshot(collision=True))
-    assert share_of_different_pixels(calm, hit) > 0.001
-    assert moving_parts(renderer).alarm.get_text() == "collision"
-    assert moving_parts(renderer).alarm.get_visible()
+    frames = []
+    for hit in (False, True, False):
+        frames.append(renderer.render(snapshot(collision=hit)))
+        parts = moving_parts(renderer)
+        assert parts.alarm.get_visible() == parts.halo.get_visible() == hit
+    assert share_of_different_pixels(*frames[:2]) > 0.001
+    assert (frames[2] == frames[0]).all()
+    assert parts.alarm.get_text() == "collision"
 
 
 def test_field_of_view_is_a_wedge_about_the_heading():

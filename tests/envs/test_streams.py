@@ -18,7 +18,7 @@ from slamgym.envs.random_numbers import (
 from slamgym.sim_configs import load_scenario, place_landmarks
 
 CROWDED = load_scenario("active_medium").with_changes(
-    landmarks={"count": 20, "min_distance": 2.5}
+    landmarks={"count": 20, "min_distance": 2.5, "bounds": [-7.5, -7.5, 7.5, 6.5]}
 )
 
 

@@ -151,8 +151,10 @@ def test_a_variance_of_one_axis_that_is_rounding_gives_no_nees(axis, frame):
     covariances = np.tile(np.diag([1e-4] * 5), (4, 1, 1))
     covariances[:, axis, axis] = 0.0, 0.9e-18, 1.1e-18, 1e-4
     covariances[:, 2:4, 2:4], covariances[3, 2] = [[1e-4, 5e-5], [5e-5, 1e-4]], 0.0
-    states, before = np.zeros((4, 5)), covariances.copy()
-    nees = state_nees(states + 0.01, states, covariances, frame=frame)
+    states, before = np.tile([0.0, 0.0, 0.0, 3.0, 1.0], (4, 1)), covariances.copy()
+    given = states + 0.01, states, covariances
+    nees, of_map = (each(*given, frame=frame) for each in (state_nees, landmark_nees))
+    np.testing.assert_allclose(of_map[:2], of_map[[2, 2]])  # the heading stays
     np.testing.assert_array_equal(np.isfinite(nees), [False, False, True, False])
     np.testing.assert_array_equal(covariances, before)
     with np.errstate(all="ignore"):
