@@ -131,7 +131,9 @@ TESTS = {
     f"{LARGE}/compressed": "compressed large_maps errors_change_nothing",
     f"{LARGE}/elimination": "submaps sparse_information smoother",
     f"{LARGE}/multifrontal": "sparse_information",
-    f"{LARGE}/sparse_information": "sparse_information large_maps",
+    f"{LARGE}/sparse_information": (
+        "sparse_information large_maps errors_change_nothing"
+    ),
     f"{LARGE}/submaps": (
         "submaps submap_editing joining large_maps errors_change_nothing sensors"
     ),

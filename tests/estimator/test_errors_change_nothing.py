@@ -158,6 +158,8 @@ def test_an_interrupt_leaves_no_filter_mixed_without_a_mark(name, managed):
             INSANE[refused](slam)
         with pytest.raises(RuntimeError, match="was interrupted in update"):
             slam.belief()
+    slam.reset(np.zeros(3), np.zeros(3))
+    assert slam.belief().landmark_ids == ()
 
 
 TOLD = {i: (r * np.cos(b), r * np.sin(b)) for i, (b, r) in enumerate(READINGS)}
