@@ -159,7 +159,9 @@ TESTS = {
     "experiments/command_line/fit_noise": "noise_fitting log_conventions",
     "experiments/command_line/generate": "generate",
     "experiments/command_line/judge": "judging strangers_files space_poses",
-    "experiments/command_line/monte_carlo": "monte_carlo_command monte_carlo_folder",
+    "experiments/command_line/monte_carlo": (
+        "monte_carlo_command monte_carlo_folder monte_carlo_report"
+    ),
     "experiments/command_line/noise_study": (
         "noise_study noise_effects_of_many_runs command_line"
     ),

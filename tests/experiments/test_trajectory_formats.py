@@ -276,7 +276,8 @@ def test_minari_loads_a_shard_and_makes_its_world_again(tmp_path, monkeypatch):
                 observation, *_, info = env.step(episode.actions[step])
     sampled = data.observation_space
     assert all(sampled.contains(seen) for seen in observations(data))
-    changes = {"sensor": {"max_range": 1.0}, "robot": {"max_speed": 3.0}}
+    robot = {"max_speed": 3.0, "max_turn_rate": 0.8}
+    changes = {"sensor": {"max_range": 1.0}, "robot": robot}
     (other,) = drives("corridor", seeds=(1,), **changes)
     layout.write([other, written[0]], tmp_path / "shard_00001-v0")
     common = minari.load_dataset("shard_00001-v0").observation_space
