@@ -64,7 +64,7 @@ class _Gaussian(NamedTuple):
 
     def gaps(self, other: _Gaussian) -> tuple[Array, Array]:
         """Return how far another belief is away, in deviations of this one."""
-        std = np.sqrt(np.abs(self.covariance.diagonal())) + 1e-9  # mistakes may be ≤ 0
+        std = np.sqrt(np.abs(self.covariance.diagonal())) + 1e-9  # may be ≤ 0
         moved = other.mean - self.mean
         moved[2] = wrap_angle(float(moved[2]))
         spread = np.abs(other.covariance - self.covariance) / np.outer(std, std)
@@ -350,7 +350,10 @@ class _ScanUpdate(NamedTuple):
 
 
 def _with_noise_of_new(factors: Array, call: _ScanUpdate) -> _Gaussian:
-    """Return the result with another noise of new landmarks, or of all if none is."""
+    """Return the result with another noise of the readings of new landmarks.
+
+    Of all readings in a scan without new ones.
+    """
     Q = call.Q @ factors
     if len(call.new):
         return call.extended(call.corrected(), Q=Q)

@@ -564,7 +564,7 @@ def excess_of(
     is_known = np.isfinite(after[errors.of])
     if is_known.sum() < _FEWEST_OF_A_KIND:
         return CANNOT_TELL, "Too few runs succeed with less noise."
-    sign = float(np.sign(errors.ratio - 1))
+    sign = 1.0 if errors.ratio > 1 else -1.0
     rest = _rest_of(after, is_known, errors.of, sign)
     found = rest.text(small.factor, of_the_noise)
     many, factor = _averages(pose, heading), small.factor

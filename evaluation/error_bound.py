@@ -136,6 +136,8 @@ def posterior_bound(
             (np.asarray(pose_std, dtype=np.float64), poses.shape),
         )
     )
+    if not (fixes > 0).all():
+        raise ValueError("pose_std must be above 0, infinite where there is no reading")
     arrays = poses, places, seen, dt, fixes, least, spread
     for some in _pieces(seen) if read in (BEARING_RANGE, POSITION) else ():
         piece = [array[some] for array in arrays]

@@ -128,8 +128,8 @@ def map_test(
     Parameters
     ----------
     deviations : array_like, shape (runs, landmarks, 2)
-        Whitened error of each landmark as the robot sees it, see
-        :func:`.nees.relative_state`; nan where a run does not have it, infinite where
+        Whitened error of each landmark as the robot sees it, of the first kind in
+        :class:`.nees.RelativeState`; nan where a run does not have it, infinite where
         its covariance is singular.
     nees, degrees_of_freedom : array_like, shape (runs,), optional
         NEES of the whole map of each run, see :func:`.nees.relative_map_nees`. Without

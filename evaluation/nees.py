@@ -10,6 +10,7 @@ rejects even a consistent filter if the heading is uncertain.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -64,11 +65,13 @@ def whitened(errors: Array, covariances: Array) -> Array:
     errors : ndarray, shape (..., n)
         They may have more leading axes than the covariances.
     covariances : ndarray, shape (..., n, n)
+        Their lower halves count.
 
     Returns
     -------
     ndarray, shape (..., n)
-        nan from the first entry on that is singular given those before, or nan.
+        From the first entry that is nan, or certain given the entries before it, all
+        entries are nan.
 
     Examples
     --------
@@ -232,15 +235,16 @@ def is_indefinite(covariance: Array) -> bool:
 
 
 class RelativeState(NamedTuple):
-    """Errors of a map in the robot's frame, turned by θ̂, and then of the pose.
+    """Errors of the map as seen from the robot, in the map's axes, and of the pose.
 
     ::
 
         R(θ̂) (m − m̂),    m = R(θ)ᵀ (l − p)
     """
 
-    #: That of the map, without the pose; then what the errors of the state become by
-    #: w = e_l − e_p − J (l̂ − p̂) e_θ, the additive and the invariant one.
+    #: Along the first axis: these of the map, with zeros for the pose; then the error
+    #: of the state, additive and invariant, with w = e_l − e_p − J (l̂ − p̂) e_θ for the
+    #: map.
     errors: Array  # (3, ..., 2n + 3)
     covariance: Array  # (..., 2n + 3, 2n + 3)
     #: The same three of each landmark, now relative to the robot, additive, invariant.
@@ -251,7 +255,7 @@ class RelativeState(NamedTuple):
 def relative_state(
     true_states: Array, means: Array, covariances: Array
 ) -> RelativeState:
-    """Return a linear transform of states in which one factor serves three NEES.
+    """Transform states so that one Cholesky factor gives three NEES.
 
     The covariance of the map is W P Wᵀ with W = [−B I], B the columns of the pose ::
 
@@ -260,8 +264,14 @@ def relative_state(
     The invariant error ξ about p̂ has w = ξ_l − ξ_p, and that of the map is V(t) R(t)ᵀ w
     (:mod:`slamgym.estimator.models.rigid_motion`).
     """
+    size = means.shape[-1]
+    shape = np.broadcast_shapes(
+        true_states.shape[:-1], means.shape[:-1], covariances.shape[:-2]
+    )
+    means = np.broadcast_to(means, (*shape, size))
+    covariances = np.broadcast_to(covariances, (*shape, size, size))
     truth, near = (seen_from(means[..., :2], each) for each in (true_states, means))
-    n, pose = means.shape[-1] - 3, covariances[..., :3, :3]
+    n, pose = size - 3, covariances[..., :3, :3]
     B = np.zeros((*near.shape[:-1], n, 3))
     B[..., 0::2, 0] = B[..., 1::2, 1] = 1.0
     B[..., 0::2, 2], B[..., 1::2, 2] = -near[..., 4::2], near[..., 3::2]
@@ -328,17 +338,24 @@ def _whiten_each(errors: Array, covariances: Array) -> Array:
     """
     from scipy.linalg.lapack import dpotrf, dtrtrs  # noqa: PLC0415 (slow to import)
 
-    n = errors.shape[-1]
-    factors = covariances.reshape(-1, n, n).copy()
+    n, own = errors.shape[-1], covariances.shape[:-2]
+    shape = np.broadcast_shapes(errors.shape[:-1], own)
+    errors = np.broadcast_to(errors, (*shape, n))
+    more, own = shape[: len(shape) - len(own)], shape[len(shape) - len(own) :]
+    covariances = np.broadcast_to(covariances, (*own, n, n))
+    factors = np.array(covariances, np.float64, order="C")
+    factors = factors.reshape(math.prod(own), n, n)
     variances = factors.diagonal(axis1=1, axis2=2).copy()
-    white = errors.reshape(-1, len(factors), n).swapaxes(0, 1).copy()
-    for L, w in zip(factors.mT, white.mT, strict=True):
-        _, failed = dpotrf(L, lower=1, clean=0, overwrite_a=1)
+    white = np.array(errors, np.float64, order="C")
+    white = white.reshape(math.prod(more), len(factors), n).swapaxes(0, 1).copy()
+    for U, w in zip(factors.mT, white.mT, strict=True):  # in Fortran's order: U = Lᵀ
+        _, failed = dpotrf(U, lower=0, clean=0, overwrite_a=1)
         if not failed:
-            dtrtrs(L, w, lower=1, overwrite_b=1)
+            dtrtrs(U, w, lower=0, trans=1, overwrite_b=1)
             continue
         size = failed - 1
-        w[:size] = dtrtrs(L[:size, :size], w[:size], lower=1)[0] if size else 0.0
+        if size:
+            w[:size] = dtrtrs(U[:size, :size], w[:size], lower=0, trans=1)[0]
         w[size:] = np.nan
     good = factors.diagonal(axis1=1, axis2=2) ** 2 > SINGULAR * variances
     known = np.logical_and.accumulate(good, axis=1)[:, None]

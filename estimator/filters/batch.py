@@ -426,10 +426,12 @@ def filter_at_truth(
     sensor: Sensor,
     threads: int | None,
 ) -> tuple[Array, IntArray]:
-    """Fill bounds of errors; return covariances and slots as `drive_at_truth` does.
+    """Filter runs at their truth; return covariances and slots as `drive_at_truth`.
 
-    The piece holds its `TrueDrives`, and its two arrays of bounds.
+    ``piece`` holds the arrays of `TrueDrives`, then ``least`` and ``spread``, which are
+    filled.
     """
+    threads = argument_checks.whole("threads", threads or usable_cores(), 1)
     visible = piece[2]
     known = int(visible.any(axis=1).sum(axis=1).max(initial=0))
     readings = int(visible.sum(axis=2).max(initial=0)) + 3
@@ -441,13 +443,13 @@ def filter_at_truth(
     rules[FIRST_STD:AFTER_STDS] = sensor.noise(measurement_std)
 
     def drive(part: slice) -> None:
-        own, known, *drives, least, spread = [each[part] for each in (P, slots, *piece)]
+        own, at, *drives, least, spread = [each[part] for each in (P, slots, *piece)]
         rows = workspace_for(Rules(), readings, capacity).rows
         for_sensor(drive_at_truth, sensor)(
-            *(own, known, tuple(drives), least, spread, motion_std**2, rules, rows)
+            *(own, at, tuple(drives), least, spread, motion_std**2, rules, rows)
         )
 
-    share_out(drive, len(visible), threads or usable_cores())
+    share_out(drive, len(visible), threads)
     return P, slots
 
 

@@ -341,6 +341,8 @@ def linearise_at_truth(
 def about_centre(P: Array, size: int, mean: Array) -> float:
     """Return the mean variance of the landmarks about their centre, invariant frame."""
     own, of_sum, count = 0.0, 0.0, (size - 3) / 2
+    if size == 3:
+        return np.nan
     for i in range(3, size):
         u = mean[i + 1] if i % 2 else -mean[i - 1]  # of −J l
         for j in range(4 - i % 2, i + 1, 2):  # of the same axis

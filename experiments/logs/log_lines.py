@@ -105,7 +105,7 @@ def shown(text: str) -> str:
     >>> shown("east")
     "'east'"
     """
-    quoted = repr(text)
+    quoted = repr(text[: MAX_SHOWN + 1])  # no copy of a huge field
     return quoted if len(quoted) <= MAX_SHOWN else quoted[:MAX_SHOWN] + "…"
 
 

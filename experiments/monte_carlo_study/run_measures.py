@@ -462,7 +462,11 @@ def _measure_map(
     for k, frame in enumerate(ERROR_FRAMES, start=1):
         values = (deviations[k] ** 2).sum(axis=-1)
         measured[f"landmark_nees_{frame}"] = by_id(values, ids, count)
-        measured[f"state_nees_{frame}"] = squares[k].sum(axis=-1)
+        found = squares[k].sum(axis=-1)
+        for row in np.flatnonzero(np.isnan(found)).tolist():  # far from its map
+            some = (part[[row]] for part in states)
+            found[row] = nees.state_nees(*some, frame=frame)[0]
+        measured[f"state_nees_{frame}"] = found
     if not size:
         return measured
     measured |= deviations_by_id(deviations[0], ids, count)

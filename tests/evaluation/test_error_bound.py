@@ -5,6 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
+from slamgym.estimator.kernels.batch import about_centre
 from slamgym.estimator.models.motions import predict_pose
 from slamgym.estimator.models.rigid_motion import rotation
 from slamgym.estimator.models.sensors import BEARING_RANGE, POSITION
@@ -232,12 +233,18 @@ def test_the_interval_of_the_efficiency_is_that_of_student():
     assert efficiency(np.zeros(3), np.ones(3)).value == 0
 
 
+def test_a_map_without_landmarks_has_no_centre_in_plain_python_either():
+    assert np.isnan(about_centre.py_func(np.eye(3), 3, np.zeros(3)))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"landmarks": np.zeros((1, 3, 2))}, r"landmarks must have shape \(1, 4, 2\)"),
         ({"visible": np.ones((1, 26))}, r"visible must have shape \(B, T, L\), got"),
         ({"motion_std": (0.1, -1, 0)}, "motion_std must be 3 finite numbers >= 0"),
+        ({"pose_std": (0.0, np.inf, np.inf)}, "pose_std must be above 0"),
+        ({"threads": -1}, "threads must be"),
     ],
 )
 def test_wrong_arguments_are_named(change, message):

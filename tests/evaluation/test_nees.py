@@ -134,6 +134,31 @@ def test_the_error_is_normalised_over_all_leading_axes_and_at_any_scale(size, sc
     np.testing.assert_allclose(found, (errors * solved).sum(axis=-1), rtol=1e-9)
 
 
+@pytest.mark.parametrize("size", [3, 5])
+def test_lower_halves_of_covariances_of_any_type_and_shape_count(size):
+    P, e = 4 * np.eye(size), np.ones(size)
+    P[0, 1] = P[1, 0] = 1
+    expected = e @ np.linalg.solve(P, e)
+    for kind in (float, np.float32, int):
+        found = normalised_squared_error(e.astype(kind), P.astype(kind))
+        assert found == pytest.approx(expected)
+    upper, lower = P + np.triu(P + 9, 1), P.copy()
+    lower[2, 1] = np.nan
+    assert normalised_squared_error(e, upper) == pytest.approx(expected)
+    assert np.isnan(whitened(e, lower)).tolist() == [False] * 2 + [True] * (size - 2)
+    several = normalised_squared_error(e, np.stack([P, 2 * P]))
+    np.testing.assert_allclose(several, [expected, expected / 2])
+    assert normalised_squared_error(e[None][:0], P[None][:0]).shape == (0,)
+
+
+def test_one_map_may_have_many_truths():
+    rng = np.random.default_rng(2)
+    mean, P, truths = MEAN, np.eye(7) + 0.1, rng.normal(MEAN, 0.1, (4, 7))
+    found = relative_map_nees(truths, mean, P)
+    each = [float(relative_map_nees(truth, mean, P)) for truth in truths]
+    np.testing.assert_allclose(found, each)
+
+
 @pytest.mark.parametrize("size", [3, 12])
 def test_a_covariance_singular_within_rounding_has_no_nees(size):
     covariance = np.tile(np.eye(size), (3, 1, 1))

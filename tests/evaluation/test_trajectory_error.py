@@ -290,3 +290,4 @@ def test_many_maps_at_once_have_the_aligned_error_of_each(scale, noise):
         apart = np.linalg.norm(one.alignment.apply(e) - g, axis=1)
         np.testing.assert_array_equal(one.aligned_errors, apart)
         assert found == pytest.approx(one.aligned_rmse, rel=1e-9)
+    assert aligned_rms(np.zeros((2, 1)), np.ones((2, 1))) == 0  # without a warning

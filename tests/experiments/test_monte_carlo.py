@@ -779,6 +779,21 @@ def test_estimators_may_be_names_and_classes():
     assert (same[0] == same[1]).all()
 
 
+class FarAway(OneByOne):
+    """Believes to be a thousand kilometres from its map."""
+
+    def belief(self):
+        moved = super().belief()
+        mean = moved.mean.copy()
+        mean[0] += 1e6
+        return Belief(mean, moved.covariance, moved.landmark_ids)
+
+
+def test_a_filter_that_is_far_from_its_map_has_a_score_that_says_so():
+    found = monte_carlo("six_landmarks", [FarAway], 2).state_nees_additive.values
+    assert (found > 1e9).all()
+
+
 def test_estimators_that_are_neither_names_nor_classes_are_refused():
     with pytest.raises(ValueError, match="must be names or classes, got 3"):
         monte_carlo("six_landmarks", ["ekf", 3], 2)

@@ -240,7 +240,7 @@ def _with_true_path(log: slamlog.SlamLog, path: str | PathLike[str]) -> slamlog.
             f"the pose before it, got {after:.15g}: sort the rows by time"
         )
     epoch = float(log.header.get("epoch", 0.0))
-    if epoch and abs(rows[0, 0]) > epoch / 2:
+    if abs(rows[0, 0]) > epoch / 2 > 0:
         rows = np.column_stack([rows[:, 0] - epoch, rows[:, 1:]])
     if rows[-1, 0] < start or rows[0, 0] > times[-1]:
         raise slamlog.LogError(
