@@ -49,21 +49,13 @@ def test_an_empty_map_has_no_error():
     assert (episode.steps, episode.path.shape) == (2, (3, 2))
 
 
-def test_a_success_is_honest_where_the_truth_agrees():
-    settings = {"landmarks": RING, "accuracy": 0.08}
-    env = ActiveSlamEnv("active_easy", **settings)
-    episode = stand_until_the_end(env, seed=1)
+@pytest.mark.parametrize("estimator", ["invariant", Shifted])
+def test_a_success_is_honest_where_the_truth_agrees(estimator):
+    settings = {"landmarks": RING, "accuracy": 0.08, "estimator": estimator}
+    episode = stand_until_the_end(ActiveSlamEnv("active_easy", **settings), seed=1)
     assert episode.success
-    assert episode.honest
-    assert episode.true_rmse <= 0.08
-
-
-def test_a_filter_that_errs_and_does_not_know_it_has_no_honest_success():
-    settings = {"landmarks": RING, "accuracy": 0.08, "estimator": Shifted}
-    episode = stand_until_the_end(ActiveSlamEnv("active_easy", **settings))
-    assert episode.success
-    assert not episode.honest
-    assert episode.true_rmse > 0.3
+    assert episode.honest == (estimator == "invariant")
+    assert episode.true_rmse <= 0.08 if episode.honest else episode.true_rmse > 0.3
 
 
 def test_success_far_from_the_truth_is_told_apart_in_many_worlds():

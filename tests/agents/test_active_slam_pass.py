@@ -9,7 +9,8 @@ from slamgym.agents.active_slam_task import ActiveSlamTask, RewardWeights
 from slamgym.estimator.filters.batch import BatchStorage
 from slamgym.sim_configs import load_scenario
 
-FLOOR = [[-8, -8, 8, -8], [8, -8, 8, 8], [8, 8, -8, 8], [-8, 8, -8, -8]]
+FLOOR = [[-8, -8, 8, -8], [8, -8, 8, 9], [8, 9, -8, 9], [-8, 9, -8, -8]]
+SLOW = {"max_speed": 0.6}  # m/s, and turns by up to 1 rad/s
 INNER = {"walls": [*FLOOR, [2, 2, 2, 6], [-3, -1, 0, 3]], "sensor": {"occlusion": True}}
 NEAR = {"accuracy": 0.12, "landmarks": {"layout": "ring", "count": 5, "radius": 3.0}}
 CASES = [
@@ -17,8 +18,8 @@ CASES = [
     ("active_medium", {}),
     ("active_hard", {}),
     ("active_easy", {**NEAR, "success_reward": 3.0}),
-    ("active_medium", {"criterion": "A", "effort_cost": 0.3}),
-    ("active_medium", {"criterion": "E", "steps": 9, "crash_cost": 2.0}),
+    ("active_medium", {"criterion": "A", "effort_cost": 0.3, "robot": SLOW}),
+    ("active_medium", {"criterion": "E", "steps": 9, "crash_cost": 2, "walls": FLOOR}),
     ("active_medium", INNER),
 ]
 
@@ -37,6 +38,8 @@ def play(level, settings, steps, worlds=16):
         before, now = now, slow.proceed(now, env.beliefs())
         expected = slow.reward(before, now, actions, infos["collision"])
         np.testing.assert_allclose(ends[0], expected[0], rtol=0, atol=1e-12)
+        measure = env.task.episodes.uncertainty
+        np.testing.assert_allclose(measure, now.uncertainty, rtol=1e-12)
         for end, other in zip((*ends[1:], infos["success"]), expected[1:], strict=True):
             np.testing.assert_array_equal(end, other)
         kinds |= set(zip(*(end.tolist() for end in expected[1:]), strict=True))

@@ -195,9 +195,11 @@ def test_an_episode_is_truncated_after_its_steps_and_never_terminated():
 
 @pytest.mark.parametrize("wild", [[50.0, -1e300], [-1.001, 2.0]])
 def test_actions_beyond_the_limits_are_clipped(wild):
-    env = make()
+    env = make(robot={"max_turn_rate": 0.5})
     env.reset(seed=0)
-    expected = np.sign(wild) * 0.5
+    limits = env.action_space.high
+    assert limits.tolist() == [1.0, 0.5]
+    expected = np.sign(wild) * limits * 0.5
     np.testing.assert_array_equal(env.step(wild)[0]["odometry"], expected)
 
 

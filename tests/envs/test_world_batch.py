@@ -21,6 +21,7 @@ WORLDS, STEPS, SEED = 5, 200, 11
 ROAMING = load_scenario("six_landmarks").with_changes(
     dt=0.5,
     steps=60,
+    robot={"max_turn_rate": 0.9},
     motion={"std": [0.05, 0.03, 0.04]},
     landmarks=RANDOM_MAP,
     controls={"sequence": "circle", "radius": 3.0, "speed": 0.8},
