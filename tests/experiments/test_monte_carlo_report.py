@@ -490,19 +490,15 @@ def test_a_single_run_is_called_a_run():
     assert one.sentence.startswith("cannot tell: 1 run succeeded")
 
 
-def test_a_flagged_run_counts_as_failed_even_if_its_numbers_are_finite():
+def test_flagged_runs_and_gaps_that_nobody_flagged_count_as_failed():
     dataset = typical().copy(deep=True)
-    dataset["failed"].loc[{"estimator": "ekf", "run": 5}] = True
+    dataset["failed"].loc[{"estimator": "ekf", "run": 5}] = True  # all is finite
+    dataset["nis"].loc[{"estimator": "ekf", "run": 7, "step": 17}] = np.nan
     entry = summarise_monte_carlo(dataset)["estimators"]["ekf"]
-    assert entry["good_runs"] == 39
-    assert "1 of 40 runs failed and are left out: 5." in entry["warnings"]
-
-
-def test_gaps_that_nobody_flagged_are_found_with_their_step():
-    dataset = typical().copy(deep=True)
-    dataset["nis"].loc[{"estimator": "ekf", "run": 5, "step": 17}] = np.nan
-    (failure,) = summarise_monte_carlo(dataset)["estimators"]["ekf"]["failed_runs"]
-    assert (failure["run"], failure["step"]) == (5, 17)
+    assert entry["good_runs"] == 38
+    assert "2 of 40 runs failed and are left out: 5, 7." in entry["warnings"]
+    failure = entry["failed_runs"][1]
+    assert (failure["run"], failure["step"]) == (7, 17)
     assert "not finite" in failure["message"]
 
 

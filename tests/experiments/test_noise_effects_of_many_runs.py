@@ -82,10 +82,8 @@ def test_a_filter_told_the_truth_stays_honest_and_one_told_too_little_does_not(e
 
 
 def test_a_worse_sensor_in_the_filter_widens_its_ellipses(effects):
-    wide, right = (
-        one(effects, "filter", "σr", 10.0),
-        one(effects, "nothing", "none", 1.0),
-    )
+    wide = one(effects, "filter", "σr", 10.0)
+    right = one(effects, "nothing", "none", 1.0)
     assert wide.landmark_area > 2 * right.landmark_area
 
 

@@ -147,7 +147,6 @@ def shown(table):
 
 
 def test_white_innovations_suggest_no_inflation(example):
-    assert example.suggested.settings == example.fitted.settings
     assert example.suggested is example.fitted
     runs = summarise_fit(example)["runs"]
     assert runs["suggested"] is runs["fitted"]
