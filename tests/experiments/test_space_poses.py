@@ -276,6 +276,8 @@ def test_the_command_judges_poses_in_space(tmp_path):
     printed = " ".join(done.stdout.split())
     assert "e: not consistent: the squared errors of the pose" in printed
     assert f"cause: {said_of('right')}" in printed
+    done = slamgym(*call, "--space", "right", "--json")
+    assert json.loads(done.stdout)["cause"] == ""
     done = slamgym(*call, "--space", "up")
     assert "--space must be one of left, right, decoupled, got 'up'" in done.stderr
 
