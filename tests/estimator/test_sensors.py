@@ -433,7 +433,7 @@ def negative_std(noise, distance):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"h": wrong_slope}, "∂range/∂y at .* but h returns"),
+        ({"h": wrong_slope}, r"∂range/∂y at .* is -0\.9\d* by .* but h returns 0\.9"),
         ({"inverse": mirrored}, "inverse of the reading of"),
         ({"angles": ()}, "bearing jumps by 2π around the robot: set its"),
         ({"std": negative_std}, "std must return two finite numbers > 0"),
