@@ -8,7 +8,7 @@ import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, jit_in_place, njit_allocating, njit_internal
-from ..models.bearing_range import expected_reading_jit, pose_slopes_jit
+from ..models.bearing_range import expected_reading_jit
 from ..models.rigid_motion import predict, propagate
 from .scan_update import (
     ADDED,
@@ -27,6 +27,7 @@ from .scan_update import (
     absorb,
     add_landmark,
     as_rules,
+    fill_slopes,
     refresh,
     refresh_pose,
     update_belief,
@@ -322,10 +323,8 @@ def linearise_at_truth(
             continue
         columns[used], used = 3 + 2 * slots[k], used + 1
         refresh(P, size, columns[used - 1])
-        ax, ay, bx, by, a_turn, b_turn = pose_slopes_jit(dx, dy, heading)
         H = rows[row : row + 2, JACOBIAN : JACOBIAN + 5]
-        H[0, 0], H[0, 1], H[0, 2], H[0, 3], H[0, 4] = -ax, -ay, a_turn, ax, ay
-        H[1, 0], H[1, 1], H[1, 2], H[1, 3], H[1, 4] = -bx, -by, b_turn, bx, by
+        fill_slopes(dx, dy, heading, H)
         rows[row, VARIANCE], rows[row + 1, VARIANCE] = variances(rules, distance)
     for axis in range(3):
         if pose_std[axis] < np.inf:

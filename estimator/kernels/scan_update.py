@@ -586,13 +586,19 @@ def linearise(
         dx = reference[column] - reference[0]
         dy = reference[column + 1] - reference[1]
         heading = reference[2]
+    fill_slopes(dx, dy, heading, H)
+    if linearisation == PROJECTED:
+        _project(reference, column, H)
+
+
+@njit_internal
+def fill_slopes(dx: float, dy: float, heading: float, H: Array) -> None:
+    """Fill H (2, 5) of a reading of the landmark at (dx, dy) from the robot."""
     ax, ay, bx, by, a_turn, b_turn = pose_slopes_jit(dx, dy, heading)
     H[0, 0], H[0, 1], H[0, 2] = -ax, -ay, a_turn
     H[1, 0], H[1, 1], H[1, 2] = -bx, -by, b_turn
     H[0, 3], H[0, 4] = ax, ay
     H[1, 3], H[1, 4] = bx, by
-    if linearisation == PROJECTED:
-        _project(reference, column, H)
 
 
 @njit_internal
