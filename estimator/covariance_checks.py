@@ -62,9 +62,20 @@ class _Gaussian(NamedTuple):
     covariance: Array
     mean: Array
 
+    @property
+    def std(self) -> Array:
+        """The deviations, above 0 also of a mistake whose variances are not."""
+        return np.asarray(np.sqrt(np.abs(self.covariance.diagonal())) + 1e-9)
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether the covariance is, up to rounding."""
+        P, std = self.covariance, self.std
+        return bool(((P - P.T) / np.outer(std, std)).max() < 1e-6)
+
     def gaps(self, other: _Gaussian) -> tuple[Array, Array]:
         """Return how far another belief is away, in deviations of this one."""
-        std = np.sqrt(np.abs(self.covariance.diagonal())) + 1e-9  # may be ≤ 0
+        std = self.std
         moved = other.mean - self.mean
         moved[2] = wrap_angle(float(moved[2]))
         spread = np.abs(other.covariance - self.covariance) / np.outer(std, std)
@@ -958,11 +969,6 @@ def _state(belief: Belief, ids: Sequence[int]) -> _Gaussian | None:
     return _Gaussian(part.covariance, part.mean)
 
 
-def _is_symmetric(belief: _Gaussian) -> bool:
-    P, std = belief.covariance, np.sqrt(np.abs(belief.covariance.diagonal())) + 1e-9
-    return bool(((P - P.T) / np.outer(std, std)).max() < 1e-6)
-
-
 def _is_proper(belief: _Gaussian) -> bool:
     """Return whether a belief is finite, symmetric and definite."""
     P = belief.covariance
@@ -970,7 +976,7 @@ def _is_proper(belief: _Gaussian) -> bool:
     if not (np.isfinite(belief.mean).all() and np.isfinite(P).all() and std.all()):
         return False
     correlations = P / np.outer(std, std)
-    return bool(_is_symmetric(belief) and np.linalg.eigvalsh(correlations)[0] > 1e-9)
+    return bool(belief.is_symmetric and np.linalg.eigvalsh(correlations)[0] > 1e-9)
 
 
 def _named(method: str, wrong: Sequence[_Made], fine: Sequence[_Made]) -> Mistake:
@@ -1059,7 +1065,7 @@ def _wrong_nis(made: Sequence[_Made]) -> Iterator[Mistake]:
 def _asymmetric(made: Sequence[_Made]) -> Iterator[Mistake]:
     """Yield that a covariance is not symmetric, where this is within tolerance."""
     for each in made:
-        if not _is_symmetric(each.got):
+        if not each.got.is_symmetric:
             text = f"so it is in step {each.step}"
             yield Mistake("belief()", "the covariance is not symmetric", text)
             return
