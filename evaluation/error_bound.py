@@ -23,7 +23,6 @@ from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
 from .. import argument_checks
-from ..argument_checks import usable_cores
 from ..arrays import Array, BoolArray, IntArray
 from ..estimator.beliefs import columns_of
 from ..estimator.filters.batch import durations_of, filter_at_truth
@@ -139,7 +138,8 @@ def posterior_bound(
     if not (fixes > 0).all():
         raise ValueError("pose_std must be above 0, infinite where there is no reading")
     arrays = poses, places, seen, dt, fixes, least, spread
-    for some in _pieces(seen) if read in (BEARING_RANGE, POSITION) else ():
+    pieces = _pieces(seen) if read in (BEARING_RANGE, POSITION) else ()
+    for some in pieces:
         piece = [array[some] for array in arrays]
         P, slots = filter_at_truth(piece, start, *stds, read, threads)
         if with_covariances:
@@ -198,7 +198,7 @@ _MOST_BYTES = 2**22  # of the covariances of the runs that are filtered at once
 def _pieces(visible: BoolArray) -> Iterator[slice]:
     """Cut runs into pieces that fit into memory."""
     most = int(visible.any(axis=1).sum(axis=1).max(initial=0))
-    size = max(usable_cores(), _MOST_BYTES // (8 * (3 + 2 * most) ** 2))
+    size = max(argument_checks.usable_cores(), _MOST_BYTES // (8 * (3 + 2 * most) ** 2))
     for begin in range(0, len(visible), size):
         yield slice(begin, begin + size)
 

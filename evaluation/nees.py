@@ -387,7 +387,7 @@ def without_rounding(covariances: Array) -> Array:
     of the position given the heading decides.
     """
     P = np.moveaxis(covariances[..., :3, :3], (-2, -1), (0, 1))
-    rounded = is_rounded(P)
+    rounded = _is_rounded(P)
     if not rounded.any():
         return covariances
     cleared = covariances.copy()
@@ -395,7 +395,7 @@ def without_rounding(covariances: Array) -> Array:
     return cleared
 
 
-def is_rounded(P: Array) -> BoolArray:
+def _is_rounded(P: Array) -> BoolArray:
     """Return where `without_rounding` clears covariances P (3, 3, ...)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(P[2, 2] > 0, 1 / P[2, 2], 0.0)
@@ -422,7 +422,7 @@ def nees_of_poses(
     sx, sy, st = np.sqrt(xx), np.sqrt(yy), np.sqrt(tt)
     a, b, c = xy / (sx * sy), xt / (sx * st), yt / (sy * st)
     left, rest = 1 - a * a, c - a * b
-    known = (left > SINGULAR) & (xx + yy < np.inf) & ~is_rounded(P)
+    known = (left > SINGULAR) & (xx + yy < np.inf) & ~_is_rounded(P)
     left = np.where(known, left, np.nan)
     slope = rest / left
     last = 1 - b * b - rest * slope

@@ -180,8 +180,8 @@ def position_accuracy(estimate: ArrayLike, truth: ArrayLike) -> PositionAccuracy
 def aligned_rms(truth: Array, errors: Array) -> Array:
     """Return the aligned RMSE of `position_accuracy`, without distances and checks.
 
-    Rounding adds up to about 1e-8 of the RMSE before the alignment.
-    With g and e true and estimated positions about their means, C the best rotation::
+    Rounding adds up to about 1e-8 of the RMSE before the alignment. With g and e true
+    and estimated positions about their means, C the best rotation::
 
         Σ |C e − g|² = Σ |e − g|² + 2 (a − √(a² + b²)),    a = Σ e · g,  b = Σ e × g
 
@@ -206,8 +206,8 @@ def aligned_rms(truth: Array, errors: Array) -> Array:
         )
     )
     length = np.hypot(dot, cross)
-    sum_ = np.where(dot > 0, length + dot, 1.0)
-    gain = np.where(dot > 0, cross * cross / sum_, length - dot)
+    gain = np.asarray(length - dot)  # by another form where it would lose digits
+    np.divide(cross * cross, length + dot, out=gain, where=dot > 0)
     return np.asarray(np.sqrt(np.maximum(raw - 2 * gain, 0.0) / gx.shape[-1]))
 
 

@@ -441,13 +441,12 @@ def filter_at_truth(
     slots = np.full(visible[:, 0].shape, NEVER)
     rules = np.array(Rules(min_range=SMALLEST))
     rules[FIRST_STD:AFTER_STDS] = sensor.noise(measurement_std)
+    kernel, noise = for_sensor(drive_at_truth, sensor), (motion_std**2, rules)
 
     def drive(part: slice) -> None:
         own, at, *drives, least, spread = [each[part] for each in (P, slots, *piece)]
         rows = workspace_for(Rules(), readings, capacity).rows
-        for_sensor(drive_at_truth, sensor)(
-            *(own, at, tuple(drives), least, spread, motion_std**2, rules, rows)
-        )
+        kernel(own, at, tuple(drives), least, spread, *noise, rows)
 
     share_out(drive, len(visible), threads)
     return P, slots

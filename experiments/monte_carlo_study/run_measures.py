@@ -405,7 +405,8 @@ def _measure_paths(
     turn = wrap_angle(turn)
     half = turn / 2
     along = np.where(half == 0, 1.0, half / np.tan(half))
-    # ξ about the estimated position, where both frames have the same covariance
+    # `invariant_error` about the estimated position, by one tangent: both errors have
+    # the same covariance there. Then about the origin, see `seen_from`.
     xi = along * ex + half * ey, along * ey - half * ex, turn
     about = xi[0] + turn * (y - origin[1]), xi[1] - turn * (x - origin[0])
     raw = np.sqrt(ex * ex + ey * ey)
