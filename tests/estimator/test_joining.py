@@ -89,6 +89,10 @@ def test_frames_begin_with_blocks_of_powers_of_two_that_common_landmarks_align()
     asked.clear()
     more.frames(summaries, frames[:9], refine)
     assert asked == []
+    sure = [each._replace(pose_covariance=1e-4 * np.eye(3)) for each in summaries]
+    found = FrameInitialisation().frames(sure, frames[:1], refine)
+    np.testing.assert_allclose(found, frames, atol=1e-9)
+    assert asked == []  # the heading's deviation along 8 submaps is 0.03
     off = frames[:9].copy()
     off[8] += (0.3, -0.2, 0.1)  # the last one only: landmarks correct most of it
     found = more.frames(summaries, off, refine)

@@ -246,16 +246,18 @@ class JoinedMap:
 # Initial values of the frames of submaps, by divide and conquer.
 #
 # Gauss-Newton needs initial values near the right minimum, and composing the frames one
-# by one drifts too far from it.  Blocks of submaps are therefore joined first, then
-# blocks of blocks, each in its own frame.  A block is then aligned as a rigid body with
-# the landmarks that it shares with the blocks before it.  Block boundaries follow the
-# binary digits of the number of submaps, so that most blocks can be reused when the map
-# grows by one submap.
+# by one drifts too far from it.  Blocks of submaps, and blocks of blocks, are therefore
+# aligned as rigid bodies with the landmarks that they share, and joined first where
+# their heading may drift.  Block boundaries follow the binary digits of the number of
+# submaps, so that most blocks can be reused when the map grows by one submap.
 
 Refine = Callable[[int, int, Array], Array]
 
 # Up to this many submaps, composing their frames is accurate enough.
 LARGEST_COMPOSED = 4
+# Standard deviation of the heading along a block up to which the block is not joined:
+# Gauss-Newton on the whole map then takes no more steps [rad].
+SMALL_TURN = 0.1
 
 
 class SubmapSummary(NamedTuple):
@@ -333,7 +335,9 @@ class FrameInitialisation:
                 right = self._block(summaries, middle, b, refine)
                 rough = _merged(summaries, a, left, right)
                 del self.blocks[a, middle], self.blocks[middle, b]
-            self.blocks[a, b] = refine(a, b, rough)
+            turned = sum(s.pose_covariance[2, 2] for s in summaries[a:b])
+            is_rough = turned > SMALL_TURN**2
+            self.blocks[a, b] = refine(a, b, rough) if is_rough else rough
         return self.blocks[a, b]
 
 
