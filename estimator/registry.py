@@ -268,7 +268,8 @@ def _known_options(factory: EstimatorFactory) -> list[str]:
     """Return the options of a factory, and of the classes that get its others."""
     makers = [factory]
     if isinstance(factory, type):  # the base filter of a large map is an `EkfSlam`
-        makers = [*factory.__mro__[:-1], ekf.EkfSlam]
+        own = [kind for kind in factory.__mro__[:-1] if "__init__" in vars(kind)]
+        makers = [*own, ekf.EkfSlam]
     known: list[str] = []
     for maker in makers:
         names, passes_others = _keywords(maker)

@@ -252,7 +252,7 @@ def error_lines(error: ValidationError) -> list[str]:
     """
     return [
         _line(dict(details))
-        for details in error.errors(include_url=False)
+        for details in error.errors()
         # a list with invalid items counts as too short, too
         if not (details["type"] == "too_short" and len(details["input"]) > 0)
     ]

@@ -123,7 +123,10 @@ TESTS = {
     "estimator/association/constellations": "constellations loop_closing",
     "estimator/association/missed_landmarks": "missed_detections map_management",
     "estimator/guards": "saved_states errors_change_nothing magnitudes",
-    "estimator/interface": "representations ekf_slam pose_readings check_estimator",
+    "estimator/interface": (
+        "representations ekf_slam pose_readings check_estimator errors_change_nothing "
+        "map_management"
+    ),
     "estimator/map_management": f"{SCANS} missed_detections map_editor",
     "estimator/map_management/clear_scans": "clear_scans map_management",
     "estimator/map_management/recent_scans": f"{SCANS} clear_scans",
@@ -139,7 +142,8 @@ TESTS = {
     ),
     "estimator/peers": "peers",
     "estimator/registry": (
-        "representations models_of_logs filter_family ekf_slam large_maps peers"
+        "representations models_of_logs filter_family ekf_slam sensors check_estimator "
+        "peers"
     ),
     "estimator/smoother": "smoother reassociation symmetries pose_readings",
     "estimator/smoother/batch_smoother": "smoother reassociation smooth_command",

@@ -51,8 +51,8 @@ class IdealEkfSlam(EkfSlam):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a saved state; the truth of each further step must be given."""
-        saved_states.refuse_other_state(state, ())
-        at_truth = saved_states.flag("at_truth", state.get("at_truth", False))
+        saved_states.refuse_other_state(state, ["at_truth"])
+        at_truth = saved_states.flag("at_truth", state["at_truth"])
         with returned_on_error(self):
             super().load_state_dict(state)
             self._linearise_at(AT_TRUTH if at_truth else AT_ESTIMATE)

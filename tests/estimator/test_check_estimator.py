@@ -163,6 +163,16 @@ class RemembersItsRuns(EkfSlam):
         super().predict(odometry, dt + 1e-9 * self.runs)
 
 
+class LosesCertainty(EkfSlam):
+    scans = 0
+
+    def update(self, measurements, landmark_ids=None):
+        report = super().update(measurements, landmark_ids)
+        self.scans += len(measurements) > 0
+        self.map.covariance[3, 3] += 0.01 * self.scans * (self.map.size > 3)
+        return report
+
+
 class NeedsAStart(EkfSlam):
     def __init__(self, *, initial_pose, **settings):
         super().__init__(initial_pose=initial_pose, **settings)
@@ -201,6 +211,8 @@ class StartsTooCertain(EkfSlam):
             shows(lambda x, P, ids: (x + 7 * P[0] / (P[0, 0] ** 0.5 + 1e-9), P, ids)),
             r"NEES below 30 \(3 is expected\), got \d\d\.\d",
         ),
+        (LosesCertainty, r"- update\(\) must not make the belief less certain\n"),
+        (LosesCertainty, "certain: a second reading of a landmark must shrink its cov"),
         (KeepsItsMapOnReset, r"after reset\(pose, pose_std\) must have no landmarks"),
         (ReturnsNothing, "must return an UpdateReport, got NoneType"),
         (

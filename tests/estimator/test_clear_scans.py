@@ -13,6 +13,7 @@ from slamgym.estimator.association.constellations import Constellations
 from slamgym.estimator.map_management import loop_closing
 from slamgym.estimator.map_management.clear_scans import ClearScans
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
+from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.experiments.run_and_replay.filter_settings import SMOOTHER
 from slamgym.sim_configs import action_sequence, load_scenario
 
@@ -116,6 +117,26 @@ def test_every_filter_on_the_shared_kernels_takes_clear_scans(count, name):
     twins = [make(name, load_scenario("loop"), clear=clear) for clear in (True, False)]
     compare(twins, scans_of("loop", 120))
     assert np.mean(count) > 0.4
+
+
+@pytest.mark.parametrize(("gap", "kept"), [(0.1, 2), (0.3, 1)])
+def test_a_clear_scan_discards_a_hypothesis_that_it_refutes(count, gap, kept):
+    places = np.array([(4.0, 3.0 * k - 7.0) for k in range(6)])
+    twins = [make("ekf", clear=clear) for clear in (True, False)]
+    first, last = (
+        predict_measurement(np.array([x, 0.0, 0.0]), places).measurement
+        for x in (0.0, gap)
+    )
+    for slam in twins:
+        for _ in range(4):
+            slam.update(first)
+        state = slam.state_dict()
+        other = {f"1{k[1:]}": v.copy() for k, v in state.items() if k[0] == "0"}
+        other["1.filter.mean"][0] += gap  # is right, and not the best one before
+        slam.load_state_dict(state | other | {"costs": np.array([0.0, 5.0])})
+    compare(twins, [(None, last, None)])
+    assert count[-1]
+    assert len(twins[0].hypotheses) == kept
 
 
 def test_given_identities_of_mapped_landmarks_are_a_clear_scan(count):

@@ -9,7 +9,7 @@ from types import FunctionType, ModuleType
 
 import numpy as np
 import pytest
-from comparison import assert_close_beliefs, assert_same_bits, part_of
+from comparison import assert_close_beliefs, assert_same_bits, digest, part_of, same
 from drives import MEASUREMENT_STD
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -312,13 +312,15 @@ def test_a_local_map_grows_by_half_before_it_changes():
         slam.update([(0.1 * k, 3.0)], [k])
         sizes.append(len(slam.local_ids))
     assert sizes == [1, 2, 3, 4, 5, 6, 7, 5, 6, 7, 5, 6]
+    with pytest.raises(ValueError, match=r"local_size must be >= 5, .* got 4"):
+        slam.update([(0.1 * i, 3.0) for i in range(5)], slam.local_ids[:5])
 
 
 def test_a_local_map_holds_what_is_required_and_the_nearest_others():
     rng = np.random.default_rng(1)
-    points, ids = rng.uniform(-9, 9, (30, 2)), rng.permutation(100)[:30].tolist()
-    slots = dict(zip(ids, rng.permutation(30).tolist(), strict=True))
-    for required, size in (((), 7), (ids[3:8], 9), (ids[:6], 6), (ids[:6], 2)):
+    points, ids = rng.uniform(-9, 9, (200, 2)), rng.permutation(999)[:200].tolist()
+    slots = dict(zip(ids, rng.permutation(200).tolist(), strict=True))
+    for required, size in (((), 40), (ids[3:8], 9), (ids[:6], 6), (ids[:6], 2)):
         centre = rng.uniform(-9, 9, 2)
         others = sorted(
             (i for i in ids if i not in required),
@@ -327,7 +329,7 @@ def test_a_local_map_holds_what_is_required_and_the_nearest_others():
         expected = [*required, *others[: max(size - len(required), 0)]]
         found = active_set.choose_local(centre, required, slots, points, size)
         assert list(found) == expected
-    everything = active_set.choose_local(centre, ids[:2], slots, points, 99)
+    everything = active_set.choose_local(centre, ids[:2], slots, points, 999)
     assert {*everything} == {*ids}
 
 
@@ -346,7 +348,8 @@ def test_a_local_map_grows_after_long_phases_and_shrinks_after_short_ones(
 
 
 def test_a_removed_landmark_leaves_nothing_in_a_saved_state():
-    slam = run(CompressedEkfSlam(*NOISE, local_size=12), wander(100, 40))
+    settings = {"base": "first_estimates", "local_size": 12}
+    slam = run(CompressedEkfSlam(*NOISE, **settings), wander(100, 40))
     places = dict(zip(slam.landmark_ids, slam.state_dict()["slots"], strict=True))
     gone = [i for i in slam.landmark_ids if i not in slam.local_ids][:3]
     slam.remove(gone)
@@ -367,6 +370,9 @@ def test_a_landmark_counts_as_near_up_to_five_deviations():
     near = {*map_of(slam).ids_near(pose, away - 4.99 * std)}
     assert {whole.landmark_ids[k], *slam.local_ids} <= near < {*slam.landmark_ids}
     assert whole.landmark_ids[k] not in map_of(slam).ids_near(pose, away - 5.9 * std)
+    view = slam.local_view(0.0)
+    assert len(view.ids) < len(view.mapped)
+    assert view.mapped == slam.landmark_ids
 
 
 @pytest.mark.slow
@@ -498,6 +504,34 @@ def test_no_step_does_more_of_the_map_than_a_full_update(base, jumping, monkeypa
     assert max(waiting) < 150  # and nothing piles up
 
 
+def test_work_that_is_taken_back_is_not_done_twice_also_after_a_saved_state():
+    rng, stored, loaded = np.random.default_rng(0), DeferredCovariance(), None
+    stored.make_room(4 * BLOCK)
+    roots = rng.standard_normal((2, 4 * BLOCK, 30))
+    for root in roots:
+        stored.defer(Downdate(root, np.ones(30), []))
+    for rank in (20, 15):  # it begins; then some more blocks
+        undo = stored.checkpoint()
+        stored.work(rank)
+        undo()
+        stored.work(rank)
+        loaded = DeferredCovariance()
+        loaded.load_state_dict(stored.state_dict())
+        same(loaded.state_dict(), stored.state_dict())
+        assert 0 < stored.state_dict()["progress"][1] < 4
+        for each in (loaded, stored)[: 1 + (rank == 15)]:
+            undo = each.checkpoint()
+            each.work(18)
+            undo()
+            each.work(200)
+            found = each.marginal(np.arange(4 * BLOCK))
+            expected = -sum(root @ root.T for root in roots)
+            np.testing.assert_allclose(found, expected, atol=1e-10)
+    none = DeferredCovariance().state_dict() | {"progress": np.array([1.0, 0.0, 0.0])}
+    with pytest.raises(ValueError, match=r"progress'\] must be 0 or 1, at most 0 blo"):
+        stored.load_state_dict(none)
+
+
 def test_a_downdate_without_memory_is_still_to_be_applied(monkeypatch):
     stored, columns = DeferredCovariance(), np.arange(4)
     stored.make_room(1)
@@ -597,6 +631,8 @@ def bytes_of_arrays(whole):
          r"base must be 'ekf' or .*, got 'robocentric'"),
         (lambda: CompressedEkfSlam(*NOISE, local_size=0),
          r"local_size must be a whole number >= 1, got 0"),
+        (lambda: CompressedEkfSlam(*NOISE, sensor="range"),
+         "the compressed filter needs a sensor whose single reading locates a land"),
         (lambda: CompressedEkfSlam(*NOISE).belief([3]),
          r"landmark_ids must be of mapped landmarks, got 3"),
         (lambda: CompressedEkfSlam(*NOISE).remove([3]),
@@ -662,6 +698,7 @@ def test_a_restart_forgets_the_map():
     slam.reset((1.0, 2.0, 0.5), (0.1, 0.1, 0.1))
     start = {"initial_pose": (1.0, 2.0, 0.5), "initial_pose_std": (0.1, 0.1, 0.1)}
     fresh = CompressedEkfSlam(*NOISE, base="invariant", **start)
+    assert digest(slam) == digest(fresh)
     for each in (slam, fresh):
         run(each, wander(200, 120))
     assert_same_bits(slam.belief(), fresh.belief())

@@ -1,10 +1,11 @@
 """Deterministic properties of every filter of the family."""
 
 import tracemalloc
+from itertools import product
 
 import numpy as np
 import pytest
-from comparison import assert_close_beliefs, assert_same_bits
+from comparison import assert_close_beliefs, assert_same_bits, digest
 from dense_ekf import DenseEkf
 from dense_family import TWINS, DenseAdaptiveInvariant, belief_of
 from dense_family import tell_truth as tell
@@ -321,10 +322,14 @@ def test_options_in_brackets_count_before_keywords():
 
 @pytest.mark.parametrize("case", FAMILY)
 def test_reset_equals_a_new_filter(case):
-    slam, fresh = make(case), make(case)
+    noise = {name: np.array(std) for name, std in NOISE.items()}
+    slam, fresh = make(case, **noise), make(case)
+    for std in noise.values():
+        std[:] = 9.0  # a filter keeps no array of its caller
     tell_truth(slam, np.ones(3))
     drive_all(3, 5, slam)
     slam.reset((0, 0, 0), (0, 0, 0))
+    assert digest(slam) == digest(fresh)
     drive_all(9, 15, slam, fresh)
     assert_same_bits(slam.belief(), fresh.belief())
 
@@ -408,6 +413,24 @@ def test_a_scan_that_cannot_be_solved_is_refused_or_harmless(case):
     assert refused > 10
 
 
+def test_an_update_that_fails_at_a_later_iterate_leaves_the_belief_as_it_was():
+    """The range is across the motion there, and reads nothing of it."""
+    refused = 0
+    for std, iterations in product((0.2, 0.25, 0.5, 1.0, 2.0, 3.0), (1, 2)):
+        noise = {"motion_std": (std, 0.0, 1.0), "measurement_std": (0.0, 0.0)}
+        slam = make_estimator("iterated", **noise, iterations=iterations)
+        slam.update([(np.arctan2(6, 8), 10.0)], [7])
+        slam.predict((0.0, 0.0))
+        before = slam.belief()
+        try:
+            slam.update([(1.0, 3.6)], [7])
+        except np.linalg.LinAlgError:
+            refused += 1
+            assert iterations == 2
+            assert_same_bits(slam.belief(), before)
+    assert refused
+
+
 @pytest.mark.parametrize("case", FAMILY)
 def test_a_reading_at_an_expected_range_below_the_minimum_is_skipped(case):
     slam = make(case, min_range=0.5)
@@ -453,6 +476,16 @@ def test_a_landmark_at_the_robot_is_reported_as_near(case):
     tell_truth(slam, (0.5, 0.0, 0.0), true_map)
     slam.predict((0.5, 0.0))
     assert slam.update([(0.0, 0.4)], [0]).near_ids == (0,)
+
+
+def test_the_first_truth_is_that_of_the_start():
+    slam = make("ideal", initial_pose_std=(0.0, 0.0, 0.1))
+    tell_truth(slam, np.array([3.0, 1.0, 0.5]), {})
+    tell_truth(slam, np.array([3.0 + np.cos(0.5), 1.0 + np.sin(0.5), 0.5]), {})
+    slam.predict((1.0, 0.0))
+    covariances = slam.belief().covariance[:2, 2]
+    expected = 0.01 * np.array([-np.sin(0.5), np.cos(0.5)])
+    np.testing.assert_allclose(covariances, expected, atol=1e-12)
 
 
 def test_the_ideal_filter_asks_for_the_truth_of_all_it_sees():

@@ -2,10 +2,14 @@
 
 import numpy as np
 import pytest
+from comparison import assert_same_bits, part_of
 
 from slamgym.estimator import (
     Belief,
+    EkfSlam,
+    InvariantEkfSlam,
     UpdateReport,
+    interface,
     list_estimators,
     make_batch,
     make_estimator,
@@ -59,6 +63,77 @@ def test_a_part_of_a_view_knows_the_whole_map():
     part = view.part([1])
     assert (part.ids, part.mapped) == ([5], (3, 5))
     assert view._replace(whole=(9, 3, 5)).part([0]).mapped == (9, 3, 5)
+
+
+class SixMethods:
+    """A filter that has no method beyond those of the interface."""
+
+    def __init__(self, **noise):
+        self._inside = InvariantEkfSlam(**noise)
+        for name in ("reset", "predict", "update", "state_dict", "load_state_dict"):
+            setattr(self, name, getattr(self._inside, name))
+
+    def belief(self):
+        return self._inside.belief()
+
+
+class ShowsAnother(EkfSlam):
+    """A filter whose map is not its belief."""
+
+    def belief(self):
+        whole = super().belief()
+        return Belief(whole.mean + 1.0, 2.0 * whole.covariance, (8, 9))
+
+
+@pytest.mark.parametrize("kind", [EkfSlam, SixMethods, ShowsAnother])
+def test_the_map_of_any_filter_is_that_of_its_belief(kind):
+    slam = kind(**NOISE)
+    slam.update([(0.0, 2.0), (1.0, 3.0)], [3, 5])
+    whole, view = slam.belief(), interface.view_map(slam)
+    ids = whole.landmark_ids
+    assert interface.mapped_ids(slam) == ids == tuple(view.ids)
+    np.testing.assert_array_equal(view.mean[:7], whole.mean)
+    np.testing.assert_array_equal(view.covariance[:7, :7], whole.covariance)
+    both = interface.marginal(slam, ids[::-1])
+    assert_same_bits(both, part_of(whole, ids[::-1]))
+    assert both.frame == whole.frame
+
+    @interface.returned_on_error(slam)
+    def interrupted():
+        slam.predict((1.0, 0.3))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert_same_bits(slam.belief(), whole)
+
+
+def test_the_nis_of_a_fix_is_added_to_that_of_the_scan():
+    scan, fix = (UpdateReport(nis=n, degrees_of_freedom=2 + n) for n in (3, 1))
+    both = interface.with_fix(scan.replace(added_ids=(4,)), fix)
+    assert (both.nis, both.degrees_of_freedom, both.added_ids) == (4, 8, (4,))
+
+
+OPTIONS = (
+    "sensor, landmark_init, gate_probability, noise_at_rest, min_range, motion, "
+    "range_std_per_metre, bearing_std_metres, range_noise_at"
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "message"),
+    [
+        ("ekf", "gate", f"; did you mean 'gate_probability'? (there are {OPTIONS})"),
+        ("slamgym.estimator:EkfSlam", "x", f" (there are {OPTIONS})"),
+        ("unscented", "iterations", f" (there are {OPTIONS})"),
+        ("compressed", "x", f" (there are base, local_size, {OPTIONS})"),
+    ],
+)
+def test_an_unknown_option_is_refused_with_those_that_there_are(name, option, message):
+    with pytest.raises(ValueError, match="has no option") as caught:
+        make_estimator(name, **NOISE, **{option: 1})
+    shown = name.rpartition(":")[2]
+    assert str(caught.value) == f"{shown} has no option '{option}'{message}"
 
 
 def test_a_batch_shows_its_runs():

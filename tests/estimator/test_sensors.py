@@ -330,11 +330,17 @@ def test_parts_without_sensors_refuse_them_in_a_sentence():
         make_estimator("ekf", **NOISE, sensor="position", management=True)
 
 
-@pytest.mark.parametrize("name", ["robocentric", "compressed", "submaps"])
-def test_filters_that_do_not_wait_refuse_a_sensor_that_makes_them(name):
-    with pytest.raises(
-        ValueError, match="whose single reading locates a landmark, got 'range"
-    ):
+@pytest.mark.parametrize(
+    ("name", "part"),
+    [
+        ("robocentric", "the robocentric filter"),
+        ("compressed", "the compressed filter"),
+        ("submaps", "a submap"),
+    ],
+)
+def test_filters_that_do_not_wait_refuse_a_sensor_that_makes_them(name, part):
+    rule = f"^{part} needs a sensor whose single reading locates a landmark, got 'range"
+    with pytest.raises(ValueError, match=rule):
         make_estimator(name, **NOISE, sensor="range")
     with pytest.raises(ValueError, match="a batch needs a sensor whose"):
         make_batch("ekf", runs=1, landmarks=1, **NOISE, sensor="bearing")

@@ -160,13 +160,15 @@ def test_a_shift_of_landmarks_that_are_new_anyway_is_refused():
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_a_draw_is_that_of_its_formula_at_a_share_of_the_ranges(share):
-    ranges = {name: [0.4, 0.9] for name in (*FACTORS, *VALUES)}
-    scenario = BASE.with_changes(randomise=ranges, start={"std": [0.1, 0.2, 0.3]})
+    ranges = {name: [0.3, 0.9] for name in (*FACTORS, *VALUES)}
+    fixed = {"start": {"std": [0.1, 0.2, 0.3]}, "sensor": {"min_range": 0.1}}
+    scenario = BASE.with_changes(randomise=ranges, **fixed)
     drawn = scenario.at_share(share)
     for name, factor in FACTORS.items():
-        assert factor(drawn) == pytest.approx(0.4 * (0.9 / 0.4) ** share), name
+        assert factor(drawn) == pytest.approx(0.3 * 3.0**share), name
     for name, value in VALUES.items():
-        assert value(drawn) == pytest.approx(0.4 + 0.5 * share), name
+        assert value(drawn) == pytest.approx(0.3 + 0.6 * share), name
+        assert share < 1 or value(drawn) == 0.9, name  # not but for rounding
     unmoved = np.zeros((BASE.landmarks.count, 2))
     assert copied_draw(scenario, dict.fromkeys(RANGES, share), unmoved) == drawn
     assert (widest_scenario(scenario) == drawn) == (share == 1)
