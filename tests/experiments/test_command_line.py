@@ -248,29 +248,6 @@ def test_the_course_log_is_replayed_with_its_published_noise(
     assert first["mahalanobis"] == pytest.approx(0.05452, abs=1e-5)
 
 
-def test_options_reach_the_filter(log, without_pictures):
-    summary = answered(
-        "replay",
-        log,
-        *("--motion-std", ".2,.1,.05", "--measurement-std", "0.5,1"),
-        *("--initial-pose-std", "1,1,0", "--gate-probability", 0.99),
-        *("--range-std-per-metre", 0.1, "--noise-at-rest", "--landmark-init", "full"),
-        *("--option", "min_range=0.5"),
-    )
-    assert summary["settings"] == {
-        "motion_std": [0.2, 0.1, 0.05],
-        "measurement_std": [0.5, 1.0],
-        "initial_pose_std": [1.0, 1.0, 0.0],
-        "options": {
-            "gate_probability": 0.99,
-            "range_std_per_metre": 0.1,
-            "noise_at_rest": True,
-            "landmark_init": "full",
-            "min_range": 0.5,
-        },
-    }
-
-
 @pytest.mark.slow
 def test_the_pictures_of_single_steps_can_be_left_out(log, monkeypatch):
     monkeypatch.setattr(figures, "save_figure", lambda _, path, **__: path.touch())
@@ -797,24 +774,6 @@ def test_a_noise_study_draws_one_figure_and_tables_eleven_runs(log):
         assert saved["sigma"] == row["sigma"]
         assert float(saved["pose_area"]) == row["pose_area"]
         assert saved["ate"] == ""
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        ("--landmark-init", "independent", "--initial-pose-std", "1,1,1"),
-        ("--gate-probability", "0.5", "--motion-std", "0.3,0.1,0.05"),
-        ("--range-std-per-metre", "0.5", "--noise-at-rest"),
-    ],
-)
-@pytest.mark.usefixtures("without_pictures", "without_figure")
-def test_a_noise_study_begins_with_what_replay_reports(options, log):
-    reported = answered("replay", log, "-e", "ekf", *options)
-    plain = answered("replay", log, "-e", "ekf")
-    unchanged = answered("noise-study", log, "-e", "ekf", *options)["rows"][0]
-    assert unchanged["landmark_rmse"] == reported["landmark_rmse"]["raw"]
-    assert unchanged["nis_per_degree"] == reported["nis"]["per_degree"]
-    assert reported["nis"] != plain["nis"]
 
 
 def test_a_film_has_one_frame_per_step_and_one_of_the_start():

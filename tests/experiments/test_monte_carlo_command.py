@@ -97,19 +97,6 @@ def test_a_filter_of_ones_own_is_found_and_its_crash_told(here):
     assert "&lt;b&gt;a wheel" in page
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("_no_figures_in_reports")
-def test_filters_may_be_told_another_noise():
-    result = slamgym(
-        *("monte-carlo", "six_landmarks", "-e", "invariant", "--runs", 30, "--json"),
-        *("--assume", "motion.std=[0.025,0.01,0.01]", "--out", "out"),
-    )
-    assert result.exit_code == 0, result.stderr
-    (found,) = json.loads(result.stdout)["estimators"].values()
-    assert found["verdict"] == "not consistent"
-    assert found["pose_nees"]["invariant"]["mean"] > 5
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
