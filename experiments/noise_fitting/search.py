@@ -204,9 +204,7 @@ def _fixed_at_zero(found: _NoiseFit, entry: int) -> _NoiseFit:
 def _without_needless(smooth: LogLikelihood, found: _NoiseFit) -> _NoiseFit:
     """Fit again without the part of σr per metre, or of σβ in metres, if possible."""
     for entry, instead in NEEDLESS:
-        if not (found.free[entry] and (found.noise[[entry, instead]] > 0).all()):
-            continue
-        if _is_plain(found, entry):
+        if not found.free[entry] or _is_plain(found, entry):
             continue
         fewer = _fixed_at_zero(found, entry)
         away = _typical_range(smooth)
@@ -316,7 +314,7 @@ def positive_start(noise: Array, typical_range: float) -> Array:
     >>> positive_start(np.array([0.1, 0, 0.05, 0.02, 0.1, 0, 0]), 5.0)
     array([0.1  , 0.01 , 0.05 , 0.02 , 0.1  , 0.002, 0.   ])
     """
-    start, metres = noise.copy(), max(typical_range, 1e-3)
+    metres = max(typical_range, 1e-3)
     along, turning = noise[:2].max(), noise[2]
     range_std = max(noise[RANGE], noise[PER_METRE] * metres, 1e-3)
     bearing_std = max(noise[BEARING], noise[IN_METRES] / metres, 1e-3)
@@ -328,7 +326,7 @@ def positive_start(noise: Array, typical_range: float) -> Array:
         SMALL * range_std / metres,
         0.0,
     )
-    return np.where(start > 0, start, instead)
+    return np.where(noise > 0, noise, instead)
 
 
 MOST_LANDMARKS = 100  # of one map

@@ -130,7 +130,7 @@ def noise_fit_figure(fit: NoiseFit) -> Figure:
     if fit.suggested is not fit.fitted:
         stages.append(("suggested", fit.suggested))
     figure = new_figure(4.0 * len(stages), 5.2)
-    axes = figure.subplots(2, len(stages), sharex=True, sharey=True, squeeze=False)
+    axes = figure.subplots(2, len(stages), sharex=True, sharey=True)
     for column, (name, stage) in enumerate(stages):
         for row, what in enumerate(("bearing", "range")):
             _draw(axes[row, column], f"{what}, {name}", fit.reading_times, stage, row)

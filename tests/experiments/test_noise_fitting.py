@@ -12,6 +12,9 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
+from slamgym.estimator.filters.drive_likelihood import DriveEvents, DriveRecord
+from slamgym.estimator.kernels.scan_update import ADDED, GATED, SKIPPED, USED
+from slamgym.evaluation import autocorrelation, ljung_box, pose_nees
 from slamgym.experiments.command_line.tables import advice, noise_comparison_table
 from slamgym.experiments.job_folders import files_below
 from slamgym.experiments.logs import (
@@ -30,12 +33,20 @@ from slamgym.experiments.noise_fitting import (
     write_noise,
 )
 from slamgym.experiments.noise_fitting.fit import (
+    FACTORS,
+    Whiteness,
     _crossing,
+    _judged,
     above_zero,
     nees_bounds,
     positive_sum,
+    whiteness,
 )
-from slamgym.experiments.noise_fitting.intervals import Interval, profile_crossing
+from slamgym.experiments.noise_fitting.intervals import (
+    Interval,
+    intervals,
+    profile_crossing,
+)
 from slamgym.experiments.noise_fitting.scoring import (
     associated_log,
     curvature,
@@ -45,7 +56,11 @@ from slamgym.experiments.noise_fitting.scoring import (
     sample_of,
     stretches_of,
 )
-from slamgym.experiments.noise_fitting.search import LogLikelihood, noise_of
+from slamgym.experiments.noise_fitting.search import (
+    LogLikelihood,
+    noise_of,
+    positive_start,
+)
 from slamgym.experiments.noise_fitting.summary import options_line
 from slamgym.experiments.run_and_replay import replay, settings_for, summarise
 
@@ -148,7 +163,10 @@ def shown(table):
 
 def test_white_innovations_suggest_no_inflation(example):
     assert example.suggested is example.fitted
-    runs = summarise_fit(example)["runs"]
+    told = []
+    summary = summarise_fit(example, progress=lambda *numbers: told.append(numbers))
+    assert told == [(0, 3), (1, 3), (2, 3)]
+    runs = summary["runs"]
     assert runs["suggested"] is runs["fitted"]
 
 
@@ -160,6 +178,30 @@ def test_the_calibration_makes_the_nees_one_and_has_an_interval(example):
     calibrated = replace(settings, measurement_std=std)
     run = replay(example.log, calibrated.make(example.log.start))
     assert summarise(run, calibrated)["nees"]["per_degree"] == pytest.approx(1, abs=0.1)
+
+
+def test_the_calibration_is_where_the_nees_of_replays_crosses_its_bounds(example):
+    settings = example.fitted.settings
+
+    def excess(factor, bound):
+        """Return the log of the mean NEES per degree by a bound, of a replay."""
+        std = tuple(factor * np.array(settings.measurement_std))
+        options = settings.options | {"range_std_per_metre": 0.0}
+        noise = replace(settings, measurement_std=std, options=options)
+        trace = replay(example.log, noise.make(example.log.start)).trace
+        args = trace.true_poses, trace.poses, trace.pose_covariances
+        nees = pose_nees(*args, frame="invariant")
+        nees = nees[np.isfinite(nees)]
+        return np.log(nees.mean() / 3 / (1.0, *nees_bounds(nees)[::-1])[bound])
+
+    for bound, found in enumerate(example.calibration):
+        if np.isinf(found):
+            assert excess(FACTORS[-1], bound) > 0
+            continue
+        k = int(np.searchsorted(FACTORS, found))
+        ends = [excess(factor, bound) for factor in FACTORS[k - 1 : k + 1]]
+        between = np.interp(0.0, ends[::-1], np.log(FACTORS[k - 1 : k + 1])[::-1])
+        assert np.log(found) == pytest.approx(between, abs=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -234,6 +276,56 @@ def test_the_bounds_are_those_of_the_products_of_all_lags(count):
     degrees = max(3.0, 3 * count / together)
     expected = chi2.ppf([0.025, 0.975], degrees) / degrees
     assert nees_bounds(nees) == pytest.approx(expected)
+
+
+def test_whiteness_is_that_of_single_scans_and_of_single_landmarks():
+    rng, scans, seen = np.random.default_rng(6), 90, 3
+    errors = lfilter([1.0], [1.0, -0.6], rng.standard_normal((scans, seen, 2)), axis=0)
+    errors[..., 1] += 3 * lfilter([1], [1, -0.9], rng.standard_normal((scans, 1)), 0)
+    outcomes = np.where(rng.random((scans, seen)) < 0.8, USED, SKIPPED)
+    outcomes[7], outcomes[8] = ADDED, GATED  # of these scans no reading is used
+    is_used = outcomes == USED
+    first = np.arange(0, scans * seen + 1, seen)
+    drive = DriveEvents(None, None, None, np.tile(range(seen), scans), first)
+    innovations = np.where(is_used[..., None], errors, 99.0).reshape(1, -1, 2)
+    record = DriveRecord(
+        *(None, None, is_used.sum(axis=1)[None], None, None, None),
+        *(innovations, outcomes.reshape(1, -1)),
+    )
+    shared = is_used.sum() / is_used.any(axis=1).sum()
+    for axis, found in enumerate(whiteness(drive, record)):
+        of_scans = [
+            errors[t, is_used[t], axis].sum() / np.sqrt(is_used[t].sum())
+            for t in range(scans)
+            if is_used[t].any()
+        ]
+        of_each = [errors[is_used[:, k], k, axis] for k in range(seen)]
+        series = np.full((seen, max(map(len, of_each))), np.nan)
+        for k, values in enumerate(of_each):
+            series[k, : len(values)] = values
+        p_values, factors = [], []
+        for each, together in ((np.array([of_scans]), 1.0), (series, shared)):
+            statistic = ljung_box(each, lags=10).statistic / together
+            p_values.append(chi2.sf(statistic, 10))
+            lags = autocorrelation(each, lags=min(50, each.shape[1] // 2))[0]
+            factors.append(np.sqrt(1 + 2 * positive_sum(lags)))
+        assert found.p_value == pytest.approx(2 * min(p_values))
+        assert found.first == pytest.approx(lags[0])
+        assert found.inflation == pytest.approx(np.sqrt(np.prod(factors)))
+    nothing = record._replace(
+        used=0 * record.used, outcomes=0 * record.outcomes + ADDED
+    )
+    for found in whiteness(drive, nothing):
+        assert np.isnan(found[:2]).all()
+        assert found.inflation == 1
+
+
+@pytest.mark.parametrize(
+    ("shape", "is_tested"), [((2, 19), False), ((1, 39), False), ((2, 20), True)]
+)
+def test_few_innovations_are_not_tested(shape, is_tested):
+    series = np.random.default_rng(1).standard_normal(shape)
+    assert np.isfinite(_judged(series).p_value) == is_tested
 
 
 @pytest.mark.slow
@@ -322,18 +414,27 @@ def test_at_rest_without_noise_at_rest_the_motion_noise_is_unknown():
 def test_a_noise_that_the_readings_do_not_determine_keeps_its_value(monkeypatch):
     unknown = Interval("unknown", 0.0, np.inf)
     monkeypatch.setattr(search, "intervals", lambda _, at, *__: [unknown] * len(at))
-    noise = fitted(a_log(steps=30)).noise[:5]
-    assert [each.value for each in noise] == [0.2, 0.2, 0.2, 0.1, 0.3]
+    inflated = Whiteness(0.0, 0.5, 2.0), Whiteness(0.0, 0.5, 3.0)
+    monkeypatch.setattr(f"{fit_noise.__module__}.whiteness", lambda *_: inflated)
+    options = {"range_std_per_metre": 0.01, "bearing_std_metres": 0.02}
+    found = fitted(a_log(steps=30), options=options)
+    assert [each.value for each in found.noise[:5]] == [0.2, 0.2, 0.2, 0.1, 0.3]
+    ends = noise_of(found.fitted.settings) * (1, 1, 1, 2, 3, 3, 2)
+    np.testing.assert_allclose(noise_of(found.suggested.settings), ends)
 
 
 def test_scoring_finds_the_spread_of_normal_numbers_and_its_interval():
     x = np.random.default_rng(2).normal(0, 3.0, 4000)
 
+    tried = []
+
     def likelihoods(sigmas):
+        tried.append(len(sigmas))
         return -0.5 * (x / sigmas) ** 2 - np.log(sigmas)
 
     best = maximise(likelihoods, np.array([[0.1], [50.0]]))
     assert best.converged
+    assert best.passes == sum(tried)
     assert best.parameters[0] == pytest.approx(np.sqrt(np.mean(x**2)), rel=1e-3)
     bent = curvature(likelihoods, np.log(best.parameters), np.array([0.05]))
     assert bent[0, 0] == pytest.approx(2 * len(x), rel=0.01)
@@ -360,7 +461,14 @@ def two_spreads(parameters):
 
 
 def test_a_search_that_begins_near_zero_does_not_stay_there():
-    near = maximise(two_spreads, np.array([[1.0, 1e-5]]))
+    tried = []
+
+    def counted(parameters):
+        tried.append(len(parameters))
+        return two_spreads(parameters)
+
+    near = maximise(counted, np.array([[1.0, 1e-5]]))
+    assert near.passes == sum(tried)
     far = maximise(two_spreads, np.array([[1.0, 1.0]]))
     assert far.parameters[1] > 0.5
     np.testing.assert_allclose(near.parameters, far.parameters, rtol=0.01)
@@ -381,6 +489,26 @@ def test_the_profile_is_that_of_fitting_the_other_parameter_anew(start):
     expected = brentq(profile, *((1e-3, top) if start < top else (top, 5.0)))
     found = profile_crossing(two_spreads, best.parameters, 1, start, level)
     assert found == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("bend", "at", "expected"),
+    [
+        (1.0, 1.0, ("zero", 0.0, 1 + 1.92**0.5)),
+        (1.6, 1.0, ("fitted", 0.0, 1 + 1.2**0.5)),  # zero is beyond 90 %, not 95 %
+        (3.0, 1.0, ("fitted", 1 - 0.64**0.5, 1 + 0.64**0.5)),
+        (3.0, 0.0, ("zero", 0.0, 0.64**0.5)),
+        (0.0, 1.0, ("unknown", 0.0, np.inf)),
+    ],
+)
+def test_intervals_end_where_the_likelihood_has_fallen(bend, at, expected):
+    def likelihoods(parameters):
+        return -bend / 40 * (parameters - at) ** 2 + np.zeros(40)
+
+    information = np.full((1, 1), 2 * bend) if at else np.empty((0, 0))
+    (found,) = intervals(likelihoods, np.array([at]), 0.0, information)
+    assert found.verdict == expected[0]
+    assert found[1:] == pytest.approx(expected[1:], rel=2e-3)
 
 
 def test_the_end_is_found_where_other_parameters_must_move_far_together():
@@ -540,7 +668,7 @@ def test_a_drive_past_few_landmarks_is_one_part():
     assert parts_of(events, stretches_of(events, 6)) == (events,)
 
 
-def test_a_sample_is_evenly_spread_parts_of_a_drive():
+def test_a_sample_is_evenly_spread_parts_of_a_drive(monkeypatch):
     log = a_log(steps=60)
     settings, events = settings_for(log, estimator="invariant"), events_of(log).events
     stretches = stretches_of(events, 4)
@@ -557,8 +685,30 @@ def test_a_sample_is_evenly_spread_parts_of_a_drive():
     assert len(kept.parts[0].readings) == len(parts[0].readings) - 1
     whole = LogLikelihood(slam, events)
     assert whole.sample(len(events.readings)) is whole
-    few = replace(whole, most_landmarks=4)
-    assert few.sample(10) is few  # one stretch holds all landmarks of this world
+    assert whole.sample(10) is whole  # one stretch holds all landmarks of this world
+    monkeypatch.setattr(search, "SAMPLED_LANDMARKS", 4)
+    again = whole.sample(len(events.readings) // 3 + 1)
+    np.testing.assert_array_equal(again.of(noise), likelihood.of(noise))
+
+
+def test_a_stretch_ends_before_the_step_with_one_landmark_too_many():
+    seen = [[0, 1], [1, 2], [3], [4, 0], [], [5], [6, 7, 8, 9], [6]]
+    first = np.cumsum([0, *map(len, seen)])
+    drive = DriveEvents(None, None, None, np.concatenate(seen).astype(int), first)
+    assert stretches_of(drive, 3) == [(0, 2), (2, 5), (5, 6), (6, 7), (7, 8)]
+
+
+@pytest.mark.parametrize(
+    ("noise", "start"),
+    [
+        ((0, 0, 0, 0, 0, 0, 0), (0.01, 0.01, 0.001, 1e-4, 1e-4, 2e-5, 0)),
+        ((0, 0, 0.3, 0, 0, 0.02, 0.5), (0.01, 0.01, 0.3, 0.01, 0.01, 0.02, 0.5)),
+        ((0.1, 0.2, 0, 0.4, 0.5, 0, 0), (0.1, 0.2, 0.02, 0.4, 0.5, 0.01, 0)),
+    ],
+)
+def test_a_search_begins_at_a_share_of_the_noise_beside_a_zero(noise, start):
+    found = positive_start(np.array(noise, dtype=float), 5.0)
+    assert found.tolist() == pytest.approx(start)
 
 
 def test_the_associations_of_a_filter_become_identities_of_the_log():
@@ -645,6 +795,38 @@ def test_exact_readings_are_refused():
         fitted(SlamLog("exact", events=exact))
 
 
+def test_a_search_begins_at_the_most_likely_multiple_and_refuses_to_end_on_its_way(
+    monkeypatch,
+):
+    log = a_log(steps=20)
+    settings = settings_for(log, estimator="invariant")
+    likelihood = LogLikelihood(settings.make(log.start), events_of(log).events)
+    start = search._coarse_start(likelihood, noise_of(settings))
+    tried = start.noise * np.repeat([(0.25, 1), (4, 1), (1, 0.25), (1, 4)], (3, 4), 1)
+    most, *others = likelihood.of(np.vstack([start.noise, tried])).sum(axis=1)
+    assert start.likelihood == pytest.approx(most)
+    assert most > max(others)
+
+    def unfinished(*arguments, **named):
+        return maximise(*arguments, **named)._replace(converged=False)
+
+    before = start.noise.copy()
+    fit = search._fit(likelihood, start)
+    np.testing.assert_array_equal(start.noise, before)
+    search._refuse_diverged(fit._replace(noise=np.full(7, 499.0)))
+    with pytest.raises(np.linalg.LinAlgError, match=f"{fit.passes} pas.*metres 501"):
+        search._refuse_diverged(fit._replace(noise=np.full(7, 501.0)))
+    search._refuse_most(np.array([True, False]))  # one half
+    with pytest.raises(np.linalg.LinAlgError, match="2 of 3 readings"):
+        search._refuse_most(np.array([True, False, True]))
+    monkeypatch.setattr(search, "ROUNDS", 1)
+    monkeypatch.setattr(search.scoring, "maximise", unfinished)
+    with pytest.raises(
+        np.linalg.LinAlgError, match=r"after \d+ passes it is at σx 0\.\d"
+    ):
+        fitted(log)
+
+
 def test_a_filter_off_the_kernels_is_refused():
     log = a_log(steps=5)
     with pytest.raises(ValueError, match="runs in batches"):
@@ -676,8 +858,10 @@ def test_writing_keeps_line_ends_and_byte_order_mark(tmp_path):
     path.write_bytes(text.encode())
     log = read_slamlog(path)
     noise = {"motion_std": (0.1, 0.2, 0.3), "measurement_std": (0.01, 0.02)}
-    write_noise(path, settings_for(log, **noise))
+    options = {"range_std_per_metre": 0.03, "bearing_std_metres": 0.04}
+    write_noise(path, settings_for(log, **noise, options=options))
     header = "\ufeff# format: slamlog 1\r\n# measurement_std: 0.01,0.02\r\n"
+    header += "# range_std_per_metre: 0.03\r\n# bearing_std_metres: 0.04\r\n"
     rest = "# motion_std: 0.1,0.2,0.3\r\nodometry,1,1,0,1\r\n"
     assert path.read_bytes().decode() == header + rest
 
