@@ -61,13 +61,8 @@ def progress_bar(
         redirect_stdout=_is_terminal(sys.stdout),  # what goes to a file stays there
     ) as bar:
         task = bar.add_task(doing, total=None)
-        is_begun = False
 
-        def update(done: int, total: int) -> None:
-            nonlocal is_begun
-            if not is_begun:
-                bar.reset(task, completed=done, total=total)
-            is_begun = True
+        def update(done: int, total: int) -> None:  # the first counts for no speed
             bar.update(task, completed=done, total=total)
 
         yield _now_and_then(update)

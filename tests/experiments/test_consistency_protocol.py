@@ -7,7 +7,7 @@ import pytest
 from commands import slamgym
 
 from slamgym.experiments import consistency_protocol as protocol
-from slamgym.experiments.monte_carlo_study import monte_carlo
+from slamgym.experiments.monte_carlo_study import monte_carlo, summarise_monte_carlo
 
 
 @pytest.fixture
@@ -38,35 +38,143 @@ def test_a_score_is_the_mean_distance_from_ratio_1():
 
 
 @pytest.mark.slow
-def test_scores_are_written_verified_and_refused_with_another_digest(small):
-    done = slamgym("benchmark", "-e", "ekf,invariant", "--out", small, "--json")
+def test_written_scores_are_verified(small):
+    assert slamgym("benchmark", "-e", "ekf,invariant", "--out", small).exit_code == 0
     found = json.loads(small.read_text())
-    assert json.loads(done.stdout) == found
     assert found["scores"].keys() == found["microseconds"].keys()
     row = found["worlds"]["anchored"]["invariant"]
     results = monte_carlo("anchored", "invariant", 3, protocol.SEED)
-    assert row["pose"] == pytest.approx(
-        float(results.pose_nees_invariant[..., 1:].mean()) / 3
-    )
+    mean = float(results.pose_nees_invariant[..., 1:].mean()) / 3
+    assert row["pose"] == pytest.approx(mean)
     result = slamgym("benchmark", "--verify", small)
     assert (result.exit_code, result.stdout[:9]) == (0, "Same bits")
-    result = slamgym("benchmark", "--out", small)
-    assert (result.exit_code, "which exists" in result.stderr) == (2, True)
-
-    row["digest"] = "0"
-    small.write_text(json.dumps(found))
-    result = slamgym("benchmark", "--verify", small)
-    assert result.exit_code == 1
-    assert result.stdout.startswith("Other bits: invariant in anchored")
 
 
-def test_a_folder_that_does_not_exist_is_refused_before_the_runs(tmp_path):
-    result = slamgym("benchmark", "--out", tmp_path / "none" / "scores.json")
-    assert result.exit_code == 2
-    assert "--out: the folder of" in result.stderr
+def test_a_world_is_measured_by_the_summary_of_its_runs():
+    found = protocol.run_world("unknown_heading", "ekf,invariant", 2)
+    results = monte_carlo("unknown_heading", "ekf,invariant", 2, 1_000_000)
+    for label, entry in summarise_monte_carlo(results)["estimators"].items():
+        nees = results.sel(estimator=label).pose_nees_invariant[:, 1:].mean() / 3
+        assert found[label] == {
+            "digest": protocol.digest(results.sel(estimator=label)),
+            "verdict": entry["verdict"],
+            "pose": pytest.approx(float(nees)),
+            "map": entry["nees_end"]["relative_map"],
+            "efficiency": entry["efficiency"]["pose"]["value"],
+            "failed_runs": [],
+        }
 
 
-@pytest.mark.parametrize("text", ["", "{}", "[]", '{"protocol": "consistency-1"}'])
+def test_the_protocol_runs_five_worlds_and_times_a_step(monkeypatch):
+    made, told, clock = [], [], iter([1.0, 4.0, 10.0, 12.0])
+
+    def run_world(*asked):
+        made.append(asked)
+        row = {"pose": len(made), "map": 1.0, "efficiency": None}
+        return {"ekf": row, "invariant": row | {"map": 2.0}}
+
+    def filter_runs(settings, runs, threads):
+        made.append((settings.estimator, len(runs.true_poses), threads))
+
+    monkeypatch.setattr(protocol, "run_world", run_world)
+    monkeypatch.setattr(protocol, "filter_runs", filter_runs)
+    monkeypatch.setattr(protocol.time, "process_time", lambda: next(clock))
+    found = protocol.score_filters("ekf,invariant", 7, lambda *n: told.append(n))
+    names = ["anchored", "six_landmarks", "unknown_heading", "corridor", "loop"]
+    assert made[:5] == [(name, "ekf,invariant", 7) for name in names]
+    assert made[5:] == [("ekf", 5, 1)] * 2 + [("invariant", 5, 1)] * 2
+    assert told == [(done, 5) for done in range(6)]
+    assert list(found["worlds"]) == names
+    of_pose = np.log([1, 2, 3, 4, 5]).mean()
+    for label, of_map in (("ekf", 0.0), ("invariant", np.log(2))):
+        scores = {"pose": of_pose, "map": of_map, "efficiency": None}
+        assert found["scores"][label] == pytest.approx(scores)
+    times = {"ekf": 3e6 / (5 * 1005), "invariant": 2e6 / (5 * 1005)}
+    assert found["microseconds"] == pytest.approx(times)
+    kept = {key: found[key] for key in ("protocol", "estimators", "runs", "seed")}
+    assert list(kept.values()) == ["consistency-1", "ekf,invariant", 7, 1_000_000]
+
+
+FOUND = {
+    "scores": {"ekf": {"pose": 0.51234, "map": None, "efficiency": 0.25}},
+    "microseconds": {"ekf": 12.345},
+}
+
+
+def test_the_command_prints_and_writes_scores(here, monkeypatch):
+    monkeypatch.setattr(protocol, "score_filters", lambda names, progress: FOUND)
+    lines = slamgym("benchmark", "-e", "ekf", "--out", "new.json").stdout.splitlines()
+    heading, row, *_, last = (line.split() for line in lines)
+    assert heading == ["filter", "pose", "map", "efficiency", "µs", "a", "step"]
+    assert row == ["ekf", "0.512", "–", "0.25", "12.3"]
+    assert last == ["Wrote", "new.json"]
+    assert json.loads((here / "new.json").read_text()) == FOUND
+    assert json.loads(slamgym("benchmark", "--json").stdout) == FOUND
+    monkeypatch.setattr(protocol, "score_filters", None)
+    for out, message in (
+        ("new.json", "a new .json file, got new.json, which exists"),
+        ("new.txt", "a new .json file, got new.txt"),
+        ("none/new.json", "--out: the folder of none/new.json does not exist"),
+    ):
+        result = slamgym("benchmark", "--out", out)
+        assert (result.exit_code, result.stderr.strip()[-len(message) :]) == (
+            2,
+            message,
+        )
+    assert "did you mean 'ekf'" in slamgym("benchmark", "-e", "ekv").stderr
+
+
+ROWS = {"ekf": {"digest": "1"}, "invariant": {"digest": "2"}}
+STORED = {
+    **{"protocol": protocol.PROTOCOL, "seed": protocol.SEED, "runs": 3},
+    **{"estimators": "ekf,invariant", "worlds": dict.fromkeys(protocol.VERIFIED, ROWS)},
+}
+
+
+@pytest.mark.parametrize(
+    ("ours", "changed"),
+    [
+        (ROWS, []),
+        (ROWS | {"ekf": {"digest": "2"}}, ["ekf in six_landmarks"]),
+        ({"ekf": {"digest": "1"}}, ["invariant in six_landmarks"]),
+    ],
+)
+def test_other_bits_are_named_with_their_filter_and_world(
+    ours, changed, here, monkeypatch
+):
+    worlds = {"anchored": ROWS, "six_landmarks": ours}
+    monkeypatch.setattr(
+        protocol,
+        "run_world",
+        lambda name, *asked: asked == ("ekf,invariant", 3) and worlds[name],
+    )
+    told = []
+    assert protocol.differences(STORED, lambda *n: told.append(n)) == changed
+    assert told == [(0, 2), (1, 2), (2, 2)]
+    (here / "scores.json").write_text(json.dumps(STORED))
+    result = slamgym("benchmark", "--verify", "scores.json")
+    text = f"Other bits: {changed[0]}" if changed else "Same bits"
+    assert result.stdout == f"{text} in anchored and six_landmarks: ekf,invariant\n"
+    assert result.exit_code == bool(changed)
+    result = slamgym("benchmark", "--verify", "scores.json", "--json")
+    assert json.loads(result.stdout) == {"same": not changed, "changed": changed}
+
+
+def test_a_file_to_verify_names_known_filters(here):
+    (here / "scores.json").write_text(json.dumps(STORED | {"estimators": "ekv"}))
+    result = slamgym("benchmark", "--verify", "scores.json")
+    assert "did you mean 'ekf'" in result.stderr
+
+
+WRONG = [
+    *({"protocol": "consistency-2"}, {"seed": 0}, {"estimators": 3}, {"runs": 3.0}),
+    *({"runs": 0}, {"runs": 101}, {"worlds": {"anchored": ROWS}}),
+    {"worlds": {name: {"ekf": {}} for name in protocol.VERIFIED}},
+]
+OTHER_FILES = ["", "[]", "{}", *(json.dumps(STORED | wrong) for wrong in WRONG)]
+
+
+@pytest.mark.parametrize("text", OTHER_FILES)
 def test_another_file_is_refused_in_one_sentence(text, tmp_path):
     path = tmp_path / "other.json"
     path.write_text(text)

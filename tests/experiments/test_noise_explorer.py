@@ -1,10 +1,12 @@
 """The page with sliders for the noise: its numbers, its size, and in Chromium."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numpy.linalg import eigvalsh
+from scipy.stats import chi2
 
 from slamgym.envs.controllers import make_controller
 from slamgym.experiments import monte_carlo, noise_explorer, summarise_monte_carlo
@@ -13,7 +15,10 @@ from slamgym.experiments.command_line.commands import BadInputError
 from slamgym.experiments.logs.recording import record_episode
 from slamgym.experiments.noise_explorer import explore_noise, write_explorer
 from slamgym.experiments.run_and_replay import replay
-from slamgym.experiments.run_and_replay.filter_settings import settings_for_scenario
+from slamgym.experiments.run_and_replay.filter_settings import (
+    estimator_choices,
+    settings_for_scenario,
+)
 from slamgym.sim_configs import load_scenario
 
 WORLD = load_scenario("six_landmarks")
@@ -35,7 +40,15 @@ def test_a_cell_holds_what_monte_carlo_finds(change, actual, assumed, monkeypatc
         change=change,
         progress=lambda *numbers: told.append(numbers),
     )
-    assert told[-1] == (80, 80)
+    assert told == [(8 * done, 80) for done in range(1, 11)]
+    head = {key: facts[key] for key in list(facts)[:11] if key != "typical"}
+    assert head == {
+        **{"world": "six_landmarks", "runs": 8, "steps": WORLD.steps, "change": change},
+        **{"factors": (0.5, 1.0, 2.0), "units": ("rad", "m")},
+        **{"motion": WORLD.motion.std, "measurement": WORLD.sensor.std},
+        **{"filters": ["ekf", "invariant"]},
+        "band": (chi2.ppf([0.025, 0.975], 24) / 24).round(4).tolist(),
+    }
     results = monte_carlo(actual, "ekf,invariant", 8, 5, assumed=assumed)
     expected = summarise_monte_carlo(results)["estimators"]
     cell = facts["cells"][2]  # measurement × 0.5, motion × 2
@@ -108,9 +121,34 @@ def test_a_filter_that_fails_with_some_noise_is_drawn_with_the_other(
 
 def test_angles_of_ellipses_are_those_of_their_longer_axis():
     frame = noise_explorer._MapCodes(np.zeros(2), 100.0, np.zeros((0, 2)))
-    turned = np.array([[5.0, 4.0], [4.0, 5.0]])  # σ 3 along 45°, 1 across
-    x, y, long, short, angle = frame.ellipses(np.array([[10.0, 20.0]]), turned[None])
-    assert (x, y, long, short, angle) == (200, 400, 180, 60, 45)
+    for degrees in (0, 30, 100, 179):
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        along = np.array([[c, -s], [s, c]])
+        covariance = along @ np.diag([9.0, 1.0]) @ along.T
+        found = frame.ellipses(np.array([[10.0, 20.0]]), covariance[None])
+        assert found == [200, 400, 180, 60, degrees]
+
+
+@pytest.mark.parametrize(("true_x", "low", "size"), [(-10.0, -10, 26), (None, 0, 13)])
+def test_the_map_shows_truth_estimate_and_landmarks_with_a_margin(true_x, low, size):
+    true_poses = None if true_x is None else np.array([[true_x, 1.0, 9.0]])
+    trace = SimpleNamespace(poses=np.array([[0.0, 0.0, 9.0]]), true_poses=true_poses)
+    frame = noise_explorer._MapCodes.around(trace, np.array([[10.0, 4.0]]))
+    corners = np.array([[low, 0.0], [10.0, 4.0]])
+    middle = corners.mean(axis=0)
+    expected = 1000 + (corners - middle) / size * 2000
+    assert frame.codes(corners) == expected.round().ravel().tolist()
+
+
+@pytest.mark.parametrize("names", ["ekf", "ekf,invariant", "ekf,invariant,iterated"])
+def test_the_numbers_of_a_page_are_shared_out(names):
+    choices = estimator_choices(names)
+    study = noise_explorer._Exploration(WORLD, names, choices, 2, 0, "filter")
+    curve, path, poses, marks = study._counts()
+    each = len(choices) * (curve + 2 * path + 5 * poses + 5 * marks) + 2 * path
+    assert 27_000 < 49 * each <= 30_000
+    factors = np.array(noise_explorer.FACTORS)
+    np.testing.assert_allclose(factors * factors[::-1], 1.0)
 
 
 def test_the_command_replaces_only_its_own_pages(tmp_path, monkeypatch, capsys):

@@ -1,5 +1,6 @@
 """Every option of a command reaches the function that does its work."""
 
+import contextlib
 import inspect
 from importlib import import_module
 from pathlib import Path
@@ -8,6 +9,7 @@ from types import GeneratorType, MethodType
 import pytest
 from commands import slamgym
 
+from slamgym.experiments.command_line import commands
 from slamgym.experiments.command_line.options import Options
 from slamgym.experiments.logs.slamlog import SlamLog
 from slamgym.experiments.run_and_replay.filter_settings import FilterSettings
@@ -53,47 +55,48 @@ replay little.csv -e ekf NOISE --landmark-init independent --gate-probability 0.
 smooth little.csv
   → experiments.run_and_replay.smooth_log log=little
     settings=SmoothingSlam/0.1,0.1,0.05/0.02,0.1/0,0,0[noise_at_rest=False
-    follow=invariant] associate=False
+    follow=invariant] associate=False progress=filtering repairing=filtering
 
 smooth little.csv -e ekf NOISE --robust huber --associate --gate-probability 0.9
   --option iterations=2
   → experiments.run_and_replay.smooth_log log=little
     settings=SmoothingSlam/0.1,0.2,0.3/0.4,0.5/0.6,0.7,0.8[noise_at_rest=True
     robust=huber gate_probability=0.9 range_std_per_metre=0.01 iterations=2 follow=ekf]
-    associate=True
+    associate=True progress=filtering repairing=filtering
 
 fit-noise little.csv
   → experiments.noise_fitting.fit_noise log=little
-    settings=invariant/0.1,0.1,0.05/0.02,0.1/0,0,0[noise_at_rest=False]
+    settings=invariant/0.1,0.1,0.05/0.02,0.1/0,0,0[noise_at_rest=False] progress=fitting
 
 fit-noise little.csv -e ekf NOISE --option min_range=2 --hide-identities
   → experiments.noise_fitting.fit_noise log=little/hidden
     settings=ekf/0.1,0.2,0.3/0.4,0.5/0.6,0.7,0.8[noise_at_rest=True management=True
-    range_std_per_metre=0.01 min_range=2]
+    range_std_per_metre=0.01 min_range=2] progress=fitting
 
 monte-carlo loop
   → experiments.monte_carlo_study.monte_carlo scenario=loop/1005/1
     estimators=ekf,invariant runs=200 seed=0 until=None assumed=loop/1005/1
     out=results/monte-carlo-loop jobs=None backend=None block_size=64 first_run=0
-    fresh=False resolution=0 small_noise=True
+    fresh=False resolution=0 progress=running-runs
 
 monte-carlo loop -e ekf --runs 9 --until decided --seed 5 --steps 7 --set dt=0.5
   --assume dt=0.25 --resolution 0.5 --jobs 2 --backend loky --block-size 3 --first-run 6
   --fresh --out mine
   → experiments.monte_carlo_study.monte_carlo scenario=loop/7/0.5 estimators=ekf runs=9
     seed=5 until=decided assumed=loop/7/0.25 out=mine jobs=2 backend=loky block_size=3
-    first_run=6 fresh=True resolution=0.5 small_noise=True
+    first_run=6 fresh=True resolution=0.5 progress=running-runs
 
 generate loop --episodes 3
   → experiments.trajectories.generate_trajectories scenario=loop/1005/1
     out=results/loop-waypoints-npz episodes=3 controller=waypoints seed=0 format=npz
     episodes_per_shard=None smallest_std=None estimator=None jobs=None backend=None
+    progress=driving-steps
 
 generate loop --episodes 3 --controller random --seed 5 --format g2o --shard 7
   --smallest-std .01 -e ekf --jobs 2 --backend loky --steps 9 --set dt=0.5 --out mine
   → experiments.trajectories.generate_trajectories scenario=loop/9/0.5 out=mine
     episodes=3 controller=random seed=5 format=g2o episodes_per_shard=7
-    smallest_std=0.01 estimator=ekf jobs=2 backend=loky
+    smallest_std=0.01 estimator=ekf jobs=2 backend=loky progress=driving-steps
 
 judge little.csv
   → experiments.judging.judge estimates=little.csv drives=None truth=None
@@ -113,68 +116,83 @@ judge a b --truth c --space right,rotation-first
 
 benchmark
   → experiments.consistency_protocol.score_filters estimators=ekf,invariant
+    progress=running-worlds
 
 benchmark -e ekf
   → experiments.consistency_protocol.score_filters estimators=ekf
+    progress=running-worlds
 
 noise-study little.csv
   → experiments.noise_study.study_log log=little
     settings=invariant/0.1,0.1,0.05/0.02,0.1/0,0,0[noise_at_rest=False]
+    progress=filtering
 
 noise-study little.csv -e ekf NOISE --landmark-init independent --gate-probability 0.9
   --option min_range=2 --hide-identities
   → experiments.noise_study.study_log log=little/hidden
     settings=ekf/0.1,0.2,0.3/0.4,0.5/0.6,0.7,0.8[noise_at_rest=True management=True
     landmark_init=independent gate_probability=0.9 range_std_per_metre=0.01 min_range=2]
+    progress=filtering
 
 noise-study loop
   → experiments.noise_study.study_scenario scenario=loop/1005/1
-    record=0/open_loop/None/0 estimator=invariant options=
+    record=0/open_loop/None/0 estimator=invariant options= progress=filtering
 
 noise-study loop -e ekf --option min_range=2 --gate-probability .9 --seed 5 --steps 9
   --controller random --set dt=0.5
   → experiments.noise_study.study_scenario scenario=loop/9/0.5 record=5/random/None/0
-    estimator=ekf options=gate_probability=0.9 min_range=2
+    estimator=ekf options=gate_probability=0.9 min_range=2 progress=filtering
 
 noise-study loop --runs 3
   → experiments.noise_study.noise_effects scenario=loop/1005/1 estimators=invariant
-    runs=3 seed=0 changed=both,world,filter jobs=None
+    runs=3 seed=0 changed=both,world,filter jobs=None progress=running-runs
 
 noise-study loop --runs 3 -e ekf,invariant[min_range=1] --option min_range=2
   --landmark-init independent --seed 5 --steps 9 --set dt=0.5 --change world --jobs 2
   → experiments.noise_study.noise_effects scenario=loop/9/0.5
     estimators=ekf[landmark_init="independent",min_range=2],invariant[min_range=1,landmark_init="independent"]
-    runs=3 seed=5 changed=world jobs=2
+    runs=3 seed=5 changed=world jobs=2 progress=running-runs
 
 explore loop
   → experiments.noise_explorer.explore_noise scenario=loop/1005/1
-    estimators=ekf,invariant runs=100 seed=0 change=filter
+    estimators=ekf,invariant runs=100 seed=0 change=filter progress=running-runs
 
 explore loop -e ekf --runs 9 --seed 5 --steps 7 --set dt=0.5 --change both
   → experiments.noise_explorer.explore_noise scenario=loop/7/0.5 estimators=ekf runs=9
-    seed=5 change=both
+    seed=5 change=both progress=running-runs
 
 render loop --out film.gif
   → envs.rendering.write_video frames=scenario=loop/1005/1
     settings=invariant/0.00884,0,0.0354/0.0349,0.1/0.0001,0.0001,0.0001 driver=OpenLoop
-    seed=0 path=film.gif fps=30
+    seed=0 tick=filming path=film.gif fps=30
 
 render loop --out film.gif --steps 120 -e none
   → envs.rendering.write_video frames=scenario=loop/120/1 settings=None driver=OpenLoop
-    seed=0 path=film.gif fps=10
+    seed=0 tick=filming path=film.gif fps=10
 
 render loop --out film.gif -e ekf --option min_range=2 --seed 5 --steps 9 --controller
   random --set dt=0.5 --fps 3
   → envs.rendering.write_video frames=scenario=loop/9/0.5
     settings=ekf/0.00884,0,0.0354/0.0349,0.1/0.0001,0.0001,0.0001[min_range=2]
-    driver=RandomWalk seed=5 path=film.gif fps=3
+    driver=RandomWalk seed=5 tick=filming path=film.gif fps=3
 """
 REACHED = {
     command.replace("NOISE", NOISE): each.split(" ", 1)
     for block in COMMANDS.strip().split("\n\n")
     for command, each in [" ".join(block.split()).split(" → ")]
 }
-UNCOMPARED = ("progress", "repairing", "command", "folder", "reporter", "tick")
+UNCOMPARED = ("command", "folder", "reporter", "small_noise")
+
+
+class Bar(contextlib.nullcontext):
+    """A progress bar that shows nothing."""
+
+    def __init__(self, doing, unit, console):
+        super().__init__(self)
+        self.texts = doing, unit
+
+    def __call__(self, done, of):
+        pass
 
 
 @pytest.mark.parametrize("command", REACHED)
@@ -187,10 +205,16 @@ def test_every_option_reaches_the_work(command, monkeypatch, here):
         given.append(inspect.signature(work).bind(*arguments, **named).arguments)
         raise ValueError("that is enough")
 
+    monkeypatch.setattr(commands, "progress_bar", Bar)
     monkeypatch.setattr(f"{module}.{name}", listen)
     (here / "little.csv").write_text(LOG)
     assert slamgym(*command.split()).stderr.endswith("slamgym: that is enough\n")
     assert words(compared(given[-1])) == expected
+    if " -" not in command:  # what Python assumes, too
+        parameters = compared(inspect.signature(work).parameters)
+        usual = {name: each.default for name, each in parameters.items()}
+        plain = {k: v for k, v in usual.items() if type(v) in (str, int, float)}
+        assert plain == {name: given[-1].get(name, plain[name]) for name in plain}
 
 
 def words(value):
@@ -222,6 +246,7 @@ WORDS = {
     dict: lambda found: " ".join(f"{k}={words(v)}" for k, v in found.items()),
     list | tuple: lambda found: ",".join(map(words, found)),
     float: "{:.3g}".format,
+    Bar: lambda bar: "-".join(filter(None, bar.texts)),
     Scenario: lambda world: f"{world.name}/{world.steps}/{world.dt:g}",
     SlamLog: lambda log: log.name + "/hidden" * ("identities" in log.header),
     FilterSettings: of_settings,

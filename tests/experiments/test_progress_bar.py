@@ -10,7 +10,6 @@ import pytest
 
 from slamgym.experiments import monte_carlo, noise_effects, progress_bar
 from slamgym.experiments.command_line import commands
-from slamgym.experiments.command_line.app import main
 
 
 class Terminal(io.StringIO):
@@ -27,12 +26,19 @@ def terminal(monkeypatch, between=0.0):
     return screen
 
 
-def test_the_bar_of_a_command_shows_speed_on_a_terminal(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("unit", "shown"),
+    [("steps", r"driving +\S+ 3/4 \d+ steps/s \S+"), ("", r"driving +\S+ 3/4")],
+)
+def test_the_bar_of_a_command_shows_the_speed_in_its_unit(unit, shown, monkeypatch):
     screen = terminal(monkeypatch)
-    given = ["six_landmarks", "--episodes", "200", "--out", str(tmp_path), "--json"]
-    main(["generate", *given], standalone_mode=False)
-    assert "driving" in screen.getvalue()
-    assert "steps/s" in screen.getvalue()
+    with commands.Reporter(as_json=True).progress("driving", unit) as tick:
+        for done in range(4):
+            tick(done, 4)
+            time.sleep(0.05)
+    frames = re.sub(r"\x1b[^a-zA-Z]*[a-zA-Z]", "", screen.getvalue()).split("\r")
+    *_, last = (frame.strip() for frame in frames if frame.strip())
+    assert re.fullmatch(shown, last)
 
 
 def test_what_was_done_earlier_counts_for_no_speed(monkeypatch):
