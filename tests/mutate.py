@@ -157,21 +157,26 @@ TESTS = {
     "evaluation/noise_findings": "noise_findings diagnosis",
     "evaluation/sequential_tests": "sequential_tests",
     "evaluation/trajectory_error": "trajectory_error",
-    "experiments/command_line": "command_line replay generate",
-    "experiments/command_line/benchmark": "consistency_protocol",
-    "experiments/command_line/explore": "noise_explorer",
-    "experiments/command_line/fit_noise": "noise_fitting log_conventions",
-    "experiments/command_line/generate": "generate",
-    "experiments/command_line/judge": "judging strangers_files space_poses",
+    "experiments/command_line": "options_of_commands command_line replay generate",
+    "experiments/command_line/benchmark": "consistency_protocol options_of_commands",
+    "experiments/command_line/commands": "command_line signals progress_bar",
+    "experiments/command_line/explore": "noise_explorer options_of_commands",
+    "experiments/command_line/fit_noise": (
+        "options_of_commands noise_fitting log_conventions"
+    ),
+    "experiments/command_line/generate": "options_of_commands generate",
+    "experiments/command_line/judge": (
+        "options_of_commands judging strangers_files space_poses"
+    ),
     "experiments/command_line/monte_carlo": (
-        "monte_carlo_command monte_carlo_folder monte_carlo_report"
+        "options_of_commands monte_carlo_command monte_carlo_folder monte_carlo_report"
     ),
     "experiments/command_line/noise_study": (
-        "noise_study noise_effects_of_many_runs command_line"
+        "options_of_commands noise_study noise_effects_of_many_runs command_line"
     ),
     "experiments/command_line/output_folder": "hostile_files signals command_line",
-    "experiments/command_line/render_video": "video command_line",
-    "experiments/command_line/smooth": "smooth_command",
+    "experiments/command_line/render_video": "options_of_commands video command_line",
+    "experiments/command_line/smooth": "options_of_commands smooth_command",
     "experiments/command_line/tables": (
         "replay monte_carlo_report noise_fitting command_line"
     ),

@@ -4,8 +4,10 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
+import warnings
 from io import StringIO
 
 import numpy as np
@@ -638,7 +640,8 @@ def test_a_log_of_unknown_noise_asks_for_it(log):
     assert "known keys" not in refused("replay", log)
 
 
-def test_the_noise_of_a_log_is_noted_unless_it_is_given(log, without_pictures):
+@pytest.mark.usefixtures("without_pictures", "without_figure")
+def test_the_noise_of_a_log_is_noted_unless_it_is_given(log):
     noise = "note: noise of little: motion_std 0.1"
     assert noise in slamgym("replay", log).stderr.replace("\n", " ")
     for command in ("replay", "smooth", "noise-study"):
@@ -709,6 +712,7 @@ WRONG_STUDIES = {
     "little.csv --jobs 1": OF_A_SCENARIO,
     "little.csv --controller random": OF_ONE_RUN,
     "loop --change world": OF_A_SCENARIO,
+    "loop --runs 3 --change filtre": "--change must be one of all, both, wo",
     "loop --runs 3 --controller random": OF_ONE_RUN,
     "loop --noise-at-rest": "of a log; for the world: --set motion.noise_at",
 }
@@ -817,10 +821,27 @@ def test_a_film_that_cannot_be_written_is_refused(monkeypatch):
 
 
 def test_every_scenario_and_estimator_is_listed():
-    names = [row["name"] for row in answered("scenarios")["scenarios"]]
-    assert names == list(list_presets())
-    assert "ekf" in [row["name"] for row in answered("estimators")["estimators"]]
-    assert "Extended Kalman filter" in printed("estimators")
+    worlds = [load_scenario(name) for name in list_presets()]
+    assert answered("scenarios")["scenarios"] == [
+        {
+            **{"name": name, "landmarks": world.landmarks.count},
+            **{"steps": world.steps, "description": world.description},
+        }
+        for name, world in zip(list_presets(), worlds, strict=True)
+    ]
+    heading, *rows = printed("scenarios").splitlines()
+    for name, world in zip(list_presets(), worlds, strict=True):
+        (row,) = (row for row in rows if row.startswith(f"{name} "))
+        for key, count in (
+            ("landmarks", world.landmarks.count),
+            ("steps", world.steps),
+        ):
+            assert row[: heading.index(key) + len(key)].endswith(f" {count}")
+    estimators = {row.pop("name"): row for row in answered("estimators")["estimators"]}
+    text = "Extended Kalman filter over the robot pose and a growing landmark map."
+    ekf = {"library": "slamgym", "installed": True, "description": text}
+    assert estimators["ekf"] == ekf
+    assert re.search(f"^ekf +slamgym +yes +{text[:20]}", printed("estimators"), re.M)
 
 
 def test_without_a_command_the_help_is_shown():
@@ -834,10 +855,16 @@ def test_a_scenario_is_explained_as_a_file_that_gives_the_same_world(name, tmp_p
     assert slamgym("scenarios", name, "--new", path).exit_code == 0
     assert load_scenario(path) == load_scenario(name)
     assert printed("scenarios", name) == path.read_text()
+    assert answered("scenarios", name) == {"scenario": path.read_text()}
     for part in (SensorTable, Gps, Randomise):  # set or not
         for key, field in part.model_fields.items():
             assert re.search(rf"^(# )?{key} =", path.read_text(), re.MULTILINE)
             assert field.description in path.read_text()
+    for line in path.read_text().splitlines():
+        if re.search("^[^[]* =.*  #", line) and " # one of " not in line:
+            assert len(line) < 104
+    layout = r'^layout = "\w+"  # one of corridor, grid, points, random, ring, streets$'
+    assert re.search(layout, path.read_text(), re.MULTILINE)
     assert "which exists" in slamgym("scenarios", name, "--new", path).output
 
 
@@ -1052,10 +1079,9 @@ def test_landmarks_that_were_never_placed_are_named(here, without_pictures):
 @pytest.mark.parametrize(
     ("line", "code", "message"),
     [
-        ("scenarios >&-", 1, "slamgym: standard output is closed: there is no place"),
         ("scenarios --json >&-", 1, "slamgym: standard output is closed"),
-        ("run nonsense 2>&-", 2, ""),
-        ("run nonsense 2>/dev/full", 2, ""),
+        ("scenarios nonsense 2>&-", 2, ""),
+        ("scenarios nonsense 2>/dev/full", 2, ""),
         ("scenarios <&-", 0, ""),
     ],
 )
@@ -1069,6 +1095,51 @@ def test_closed_streams_neither_lose_results_nor_change_the_exit_code(
     )
     assert (done.returncode, done.stderr[: len(message)]) == (code, message)
     assert bool(done.stdout) == (code == 0)
+
+
+@pytest.mark.parametrize("command", ["scenarios", "scenarios --json"])
+def test_results_for_a_closed_output_are_an_error(command, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stdout", None)
+    with pytest.raises(SystemExit, match="1"):
+        main(command.split())
+    message = "standard output is closed: there is no place for the results"
+    assert capsys.readouterr().err == f"slamgym: {message}\n"
+
+
+def test_the_first_sigterm_in_a_block_is_an_error_and_others_are_ignored():
+    usual = signal.getsignal(signal.SIGTERM)
+    try:
+        for before in (signal.SIG_IGN, signal.SIG_DFL):
+            signal.signal(signal.SIGTERM, before)
+            with commands.terminable():
+                inside = signal.getsignal(signal.SIGTERM)
+            assert signal.getsignal(signal.SIGTERM) is before
+            assert (inside is signal.SIG_IGN) == (before is signal.SIG_IGN)
+        with commands.terminable():
+            with pytest.raises(commands.TerminationError):
+                os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), signal.SIGTERM)
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGTERM, usual)
+
+
+def test_an_interrupt_names_the_work_of_the_block_that_it_ends(monkeypatch):
+    def interrupt(_):
+        with commands.interruptible("the runs are kept"):
+            with commands.interruptible("the table is kept"):
+                pass
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands.Reporter, "finish", lambda *_: interrupt(_))
+    assert refused("scenarios", "--json", code=130) == "the runs are kept"
+
+
+def test_every_warning_is_a_note_also_if_it_comes_again(capsys):
+    with commands.Reporter(as_json=True).warnings():
+        for _ in range(2):
+            warnings.warn("the log has no truth", stacklevel=1)
+    assert capsys.readouterr().err == "note: the log has no truth\n" * 2
 
 
 @pytest.mark.parametrize("place", [".", "rc"])

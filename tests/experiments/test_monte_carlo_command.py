@@ -115,22 +115,6 @@ def test_what_cannot_be_done_is_said_in_one_line(here, arguments, message):
     assert not (here / "out").exists()
 
 
-@pytest.mark.slow
-def test_a_noise_study_over_many_runs_writes_figure_and_table(here):
-    result = slamgym(
-        *("noise-study", "anchored", "--runs", 3, "-e", "ekf,invariant"),
-        *("--change", "filter", "--out", "study", "--json"),
-    )
-    assert result.exit_code == 0, result.stderr
-    summary = json.loads(result.stdout)
-    assert len(summary["rows"]) == 2 * 11
-    assert summary["files"] == ["noise_study.csv", "noise_study.png", "summary.json"]
-    assert len((here / "study" / "noise_study.csv").read_text().splitlines()) == 23
-    assert "--change must be" in refused(
-        "noise-study", "anchored", "--runs", 3, "--change", "filtre"
-    )
-
-
 CARELESS = """
 from slamgym.estimator import EkfSlam, InvariantEkfSlam
 

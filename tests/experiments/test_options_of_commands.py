@@ -1,17 +1,22 @@
-"""Every option of a command reaches the function that does its work."""
+"""Every option of a command reaches its work, and every command reports its files."""
 
 import contextlib
 import inspect
+import json
 from importlib import import_module
 from pathlib import Path
 from types import GeneratorType, MethodType
 
 import pytest
 from commands import slamgym
+from matplotlib.figure import Figure
+from recordings import recorded
 
+from slamgym.experiments import figures
 from slamgym.experiments.command_line import commands
 from slamgym.experiments.command_line.options import Options
-from slamgym.experiments.logs.slamlog import SlamLog
+from slamgym.experiments.job_folders import files_below
+from slamgym.experiments.logs.slamlog import SlamLog, write_slamlog
 from slamgym.experiments.run_and_replay.filter_settings import FilterSettings
 from slamgym.sim_configs import Scenario
 
@@ -254,3 +259,50 @@ WORDS = {
     GeneratorType: lambda frames: words(compared(frames.gi_frame.f_locals)),
     MethodType: lambda method: words(method.__self__),
 }
+
+
+#: A command, and its folder by default.
+FOLDERS = {
+    "run six_landmarks --steps 3": "six_landmarks-invariant",
+    "replay little.csv -e ekf,invariant": "little-ekf-invariant",
+    "smooth little.csv": "little-smoother",
+    "fit-noise longer.csv": "six_landmarks-noise",
+    "noise-study little.csv -e ekf": "noise-study-little-ekf",
+    "noise-study six_landmarks --steps 3 -e ekf": "noise-study-six_landmarks-ekf",
+    "noise-study six_landmarks --steps 3 --runs 2 -e ekf --change filter": (
+        "noise-study-six_landmarks-2-runs"
+    ),
+    "monte-carlo six_landmarks --steps 3 --runs 2 -e ekf": "monte-carlo-six_landmarks",
+    "judge drives": "judge-six_landmarks",
+}
+
+
+@pytest.mark.usefixtures("_no_figures_in_reports")
+@pytest.mark.parametrize("command", FOLDERS)
+def test_every_command_reports_the_files_that_it_writes(command, monkeypatch, here):
+    monkeypatch.setattr(figures, "save_figure", lambda _, path, **__: path.touch())
+    for name in ("noise_study_figure", "map_figure"):
+        monkeypatch.setattr(figures, name, lambda _, **__: Figure())
+    monkeypatch.setattr(figures, "map_sequence", lambda *_, **__: None)
+    (here / "little.csv").write_text(LOG)
+    if "longer" in command:
+        write_slamlog(recorded("six_landmarks", 3, steps=30), here / "longer.csv")
+    if "drives" in command:
+        world = ("six_landmarks", "--steps", 3, "--episodes", 2, "-e", "ekf")
+        slamgym("generate", *world, "--out", "drives")
+    out = Path("results", FOLDERS[command])
+    done = slamgym(*command.split())
+    assert done.exit_code == 0, done.stderr
+    summary = json.loads((out / "summary.json").read_text())
+    below = [name for name in files_below(out) if "blocks/" not in name]
+    assert sorted(summary["files"]) == sorted({*below} - {"job.json"})
+    end = done.stdout.partition(f"Wrote {out}/")[2].split("Test with")[0]
+    for name in summary["files"]:
+        assert (name if "/" not in name else name.split("/")[0]) in end
+    done = slamgym(*command.split(), "--json")
+    answer = json.loads(done.stdout)
+    assert answer.pop("out") == str(out)
+    assert not answer.pop("written", False)
+    for key in ("command", "seconds"):
+        answer.pop(key, None), summary.pop(key, None)
+    assert answer == summary
