@@ -726,6 +726,9 @@ WRONG = {
     **{f"run {words}": text for words, text in WRONG_WORLDS.items()},
     **{f"noise-study {words}": text for words, text in WRONG_STUDIES.items()},
     **{f"replay {words}": text for words, text in WRONG_LOGS.items()},
+    "generate loop --episodes 0": "Invalid value for '--episodes'",
+    "generate loop --episodes 1 --shard 0": "Invalid value for '--shard'",
+    "explore loop --runs 1": "Invalid value for '--runs'",
 }
 
 

@@ -14,6 +14,7 @@ from recordings import recorded
 
 from slamgym.experiments import figures
 from slamgym.experiments.command_line import commands
+from slamgym.experiments.command_line.monte_carlo import connected
 from slamgym.experiments.command_line.options import Options
 from slamgym.experiments.job_folders import files_below
 from slamgym.experiments.logs.slamlog import SlamLog, write_slamlog
@@ -85,11 +86,11 @@ monte-carlo loop
     fresh=False resolution=0 progress=running-runs
 
 monte-carlo loop -e ekf --runs 9 --until decided --seed 5 --steps 7 --set dt=0.5
-  --assume dt=0.25 --resolution 0.5 --jobs 2 --backend loky --block-size 3 --first-run 6
-  --fresh --out mine
+  --assume dt=0.25 --resolution 0.5 --jobs 2 --backend dask --scheduler tcp://b:1
+  --block-size 3 --first-run 6 --fresh --out mine
   → experiments.monte_carlo_study.monte_carlo scenario=loop/7/0.5 estimators=ekf runs=9
-    seed=5 until=decided assumed=loop/7/0.25 out=mine jobs=2 backend=loky block_size=3
-    first_run=6 fresh=True resolution=0.5 progress=running-runs
+    seed=5 until=decided assumed=loop/7/0.25 out=mine jobs=2 backend=dask block_size=3
+    first_run=6 fresh=True resolution=0.5 progress=running-runs cluster=tcp://b:1,2
 
 generate loop --episodes 3
   → experiments.trajectories.generate_trajectories scenario=loop/1005/1
@@ -98,10 +99,12 @@ generate loop --episodes 3
     progress=driving-steps
 
 generate loop --episodes 3 --controller random --seed 5 --format g2o --shard 7
-  --smallest-std .01 -e ekf --jobs 2 --backend loky --steps 9 --set dt=0.5 --out mine
+  --smallest-std .01 -e ekf --jobs 2 --backend dask --scheduler tcp://b:1 --steps 9
+  --set dt=0.5 --out mine
   → experiments.trajectories.generate_trajectories scenario=loop/9/0.5 out=mine
     episodes=3 controller=random seed=5 format=g2o episodes_per_shard=7
-    smallest_std=0.01 estimator=ekf jobs=2 backend=loky progress=driving-steps
+    smallest_std=0.01 estimator=ekf jobs=2 backend=dask progress=driving-steps
+    cluster=tcp://b:1,2
 
 judge little.csv
   → experiments.judging.judge estimates=little.csv drives=None truth=None
@@ -212,9 +215,14 @@ def test_every_option_reaches_the_work(command, monkeypatch, here):
 
     monkeypatch.setattr(commands, "progress_bar", Bar)
     monkeypatch.setattr(f"{module}.{name}", listen)
+    joined = {}
+    monkeypatch.setattr(
+        f"{connected.__module__}._dask_client",
+        lambda *cluster: contextlib.nullcontext(joined.update(cluster=cluster)),
+    )
     (here / "little.csv").write_text(LOG)
     assert slamgym(*command.split()).stderr.endswith("slamgym: that is enough\n")
-    assert words(compared(given[-1])) == expected
+    assert words(compared(given[-1]) | joined) == expected
     if " -" not in command:  # what Python assumes, too
         parameters = compared(inspect.signature(work).parameters)
         usual = {name: each.default for name, each in parameters.items()}
