@@ -13,7 +13,7 @@ import xarray as xr
 from commands import slamgym
 
 from slamgym import judge, load_scenario, load_trajectories, make_estimator, monte_carlo
-from slamgym.estimator.models.rigid_motion import invariant_covariance
+from slamgym.estimator.models.rigid_motion import invariant_covariance, pose_rotation
 from slamgym.estimator.smoother import smooth
 from slamgym.experiments import (
     estimate_conventions,
@@ -591,6 +591,33 @@ def test_true_paths_from_elsewhere_give_the_same_nees(elsewhere, study):
     assert found["verdict"] == entry_of(study)["verdict"]
     assert found["diagnosis"] is None
     assert found["efficiency"] is None
+
+
+def move(file, at):
+    """Move the poses of a TUM file as a whole."""
+    rows = np.loadtxt(file)
+    places = complex(*at[:2]) + np.exp(1j * at[2]) * (rows[:, 1] + 1j * rows[:, 2])
+    half = np.arctan2(rows[:, 6], rows[:, 7]) + at[2] / 2
+    rows[:, 1:3] = np.column_stack([places.real, places.imag])
+    rows[:, 6:8] = np.column_stack([np.sin(half), np.cos(half)])
+    if rows.shape[1] > 8:
+        turn = pose_rotation(at[2])
+        rows[:, 8:] = (turn @ rows[:, 8:].reshape(-1, 3, 3) @ turn.T).reshape(-1, 9)
+    np.savetxt(file, rows, fmt="%.17g")
+
+
+def test_paths_from_elsewhere_in_the_frame_of_their_start_are_named(
+    elsewhere, beliefs, study
+):
+    mine, truth = elsewhere
+    for path, true in zip(sorted(truth.iterdir()), beliefs[3], strict=True):
+        move(mine / path.name, inverse_of(true[0]))
+        move(path, (3.0, -2.0, 0.7))
+    said = entry_of(judge(mine, truth=truth))["diagnosis"]["sentence"]
+    start, _, end = said.partition(": read so, NEES / 3 is ")
+    assert start == "convention: poses in the frame of the start"
+    right = float(study.pose_nees_invariant.mean()) / 3
+    assert float(end.partition(",")[0]) == pytest.approx(right, rel=0.2)
 
 
 BAD_TRUTH = {

@@ -9,6 +9,7 @@ from commands import slamgym
 from scipy.linalg import expm, logm
 from scipy.spatial.transform import Rotation
 
+from slamgym.experiments import space_poses
 from slamgym.experiments.space_poses import (
     Pose,
     SpaceEstimate,
@@ -260,7 +261,31 @@ def test_what_is_no_pose_in_space_is_refused(tmp_path):
             judge_in_space(estimates, truth)
 
 
-def test_the_command_judges_poses_in_space(tmp_path):
+@pytest.mark.parametrize(
+    ("gains", "is_named"),
+    [
+        (np.full(40, 0.24), False),
+        (np.full(40, 0.26), True),
+        (np.tile([3.1, -2.1], 20), False),  # 0.5, with a standard error of 0.41
+        (np.tile([1.1, -0.1], 20), True),
+    ],
+)
+def test_a_cause_explains_much_more_than_chance(gains, is_named, monkeypatch):
+    fits = {
+        "as given": (False, np.full(40, -3.0), 9.0),
+        "dishonest": (False, np.full(40, 9.0), 1.0),
+        "less likely": (True, gains - 3.1, 1.0),
+        "right": (True, gains - 3.0, 1.04),
+    }
+    monkeypatch.setattr(space_poses, "_fit", lambda error, _: fits[error])
+    readings = {name: (name, None) for name in fits}
+    nees = np.append(np.full(9, 54.0), np.nan)
+    said = "convention: right: read so, NEES / 6 is 1.04, not 9."
+    assert space_poses._cause(readings, "as given", nees) == said * is_named
+
+
+def test_the_command_judges_poses_in_space(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["/bin/slamgym", "judge", "my poses"])
     estimates, truth = write(tmp_path, 11, WRITTEN["right"])
     call = "judge", estimates, "--truth", truth, "--out", tmp_path / "out"
     done = slamgym(*call, "--space", "left", "--json")
@@ -269,6 +294,7 @@ def test_the_command_judges_poses_in_space(tmp_path):
     saved = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert saved == {name: found[name] for name in found if name != "out"}
     assert saved["files"] == ["nees.svg", "summary.json"]
+    assert saved["command"] == "slamgym judge 'my poses'"
     for name, ratio in saved["nees"].items():
         assert np.mean(saved["nees_over_time"][name]) == pytest.approx(ratio)
     assert "ANEES / n" in (tmp_path / "out" / "nees.svg").read_text()
@@ -276,6 +302,7 @@ def test_the_command_judges_poses_in_space(tmp_path):
     printed = " ".join(done.stdout.split())
     assert "e: not consistent: the squared errors of the pose" in printed
     assert f"cause: {said_of('right')}" in printed
+    assert printed.endswith(f"Wrote {tmp_path}/out/ nees.svg, summary.json")
     done = slamgym(*call, "--space", "right", "--json")
     assert json.loads(done.stdout)["cause"] == ""
     done = slamgym(*call, "--space", "up")
