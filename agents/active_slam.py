@@ -26,6 +26,7 @@ from ..estimator.filters.batch import BatchBeliefs, BatchStorage
 from ..jit import jit_in_place
 from ..restorable import Restorable
 from ..sim_configs import Scenario
+from .active_slam_kernels import SUCCESS, TERMINATED
 from .active_slam_task import ActiveSlamTask, AssociationRecord, split_settings
 from .belief_observation import (
     ONE_WORLD,
@@ -180,6 +181,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
             [self._estimator], rows, by_id=by_id, live=render_mode is None
         )
         self._explorers = Explorers(self._filters, self.task)
+        self._driven = np.empty((1, 2)), np.empty(1, np.bool_)  # action and collision
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -189,7 +191,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         self._explorers.begin(self.start_estimate[None], ONE_WORLD)
         self._scan(observation, info, moved=False)
         self.task.begin(self._filters.storage(), ONE_WORLD)
-        return self._output(info, ~ONE_WORLD)
+        return self._output(info, ended=False)
 
     def step(
         self, action: ArrayLike
@@ -201,20 +203,21 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         ValueError
             If the action is not two finite numbers. The world does not change.
         """
-        self._steps()  # refuses to step before `reset`
+        self._refuse_before_episode()
         observation, _, _, _, info = super().step(action)
         self._scan(observation, info, moved=True)
-        beliefs, collision = self._filters.storage(), np.array([info["collision"]])
-        actions = np.asarray(action, dtype=np.float64)[None]
-        outcome = self.task.proceed(beliefs, ONE_WORLD, actions, collision)
-        seen, info = self._output(info, outcome.terminated | outcome.truncated)
-        ends = bool(outcome.terminated[0]), bool(outcome.truncated[0])
-        return seen, float(outcome.rewards[0]), *ends, info
+        beliefs, (actions, collisions) = self._filters.storage(), self._driven
+        actions[0], collisions[0] = action, info["collision"]
+        results = self.task.proceed(beliefs, ONE_WORLD, actions, collisions)
+        (terminated,), (truncated,), _ = results.ends.tolist()
+        seen, info = self._output(info, ended=terminated or truncated)
+        return seen, results.rewards.item(), terminated, truncated, info
 
     @property
     def knowledge(self) -> AgentKnowledge:
         """The knowledge of an agent at this step, for policies that plan."""
-        step, episodes = self._steps(), self.task.episodes
+        self._refuse_before_episode()
+        episodes = self.task.episodes
         return AgentKnowledge(
             self.scenario,
             self.task.grid,
@@ -224,13 +227,12 @@ class ActiveSlamEnv(LandmarkWorldEnv):
             episodes.known[0].copy(),
             self.task.weights.accuracy,
             self.task.prior_std,
-            step,
+            int(episodes.steps[0]),
         )
 
-    def _steps(self) -> int:
+    def _refuse_before_episode(self) -> None:
         if not self.task.begun:
             raise ResetNeeded("call reset first: there is no episode yet")
-        return int(self.task.episodes.steps[0])
 
     def _scan(
         self, observation: Observation, info: Mapping[str, Any], *, moved: bool
@@ -244,11 +246,10 @@ class ActiveSlamEnv(LandmarkWorldEnv):
             self.show_belief(self._filters.belief(0))
 
     def _output(
-        self, info: dict[str, Any], ended: BoolArray
+        self, info: dict[str, Any], *, ended: bool
     ) -> tuple[Observation, dict[str, Any]]:
-        infos = self._explorers.infos(self._landmarks, ended)
-        more = {key: values.item() for key, values in infos.items()}
-        return self.task.observation(), {**info, **more}
+        more = self._explorers.info(self._landmarks, ended=ended)
+        return self.task.observation(), info | more
 
 
 Observations = dict[str, AnyArray]
@@ -325,10 +326,10 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         if np.count_nonzero(moving) < self.num_envs:
             self._explorers.begin(self._worlds.start_estimates, ~moving)
         self._scan(self._all, moving)
-        outcome = self.task.proceed(
+        results = self.task.proceed(
             self._filters.storage(), moving, actions, self._worlds.collisions
         )
-        return outcome.rewards, outcome.terminated
+        return results.rewards, results.ends[TERMINATED]
 
     def _follow(self, worlds: BoolArray) -> None:
         """Start the filters of some worlds, each with its first scan."""
@@ -369,8 +370,8 @@ class Explorers(Restorable):
 
     def __init__(self, filters: Filters, task: ActiveSlamTask) -> None:
         self._filters, self._task = filters, task
-        by_id = task.scenario.sensor.identities
-        self._record = None if by_id else AssociationRecord(len(task.mapped))
+        by_id, worlds = task.scenario.sensor.identities, len(task.results.rewards)
+        self._record = None if by_id else AssociationRecord(worlds)
 
     def begin(self, estimates: Array, worlds: BoolArray) -> None:
         """Start the filters of some worlds, (B,), at estimates (B, 3)."""
@@ -405,19 +406,32 @@ class Explorers(Restorable):
         ended : bool ndarray, shape (B,)
             Worlds whose episode is over.
         """
-        task, beliefs = self._task, self._filters.storage()
+        results, beliefs = self._task.results, self._filters.storage()
         error = map_rmse if self._record is None else matched_rmse
-        success, rmse = task.outcome.success, error(beliefs, landmarks)
-        infos: dict[str, AnyArray] = {
-            "mapped": task.mapped,
-            "known": task.known,
-            "success": success,
-            "true_rmse": rmse,
-            "honest_success": success & (rmse <= task.weights.accuracy),
-        }
+        success, rmse = results.ends[SUCCESS], error(beliefs, landmarks)
+        infos = self._named(results.counts, success, rmse)
         if self._record is not None and isinstance(self._filters, SeparateFilters):
             infos |= self._record.scores(self._filters.filters, ended)
         return infos
+
+    def info(self, landmarks: ComplexArray, *, ended: bool) -> dict[str, Any]:
+        """Return the same entries of a single world, as plain numbers."""
+        if self._record is not None:
+            infos = self.infos(landmarks, np.array([ended]))
+            return {key: values.item() for key, values in infos.items()}
+        results, beliefs = self._task.results, self._filters.storage()
+        success, rmse = results.ends[SUCCESS].item(), map_rmse(beliefs, landmarks)
+        return self._named(results.counts.ravel().tolist(), success, rmse.item())
+
+    def _named(self, counts: Any, success: Any, rmse: Any) -> dict[str, Any]:
+        mapped, known = counts
+        return {
+            "mapped": mapped,
+            "known": known,
+            "success": success,
+            "true_rmse": rmse,
+            "honest_success": success & (rmse <= self._task.weights.accuracy),
+        }
 
 
 # --------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from ..jit import (
     njit_internal,
     njit_reordered,
 )
-from .belief_features import Bounds, FeatureArrays, write_belief_features
+from .belief_features import Bounds, write_belief_features
 
 CELLS = 8.0  # that weigh as much as one landmark
 D, A, _ = range(3)  # criteria of the map, in the order of `CRITERIA`
@@ -38,27 +38,30 @@ class Episodes(NamedTuple):
     known: BoolArray  # landmarks known to the required accuracy, shape (B, N)
 
 
-class StepOutcome(NamedTuple):
-    """The outcome of one step in B worlds; arrays of shape (B,)."""
+class StepResults(NamedTuple):
+    """What the pass writes of one step in B worlds."""
 
-    rewards: Array
-    terminated: BoolArray
-    truncated: BoolArray
-    success: BoolArray
+    # The values of the first feature for all worlds, then those of the next one. The
+    # boolean feature, which landmarks are mapped, has none.
+    numbers: Array
+    mapped: BoolArray  # this feature, shape (B, N)
+    rewards: Array  # shape (B,)
+    ends: BoolArray  # TERMINATED, TRUNCATED, SUCCESS, shape (3, B)
+    counts: IntArray  # of landmarks mapped, and of those known, shape (2, B)
+
+
+TERMINATED, TRUNCATED, SUCCESS = range(3)
 
 
 class Worlds(NamedTuple):
     """All that the pass reads and writes of B worlds."""
 
-    beliefs: tuple[Array, Array, IntArray]  # a `BatchStorage`
     actions: Array
     collisions: BoolArray
+    beliefs: tuple[Array, Array, IntArray]  # a `BatchStorage`
     episodes: Episodes
-    outcome: StepOutcome
-    counts: tuple[IntArray, IntArray]  # landmarks mapped and known, (B,)
-    belief_features: FeatureArrays
-    # Goals, progress, uncertain, unexplored and walls, see `ActiveSlamTask`.
-    features: tuple[Array, Array, Array, Array, Array]
+    results: StepResults
+    starts: IntArray  # of the features of one world, and the end of the last
 
 
 class TaskRules(NamedTuple):
@@ -88,59 +91,37 @@ class Scratch(NamedTuple):
 def advance(
     chosen: BoolArray,
     moving: BoolArray,
-    worlds: tuple[Any, ...],
-    plan: tuple[Any, ...],
-    rules: tuple[Any, ...],
-    scratch: tuple[Any, ...],
+    actions: Array,
+    collisions: BoolArray,
+    beliefs: tuple[Any, ...],
+    episodes: tuple[Any, ...],
+    results: tuple[Any, ...],
+    fixed: tuple[Any, ...],
 ) -> None:
     """Take the chosen worlds (B,) through a step, or begin their episodes.
 
     Of the chosen worlds, those that move take a step. The progress of the others starts
-    from nothing, and they have no outcome. Worlds not chosen stay. The arrays come as
-    plain tuples, the entries of `Worlds`, `Floor`, `TaskRules` and `Scratch`: numba
-    takes microseconds to recognise a NamedTuple. The numeric features of a `Worlds`
-    come in one array: the values of the first feature for all worlds, then those of the
-    next one, with an array of where each begins. The boolean feature, which landmarks
-    are mapped, is an array of its own, and has no numbers.
+    from nothing, and they have no outcome. Worlds not chosen stay.
+
+    The last arguments are plain tuples, with the entries of `BatchStorage`, `Episodes`,
+    `StepResults`, and of what never changes: `starts`, `Floor`, `TaskRules` and
+    `Scratch`. Numba takes microseconds to recognise a NamedTuple.
     """
-    beliefs, actions, collisions, episodes, outcome, counts, flat, mapped = worlds
-    now, result = Episodes(*episodes), StepOutcome(*outcome)
-    shape = (*mapped.shape, 2)
-    of_belief = (
-        _feature(flat, 0, mapped),
-        _feature(flat, 1, mapped),
-        _feature(flat, 2, mapped).reshape(shape),
-        _feature(flat, 3, mapped).reshape(shape),
-        mapped,
-        _feature(flat, 5, mapped),
-        _feature(flat, 6, mapped),
-        _feature(flat, 7, mapped),
-    )
-    more = (
-        _feature(flat, 8, mapped),
-        _feature(flat, 9, mapped),
-        _feature(flat, 10, mapped),
-        _feature(flat, 11, mapped),
-        _feature(flat, 12, mapped),
-    )
-    everything = Worlds(
-        beliefs, actions, collisions, now, result, counts, of_belief, more
-    )
-    cells, walls, bounds, diagonal, view = plan
-    floor = Floor(cells, walls, bounds, diagonal, View(*view))
+    starts, (cells, walls, bounds, diagonal, view), rules, scratch = fixed
+    now, after = Episodes(*episodes), StepResults(*results)
+    worlds = Worlds(actions, collisions, beliefs, now, after, starts)
+    floor, room = Floor(cells, walls, bounds, diagonal, View(*view)), Scratch(*scratch)
     for b in range(len(chosen)):
         if chosen[b]:
-            advance_world(
-                b, moving[b], everything, floor, TaskRules(*rules), Scratch(*scratch)
-            )
+            advance_world(b, moving[b], worlds, floor, TaskRules(*rules), room)
 
 
 @njit_inlined
-def _feature(flat: tuple[Array, IntArray], place: int, mapped: BoolArray) -> Array:
-    """Return the feature at a place of the array of all numbers, shape (B, size)."""
-    (numbers, starts), count = flat, len(mapped)
-    first, end = starts[place], starts[place + 1]
-    return numbers[first:end].reshape(count, (end - first) // count)
+def feature(worlds: Worlds, place: int, b: int) -> Array:
+    """Return a numeric feature of one world, by its place in the observation."""
+    first, end = worlds.starts[place], worlds.starts[place + 1]
+    begin = first * len(worlds.actions) + b * (end - first)
+    return worlds.results.numbers[begin : begin + end - first]
 
 
 @njit_internal
@@ -156,16 +137,22 @@ def advance_world(
     means, covariances, slots = worlds.beliefs
     explored, steps, uncertainty, known = worlds.episodes
     mean, covariance = means[b], covariances[b]
-    features, bounds = worlds.belief_features, floor.bounds
-    write_belief_features(b, mean, covariance, slots[b], bounds, features)
-    directions = features[5]
-    pose = mean[0], mean[1], directions[b, 2], directions[b, 3]
+    corr, map_std = feature(worlds, 0, b), feature(worlds, 1, b)
+    std, landmarks = feature(worlds, 2, b), feature(worlds, 3, b)
+    mask, of_pose = worlds.results.mapped[b], feature(worlds, 5, b)
+    pose_corr, pose_std = feature(worlds, 6, b), feature(worlds, 7, b)
+    into = corr, map_std, std, landmarks, mask, of_pose, pose_corr, pose_std
+    write_belief_features(mean, covariance, slots[b], floor.bounds, into)
+    goals, progress = feature(worlds, 8, b), feature(worlds, 9, b)
+    uncertain, unexplored = feature(worlds, 10, b), feature(worlds, 11, b)
+    distances = feature(worlds, 12, b)
+    pose = mean[0], mean[1], of_pose[2], of_pose[3]
     if not moved:
         explored[b] = False
-    points = scratch.points
+    points, diagonal = scratch.points, floor.diagonal
     unseen = look_around(pose, floor.cells, floor.sight, explored[b], points)
-    write_nearest(points, unseen, floor.diagonal, worlds.features[0][b, :3])
-    write_densities(points, unseen, floor.diagonal, CELLS, worlds.features[3][b])
+    write_nearest(points, unseen, diagonal, goals[:3])
+    write_densities(points, unseen, diagonal, CELLS, unexplored)
     accuracy, variances = rules.accuracy, scratch.variances
     mapped = judge_landmarks(covariance, slots[b], accuracy, variances, known[b])
     before = uncertainty[b]
@@ -173,10 +160,12 @@ def advance_world(
     steps[b] = steps[b] + 1 if moved else 0
     if moved:
         reward_step(b, before - uncertainty[b], worlds, rules)
-    write_shares(b, unseen, mapped, worlds, rules)
-    distances, diagonal = worlds.features[4][b], floor.diagonal
+    else:
+        worlds.results.rewards[b], worlds.results.ends[:, b] = 0.0, False
+    write_shares(b, unseen, mapped, worlds, rules, progress)
     write_wall_distances(pose, floor.walls, diagonal, rules.longest_step, distances)
-    write_landmark_goals(b, pose, mean, worlds, diagonal, scratch)
+    judged = slots[b], known[b], variances
+    write_landmark_goals(pose, mean, judged, diagonal, points, goals, uncertain)
 
 
 @njit_internal
@@ -229,43 +218,46 @@ def reward_step(b: int, gain: float, worlds: Worlds, rules: TaskRules) -> None:
         reward -= rules.crash_cost
     if success:
         reward += rules.success_reward * (2.0 - steps / rules.steps)
-    outcome = worlds.outcome
-    outcome.rewards[b], outcome.success[b] = reward, success
-    outcome.terminated[b] = success or crashed
-    outcome.truncated[b] = not outcome.terminated[b] and steps >= rules.steps
+    ends, ended = worlds.results.ends, success or crashed
+    worlds.results.rewards[b], ends[SUCCESS, b] = reward, success
+    ends[TERMINATED, b], ends[TRUNCATED, b] = ended, not ended and steps >= rules.steps
 
 
 @njit_internal
 def write_shares(
-    b: int, unseen: int, mapped: int, worlds: Worlds, rules: TaskRules
+    b: int, unseen: int, mapped: int, worlds: Worlds, rules: TaskRules, shares: Array
 ) -> None:
     """Write the shares explored, mapped, known, and of time left, and the counts."""
-    shares, episodes = worlds.features[1][b], worlds.episodes
+    episodes = worlds.episodes
     cells, known = episodes.explored.shape[1], episodes.known[b]
-    counts = worlds.counts
-    counts[0][b], counts[1][b] = mapped, known.sum()
+    counts = worlds.results.counts
+    counts[0, b], counts[1, b] = mapped, known.sum()
     shares[0] = (cells - unseen) / cells
-    shares[1], shares[2] = mapped / len(known), counts[1][b] / len(known)
+    shares[1], shares[2] = mapped / len(known), counts[1, b] / len(known)
     shares[3] = 1.0 - min(episodes.steps[b] / rules.steps, 1.0)
 
 
 @njit_internal
 def write_landmark_goals(
-    b: int, pose: Pose, mean: Array, worlds: Worlds, diagonal: float, scratch: Scratch
+    pose: Pose,
+    mean: Array,
+    judged: tuple[IntArray, BoolArray, Array],
+    diagonal: float,
+    points: Array,
+    goals: Array,
+    uncertain: Array,
 ) -> None:
-    """Write goals and densities of the landmarks."""
-    points, slots = scratch.points, worlds.beliefs[2][b]
-    goals, _, uncertain, _, _ = worlds.features
-    count = 0
+    """Write goals and densities of the landmarks, of `judge_landmarks`."""
+    (slots, known, variances), count = judged, 0
     for i in range(len(slots)):
-        if slots[i] >= 0 and not worlds.episodes.known[b, i]:
+        if slots[i] >= 0 and not known[i]:
             count = add_landmark(points, count, mean, slots[i], pose)
-    write_nearest(points, count, diagonal, goals[b, 3:6])
-    write_densities(points, count, diagonal, 1.0, uncertain[b])
-    best, count = first_smallest(scratch.variances, len(slots)), 0
+    write_nearest(points, count, diagonal, goals[3:6])
+    write_densities(points, count, diagonal, 1.0, uncertain)
+    best, count = first_smallest(variances, len(slots)), 0
     if slots[best] >= 0:
         count = add_landmark(points, 0, mean, slots[best], pose)
-    write_nearest(points, count, diagonal, goals[b, 6:])
+    write_nearest(points, count, diagonal, goals[6:])
 
 
 @njit_internal

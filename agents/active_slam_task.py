@@ -23,7 +23,7 @@ from ..evaluation.association_scores import score_association
 from ..restorable import Restorable
 from ..sim_configs import Scenario
 from ..sim_configs.scenario import refuse_unknown_keywords
-from .active_slam_kernels import Episodes, StepOutcome, advance
+from .active_slam_kernels import Episodes, StepResults, advance
 from .belief_features import belief_space
 from .information_reward import CRITERIA, check_criterion, landmark_prior_std
 from .landmark_set import FEATURES, ObservationForm, write_landmark_sets
@@ -99,14 +99,14 @@ class ActiveSlamTask(Restorable):
         =============== ====== ====================================================
     episodes : Episodes
         Their progress.
-    outcome : StepOutcome
+    results : StepResults
         Of the last step.
-    mapped, known : ndarray, shape (B,)
-        Numbers of landmarks in the present map, and of those known accurately.
+    begun : bool
+        Whether there are episodes.
     """
 
     changing = ("episodes",)
-    replaced = ("outcome", "mapped", "known", "_rows")
+    replaced = ("results", "_sets", "begun")
 
     def __init__(
         self,
@@ -130,43 +130,38 @@ class ActiveSlamTask(Restorable):
         }
         self.observation_space = self._form.space(spaces.Dict(flat))
         self._shape = count, landmarks
-        self._rules = _rules(scenario, weights, self.prior_std)
-        self._scratch = (
+        scratch = (
             np.zeros((3, max(cells, landmarks))),
             np.zeros(landmarks),
             np.zeros((2 * landmarks, 2 * landmarks)),
         )
         sizes = [
-            0 if key == "belief_mask" else count * flatdim(box)
-            for key, box in flat.items()
+            0 if key == "belief_mask" else flatdim(box) for key, box in flat.items()
         ]
-        #: Where each entry begins in the array of all numbers, and the end of the last.
-        self._starts = np.append(0, np.cumsum(sizes))
-        ends = itertools.pairwise(self._starts.tolist())
+        # Where each entry of one world begins in the array of all numbers.
+        starts = np.append(0, np.cumsum(sizes))
+        ends = itertools.pairwise((count * starts).tolist())
         self._parts = dict(zip(flat, itertools.starmap(slice, ends), strict=True))
-        self._all = np.ones(count, dtype=np.bool_)
-        self._rows: tuple[AnyArray, ...] = ()
+        rules = _rules(scenario, weights, self.prior_std)
+        self._fixed = starts, self.grid.plan, rules, scratch
+        self._size = count * starts[-1]
+        self._all, self._at_rest = np.ones(count, dtype=np.bool_), np.zeros((count, 2))
+        self.begun = False
         self.episodes = Episodes(
             np.zeros((count, cells), dtype=np.bool_),
             np.zeros(count, dtype=np.int64),
             np.zeros(count),
             np.zeros(self._shape, dtype=np.bool_),
         )
-        self.outcome = _no_outcome(count)
-        self.mapped, self.known = np.zeros((2, count), dtype=np.int64)
-
-    @property
-    def begun(self) -> bool:
-        """Whether there are episodes."""
-        return bool(self._rows)
+        self.results, self._sets = self._empty_results(), self._empty_sets()
 
     def begin(self, beliefs: BatchStorage, worlds: BoolArray) -> None:
         """Begin episodes in some worlds, (B,), after their first scan."""
-        rows = self._rows or self._empty_rows()
-        self._rows = tuple([row.copy() for row in rows])
-        self.outcome = self.outcome._replace(success=self.outcome.success & ~worlds)
-        self.mapped, self.known = self.mapped.copy(), self.known.copy()
-        self._advance(beliefs, worlds, ~worlds)
+        last: Any = map(np.copy, self.results)
+        self.results = StepResults(*last)
+        self._sets = tuple(map(np.copy, self._sets))
+        self._advance(beliefs, worlds, ~worlds, self._at_rest, worlds)
+        self.begun = True
 
     def proceed(
         self,
@@ -174,32 +169,34 @@ class ActiveSlamTask(Restorable):
         moving: BoolArray,
         actions: ArrayLike,
         collisions: BoolArray,
-    ) -> StepOutcome:
+    ) -> StepResults:
         """Take moving worlds, (B,), through a step and its scan.
 
         The others begin episodes, after their first scan.
         """
-        self._rows = self._empty_rows()
-        self.outcome = _no_outcome(self._shape[0])
-        self.mapped, self.known = np.empty((2, self._shape[0]), dtype=np.int64)
-        self._advance(beliefs, self._all, moving, actions, collisions)
-        return self.outcome
+        given = np.asarray(actions, dtype=np.float64, order="C")
+        self.results, self._sets = self._empty_results(), self._empty_sets()
+        self._advance(beliefs, self._all, moving, given, collisions)
+        return self.results
 
     def observations(self) -> dict[str, AnyArray]:
         """Return the observations of all worlds: arrays that no later step changes."""
-        numbers, mapped, *sets = self._rows
-        flat = {
+        numbers, mapped = self.results.numbers, self.results.mapped
+        flat: dict[str, AnyArray] = {
             key: numbers[part].reshape(len(mapped), -1)
             for key, part in self._parts.items()
         }
         flat["belief_mask"] = mapped
-        return self._form.cast(flat | dict(zip(_OF_SETS, sets, strict=False)))
+        return self._form.cast(flat | dict(zip(_OF_SETS, self._sets, strict=False)))
 
     def observation(self) -> dict[str, AnyArray]:
         """Return the observation of a single world, which no later step changes."""
-        numbers, mapped, *sets = self._rows
-        first = {key: numbers[part] for key, part in self._parts.items()}
-        for key, rows in zip(("belief_mask", *_OF_SETS), (mapped, *sets), strict=False):
+        numbers, mapped = self.results.numbers, self.results.mapped
+        first: dict[str, AnyArray] = {
+            key: numbers[part] for key, part in self._parts.items()
+        }
+        first["belief_mask"] = mapped[0]
+        for key, rows in zip(_OF_SETS, self._sets, strict=False):
             first[key] = rows[0]
         return self._form.cast(first)
 
@@ -208,31 +205,31 @@ class ActiveSlamTask(Restorable):
         beliefs: BatchStorage,
         worlds: BoolArray,
         moving: BoolArray,
-        actions: ArrayLike = ((0.0, 0.0),),
-        collisions: BoolArray | None = None,
+        actions: Array,
+        collisions: BoolArray,
     ) -> None:
-        numbers, mapped, *sets = self._rows
-        worlds_now: tuple[Any, ...] = (  # a `Worlds`
-            tuple(beliefs),
-            np.asarray(actions, dtype=np.float64),
-            worlds if collisions is None else collisions,
-            tuple(self.episodes),
-            tuple(self.outcome),
-            (self.mapped, self.known),
-            (numbers, self._starts),
-            mapped,
-        )
-        advance(worlds, moving, worlds_now, self.grid.plan, self._rules, self._scratch)
-        if sets:
-            write_landmark_sets(worlds, worlds_now[0], self.episodes.known, *sets)
+        held: Any = tuple(beliefs)
+        groups = held, tuple(self.episodes), tuple(self.results), self._fixed
+        advance(worlds, moving, actions, collisions, *groups)
+        if self._sets:
+            write_landmark_sets(worlds, held, self.episodes.known, *self._sets)
 
-    def _empty_rows(self) -> tuple[AnyArray, ...]:
-        rows = np.empty(self._starts[-1]), np.empty(self._shape, dtype=np.bool_)
+    def _empty_results(self) -> StepResults:
+        count = self._shape[0]
+        return StepResults(
+            np.empty(self._size),
+            np.empty(self._shape, np.bool_),
+            np.empty(count),
+            np.empty((3, count), np.bool_),
+            np.empty((2, count), np.int64),
+        )
+
+    def _empty_sets(self) -> tuple[AnyArray, ...]:
+        """Return arrays for the entries that only observations as sets have."""
         if not self._form.rows:
-            return rows
+            return ()
         shape = self._shape[0], self._form.rows
-        landmarks = np.empty((*shape, len(FEATURES)))
-        return *rows, landmarks, np.empty(shape, dtype=np.bool_)
+        return np.empty((*shape, len(FEATURES))), np.empty(shape, dtype=np.bool_)
 
 
 def split_settings(
@@ -268,11 +265,6 @@ def _rules(
         scenario.steps,
         prior_std,
     )
-
-
-def _no_outcome(count: int) -> StepOutcome:
-    no = np.zeros((3, count), dtype=np.bool_)
-    return StepOutcome(np.zeros(count), no[0], no[1], no[2])
 
 
 # Entries of `AssociationScores` that `info` reveals.

@@ -214,7 +214,7 @@ def live_storage(estimator: EkfSlam, size: int) -> BatchStorage:
 # --------------------------------------------------------------------------------------
 # The kernels: one pass over all worlds.
 
-# Of B worlds, in the alphabetical order of their keys, see `belief_features`.
+# In the alphabetical order of their keys, see `belief_features`.
 FeatureArrays = tuple[Array, Array, Array, Array, BoolArray, Array, Array, Array]
 
 # Standard deviations [m, rad] that `on_log_scale` maps to 0 and to 1.
@@ -320,31 +320,31 @@ def relative_spread(
 
 @njit_internal
 def write_belief_features(
-    b: int, mean: Array, P: Array, slots: IntArray, box: Bounds, into: FeatureArrays
+    mean: Array, P: Array, slots: IntArray, box: Bounds, into: FeatureArrays
 ) -> None:
-    """Write the features of one belief into row b, see `belief_features`."""
-    corr, map_std, std, landmarks, mask, poses, pose_corr, pose_std = into
+    """Write the features of one belief, see `belief_features`, into flat arrays."""
+    corr, map_std, std, landmarks, mask, pose, pose_corr, pose_std = into
     left, bottom, right, top = box
     diagonal = math.hypot(right - left, top - bottom)
-    write_pose_features(mean, P, box, poses[b], pose_corr[b], pose_std[b])
-    cos, sin = poses[b, 2], poses[b, 3]
+    write_pose_features(mean, P, box, pose, pose_corr, pose_std)
+    cos, sin = pose[2], pose[3]
     for i in range(len(slots)):
-        mask[b, i] = slots[i] >= 0
-        if not mask[b, i]:
-            corr[b, i] = map_std[b, i] = 0.0
-            std[b, i] = 0.0
-            landmarks[b, i] = 0.0
+        j, k = 2 * i, 2 * i + 1
+        mask[i] = slots[i] >= 0
+        if not mask[i]:
+            corr[i] = map_std[i] = 0.0
+            std[j] = std[k] = landmarks[j] = landmarks[k] = 0.0
             continue
         x = 3 + 2 * slots[i]
         dx, dy = mean[x] - mean[0], mean[x + 1] - mean[1]
-        landmarks[b, i, 0] = clip_jit((cos * dx + sin * dy) / diagonal, -1.0, 1.0)
-        landmarks[b, i, 1] = clip_jit((cos * dy - sin * dx) / diagonal, -1.0, 1.0)
+        landmarks[j] = clip_jit((cos * dx + sin * dy) / diagonal, -1.0, 1.0)
+        landmarks[k] = clip_jit((cos * dy - sin * dx) / diagonal, -1.0, 1.0)
         xx, xy, yy = relative_spread(P, x, dx, dy)
         aa, ab, bb = turned_jit(xx, xy, yy, cos, sin)
         ahead, aside = root_jit(aa), root_jit(bb)
-        std[b, i, 0], std[b, i, 1] = on_log_scale_jit(ahead), on_log_scale_jit(aside)
-        corr[b, i] = correlation_jit(ab, ahead * aside)
-        map_std[b, i] = on_log_scale_jit(root_jit(largest_variance(P, x)))
+        std[j], std[k] = on_log_scale_jit(ahead), on_log_scale_jit(aside)
+        corr[i] = correlation_jit(ab, ahead * aside)
+        map_std[i] = on_log_scale_jit(root_jit(largest_variance(P, x)))
 
 
 @jit_in_place
@@ -356,5 +356,10 @@ def write_features(
     features: FeatureArrays,
 ) -> None:
     """Write the features of all beliefs, see `belief_features`."""
+    corr, map_std, std, landmarks, mask, poses, pose_corr, pose_std = features
+    shape = len(slots), 2 * slots.shape[1]
+    std, landmarks = std.reshape(shape), landmarks.reshape(shape)
     for b in range(len(means)):
-        write_belief_features(b, means[b], covariances[b], slots[b], bounds, features)
+        landmark_rows = corr[b], map_std[b], std[b], landmarks[b], mask[b]
+        rows = *landmark_rows, poses[b], pose_corr[b], pose_std[b]
+        write_belief_features(means[b], covariances[b], slots[b], bounds, rows)

@@ -426,8 +426,10 @@ class SeparateFilters(Restorable):
             slam.predict(observation["odometry"])
             self._steps[run] += 1
         (seen,) = observation["mask"].nonzero()
-        ids = seen.tolist() if self._by_id else None
-        slam.update(observation["landmarks"][seen], ids)
+        readings, ids = observation["landmarks"].take(seen, axis=0), None
+        if self._by_id:  # a filter of another library may need a list
+            ids = seen if self._live[run] else seen.tolist()
+        slam.update(readings, ids)
         if self._live[run]:
             self._show(run, cast("EkfSlam", slam))
             return

@@ -130,8 +130,9 @@ class UnicycleBody(Restorable):
         dx, dy = displacement(forward, sideways, self._cos, self._sin)
         share = 1.0
         if self._walls:
-            x, y, _ = self._pose
-            share = self._contacts.free_share(x, y, dx, dy)
+            (x, y, _), contacts = self._pose, self._contacts
+            if is_near(x, y, dx, dy, contacts.ends, contacts.reach):
+                share = contacts.free_share(x, y, dx, dy)
         if share < 1.0:
             dx, dy = share * dx, share * dy
         self._body.velocity = dx, dy
@@ -262,14 +263,15 @@ def _outward(
     return hit.shape.point_query(start).gradient
 
 
-@njit_internal
-def _is_near(way: Wall, walls: Array, reach: float) -> bool:
-    """Return whether a way comes within reach of a wall.
+@jit_in_place
+def is_near(
+    x: float, y: float, dx: float, dy: float, walls: Array, reach: float
+) -> bool:
+    """Return whether a way from (x, y) comes within reach of a wall.
 
     A wall beyond the length of the way from its start is out of reach at once.
     """
-    dx, dy = way[2] - way[0], way[3] - way[1]
-    length = math.sqrt(dx * dx + dy * dy)
+    way, length = (x, y, x + dx, y + dy), math.sqrt(dx * dx + dy * dy)
     for w in range(len(walls)):
         wall = walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
         if _gap(way[0], way[1], wall) <= reach + length and _meet(way, wall, reach):
@@ -456,7 +458,7 @@ def _move(  # noqa: PLR0917 (numba takes arrays more quickly than tuples of them
             forward, sideways = path[b, 0] + slip[b, 0], path[b, 1] + slip[b, 1]
         dx, dy = displacement_jit(forward, sideways, frame[3, b], frame[4, b])
         after[2, b] += commands[b, 1] + slip[b, 2]
-        if dx * dx + dy * dy > 0.0 and _is_near((x, y, x + dx, y + dy), walls, reach):
+        if dx * dx + dy * dy > 0.0 and is_near(x, y, dx, dy, walls, reach):
             after[0, b], after[1, b] = dx, dy
             near[count] = b
             count += 1

@@ -134,7 +134,7 @@ def clipped_action(action: ArrayLike, limits: Sequence[float]) -> tuple[float, f
     >>> clipped_action([3, -0.5], limits=(1.0, 1.0))
     (1.0, -0.5)
     """
-    speed, turn_rate = _real_numbers(action, (2,), partial(_refusal, action)).tolist()
+    speed, turn_rate = _real_numbers(action, (2,), _refusal).tolist()
     fastest, quickest = limits
     if not (-fastest <= speed <= fastest and -quickest <= turn_rate <= quickest):
         if not (math.isfinite(speed) and math.isfinite(turn_rate)):
@@ -211,28 +211,28 @@ def _begin_step(
 
 
 def _real_numbers(
-    value: ArrayLike, shape: tuple[int, ...], refusal: Callable[[str], ValueError]
+    value: ArrayLike, shape: tuple[int, ...], refusal: Callable[..., ValueError]
 ) -> AnyArray:
     try:
         array = np.asarray(value)
     except ValueError:  # ragged
-        raise refusal(repr(value)) from None
+        raise refusal(value, repr(value)) from None
     if array.shape != shape:
-        raise refusal(f"shape {array.shape}")
+        raise refusal(value, f"shape {array.shape}")
     if isinstance(value, np.ma.MaskedArray):  # what lies under a mask means nothing
-        raise refusal("a masked array")
+        raise refusal(value, "a masked array")
     if array.dtype.char not in _REAL_NUMBERS:
-        raise refusal(f"{array.dtype}")
+        raise refusal(value, f"{array.dtype}")
     return array
 
 
-def _refusal(action: ArrayLike, got: str = "") -> ValueError:
+def _refusal(action: ArrayLike, _got: str = "") -> ValueError:
     return ValueError(
         f"action must be 2 finite numbers (v [m/s], ω [rad/s]), got {action!r}"
     )
 
 
-def _refusal_of_many(count: int, got: str) -> ValueError:
+def _refusal_of_many(count: int, _actions: ArrayLike, got: str) -> ValueError:
     return ValueError(
         f"actions must be real numbers of shape ({count}, 2), one row "
         f"(v [m/s], ω [rad/s]) per world, got {got}"
