@@ -23,11 +23,13 @@ from ...jit import jit, jit_in_place, njit_allocating, njit_internal
 from ..interface import MapView
 from ..kernels.assignment_search import (
     UNPAIRED,
+    Problem,
     best_assignments,
-    cost_if_settled,
     fill_expected,
     largest_change,
+    least_distances,
     only_partners,
+    settled_assignments,
 )
 from ..kernels.scan_update import copy_covariance
 from ..models.bearing_range import (
@@ -148,28 +150,47 @@ def assign_jointly(
     pairs, of_map = (feasible, innovations, variances), (expected, joint)
     of_scan = innovations, joint, variances, feasible, missing
     problem = *of_scan, pair_gate, limits, pairs_first
+    reach = most, BRANCH_SPREAD, ceiling
+    costs, marks = missing[:0], np.empty((0, rows), np.int64)
     partners = only_partners(feasible)
     if len(partners) == rows and not pairs_first:
         _fill_pairs(pairs, readings, of_map, of_sensor, True)
-        cost = cost_if_settled(problem, partners, most, BRANCH_SPREAD, ceiling, SAME)
-        if cost < np.inf:
-            return np.full(1, cost), explained[partners].reshape((1, rows)), explained
+        costs, marks = settled_assignments(problem, partners, *reach, SAME)
+    if len(costs) == 1 and (marks[0] != UNPAIRED).all():
+        return costs, explained[marks[0]].reshape((1, rows)), explained
     _fill_pairs(pairs, readings, of_map, of_sensor, False)
-    costs, marks, distances, _ = best_assignments(
-        problem, most, BRANCH_SPREAD, ceiling, nodes
-    )
+    if len(costs) > 0:
+        distances = least_distances(Problem(*problem), marks)
+    else:
+        costs, marks, distances, _ = best_assignments(problem, *reach, nodes)
+    slots, kept = _slots(problem, (costs, marks), distances, explained)
+    return costs[:kept], slots[:kept], explained
+
+
+@njit_allocating
+def _slots(
+    problem: tuple[Any, ...],
+    found: tuple[Array, IntArray],
+    distances: Array,
+    explained: IntArray,
+) -> tuple[IntArray, int]:
+    """Return the slots of assignments, and how many are not superfluous.
+
+    These move to the front of ``found``, costs and marks.
+    """
+    (costs, marks), pair_gate = found, Problem(*problem).gate
     slots, kept = np.empty_like(marks), 0
     for s in range(len(marks)):
-        for i in range(rows):
+        for i in range(marks.shape[1]):
             slots[kept, i] = AMBIGUOUS if distances[s, i] <= pair_gate else NEW
             if marks[s, i] != UNPAIRED:
                 slots[kept, i] = explained[marks[s, i]]
         if not _is_superfluous(problem, marks[:kept], marks[s], slots[kept]):
             costs[kept] = costs[s]
-            for i in range(rows):
+            for i in range(marks.shape[1]):
                 marks[kept, i] = marks[s, i]
             kept += 1
-    return costs[:kept], slots[:kept], explained
+    return slots, kept
 
 
 @njit_allocating

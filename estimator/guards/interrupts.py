@@ -51,6 +51,8 @@ class changing:  # noqa: N801 (reads as a verb, in a with statement)
     RuntimeError: Interruptible was interrupted in update: reset it or load a state
     """
 
+    __slots__ = "_anew", "_before", "_call", "_slam", "_steps", "_undo"
+
     def __init__(
         self,
         slam: Any,
@@ -64,9 +66,9 @@ class changing:  # noqa: N801 (reads as a verb, in a with statement)
     def __enter__(self) -> None:
         """Refuse a filter with a mark, unless its state is replaced; mark it."""
         slam = self._slam
-        if not self._anew:
-            slam.refuse_interrupted()
         self._before, self._steps = slam.interrupted_in, slam.steps
+        if self._before and not self._anew:
+            slam.refuse_interrupted()
         slam.interrupted_in = self._call
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

@@ -59,10 +59,13 @@ def _decision_order(feasible: BoolArray, innovations: Array) -> IntArray:
 
     Ties are broken by the readings themselves: the order of the scan has no effect.
     """
-    _, options = _candidates(feasible)
-    order = np.arange(len(options))
-    if feasible.shape[1] == 0:  # there are no innovations to compare
+    rows, landmarks = feasible.shape
+    options, order = np.zeros(rows, np.int64), np.arange(rows)
+    if landmarks == 0:  # there are no innovations to compare
         return order
+    for i in range(rows):
+        for j in range(landmarks):
+            options[i] += feasible[i, j]
     for i in range(1, len(options)):
         k = i
         while k > 0:
@@ -281,11 +284,11 @@ def best_assignments(
 
 @njit_allocating
 def only_partners(feasible: BoolArray) -> IntArray:
-    """Return the one landmark that each reading may belong to; nothing if not all do.
+    """Return the landmark that each reading may belong to, or `UNPAIRED`.
 
-    No two readings may belong to the same landmark.
+    Nothing if a reading may belong to several, or several to the same one.
     """
-    partners = np.empty(len(feasible), np.int64)
+    partners = np.full(len(feasible), UNPAIRED)
     is_taken = np.zeros(feasible.shape[1], np.bool_)
     for i in range(feasible.shape[0]):
         found = 0
@@ -294,37 +297,40 @@ def only_partners(feasible: BoolArray) -> IntArray:
                 if is_taken[j]:
                     return partners[:0]
                 partners[i], is_taken[j], found = j, True, found + 1
-        if found != 1:
+        if found > 1:
             return partners[:0]
     return partners
 
 
 @njit_allocating
-def cost_if_settled(
+def settled_assignments(
     of_scan: tuple[Any, ...],
     partners: IntArray,
     most: int,
     spread: float,
     ceiling: float,
     same: float,
-) -> float:
-    """Return the cost of pairing all readings, if no other assignment is of interest.
+) -> tuple[Array, IntArray]:
+    """Return the cheapest assignments if they pair all readings or all but one.
 
-    The search finds this assignment first, with the same cost to the bit, if every pair
-    costs less than its reading left out, given the pairs before it.  Leaving out the
-    readings U costs in addition ::
+    Readings near no landmark are not paired by any.  The search finds the assignment
+    that pairs all others first, if every pair costs less than its reading left out,
+    given the pairs before it.  Leaving out the readings U costs
+    in addition ::
 
         Σ λ − ln det S_U − ρᵀ (Q − C⁺)⁻¹ ρ
 
     where S_U is given all other pairs, and ρ and C⁺ are the innovations and C of U
     after all pairs.  Leaving out one reading does not matter if it is too expensive, or
-    if the reading is then near its landmark and hardly changes the belief (`_is_idle`).
-    Leaving out several must be too expensive.  det S_U is at most the product of det S
-    before any pair, and C⁺ ⪯ τ Q with τ = Σ tr Q⁻¹ C⁺ over U.  The last term is at most
-    νᵀ S⁻¹ ν of all pairs.  So leaving out u readings costs at least the larger of ::
+    if the reading is then near its landmark and hardly changes the belief
+    (`_without_one`).  Leaving out several must be too expensive.  det S_U is at most
+    the product of det S before any pair, and the last term at most νᵀ S⁻¹ ν of all
+    pairs.  By Gershgorin's theorem for blocks, C⁺ ⪯ τ Q with the norm of Frobenius in
+    τ = max tr Q⁻¹ C⁺ + (u − 1) max ‖Q^−½ C⁺ Q^−½‖ of one reading and of two.  So
+    leaving out u readings costs at least the larger of ::
 
         u min (λ − ln det S) − νᵀ S⁻¹ ν
-        sum of the u least of λ − ln det S − ρᵀ Q⁻¹ ρ / (1 − u max tr Q⁻¹ C⁺)
+        sum of the u least of λ − ln det S − ρᵀ Q⁻¹ ρ / (1 − τ)
 
     Where C is larger than 10⁶ Q, rounding in ρ and C⁺ could hide another assignment.
 
@@ -335,22 +341,25 @@ def cost_if_settled(
         variances, those of partners are read, and the innovations of the first
         landmark.  ``limits`` are not read, and must be infinite.
     partners : ndarray of int64, shape (m,)
-        The landmark of each reading, from :func:`only_partners`.
+        The landmark of each reading or `UNPAIRED`, from :func:`only_partners`.
     same : float
         Leaving out a reading near its landmark does not matter if it changes the belief
         by less than this, see :func:`largest_change`; at most 1.
 
     Returns
     -------
-    float
-        Infinite if other assignments may be of interest.
+    costs, marks : ndarray, shapes (M,) and (M, m)
+        As the search finds them, to the bit, but for those that do not matter.  Empty
+        if others may be of interest.
     """
-    problem, rows = Problem(*of_scan), len(partners)
+    problem, count = Problem(*of_scan), len(partners)
+    others = np.empty(0), np.empty((0, count), np.int64)
     # The search decides the last of these first.
     order = _decision_order(problem.feasible, problem.innovations)[::-1]
-    names, missing = partners[order], problem.missing[order]
+    rows = (partners != UNPAIRED).sum()  # those with a landmark come first
+    names, missing = partners[order[:rows]], problem.missing[order]
     nu, Q = np.empty((rows, rows, 2)), np.empty((rows, rows, 2))
-    h, C = np.zeros((2, rows, 2)), np.empty((2, 2 * rows, 2 * rows))
+    h, C = np.zeros((3, rows, 2)), np.empty((3, 2 * rows, 2 * rows))
     for a in range(rows):
         for i in range(2):
             nu[a, a, i] = problem.innovations[order[a], names[a], i]
@@ -359,63 +368,135 @@ def cost_if_settled(
                 for k in range(2):
                     value = problem.joint[2 * names[a] + i, 2 * names[b] + k]
                     C[0, 2 * a + i, 2 * b + k] = value
-    cost, squared, here, gains = 0.0, 0.0, 0, np.empty((4, 2 * rows))
     saved = np.empty(rows)  # λ − ln det S
     for a in range(rows):
         c, d = 2 * a, 2 * a + 1
         if not (C[0, c, c] < WIDE * Q[a, a, 0] and C[0, d, d] < WIDE * Q[a, a, 1]):
-            return np.inf
+            return others
         s00, s11 = C[0, c, c] + Q[a, a, 0], C[0, d, d] + Q[a, a, 1]
         saved[a] = missing[a] - np.log(s00 * s11 - C[0, d, c] * C[0, d, c])
-    for a in range(rows - 1, -1, -1):
-        c, d = 2 * a, 2 * a + 1
-        n0, n1 = nu[a, a, 0] - h[here, a, 0], nu[a, a, 1] - h[here, a, 1]
-        s00, s11 = C[here, c, c] + Q[a, a, 0], C[here, d, d] + Q[a, a, 1]
-        x, determinant = fit(n0, n1, s00, C[here, d, c], s11)
-        own = x + np.log(determinant)
-        if not (x <= problem.gate and own < missing[a]):
-            return np.inf
-        cost, squared = cost + own, squared + x
-        condition(nu, Q, a, a, rows, h, C, here, 1 - here, gains)
-        here = 1 - here
+    of_pairs, limits = (nu, Q, h, C, np.empty((4, 2 * rows))), (problem.gate, missing)
+    cost, squared, here = _paired(of_pairs, limits, -1)
+    if not cost < np.inf:
+        return others
     limit = min(cost if most == 1 else np.inf, cost + spread, ceiling)
     margin = max(limit - cost, 0.0) + ROUNDING
     allowed, least_saved = (margin, problem.gate, same), saved.min() if rows else np.inf
+    # What it costs to leave out each reading, and none; whether that does not matter.
+    more, is_idle = np.full(rows + 1, np.inf), np.ones(rows + 1, np.bool_)
+    more[rows], is_idle[rows] = 0.0, False
     # ρᵀ Q⁻¹ ρ of each reading, and the largest tr Q⁻¹ C⁺.
     residuals, share = np.empty(rows), 0.0
     for a in range(rows):
         c, d, q0, q1 = 2 * a, 2 * a + 1, Q[a, a, 0], Q[a, a, 1]
         n0, n1 = nu[a, a, 0] - h[here, a, 0], nu[a, a, 1] - h[here, a, 1]
         left = q0 - C[here, c, c], -C[here, d, c], q1 - C[here, d, d]
-        if not (
-            least_saved - squared >= margin
-            or _is_idle((n0, n1), left, (q0, q1), missing[a], allowed)
-        ):
-            return np.inf
+        if least_saved - squared < margin:
+            one = _without_one((n0, n1), left, (q0, q1), missing[a], allowed)
+            if np.isnan(one[0]):
+                return others
+            more[a], is_idle[a] = one
         residuals[a] = n0 * n0 / q0 + n1 * n1 / q1
         share = max(share, C[here, c, c] / q0 + C[here, d, d] / q1)
+    apart = 0.0
+    if 2 * least_saved - squared < margin:
+        apart = _largest_apart(C[here], Q)
     for u in range(2, rows + 1):
         if u * least_saved - squared >= margin:
             break
-        least, next_least = np.inf, np.inf
+        least, next_least, tau = np.inf, np.inf, share + (u - 1) * apart
         for a in range(rows):
-            more = saved[a] - residuals[a] / (1 - u * share)
-            next_least = min(next_least, max(least, more))
-            least = min(least, more)
-        if not (u * share < 1 and least + (u - 1) * next_least >= margin):
-            return np.inf
-    return cost
+            one_more = saved[a] - residuals[a] / (1 - tau)
+            next_least = min(next_least, max(least, one_more))
+            least = min(least, one_more)
+        if not (tau < 1 and least + (u - 1) * next_least >= margin):
+            return others
+    costs, marks, found, last = np.empty(most), np.full((most, count), UNPAIRED), 0, 0.0
+    for place in range(most + 1):
+        a = int(np.argmin(more))
+        if not more[a] < margin:
+            break
+        if place > 0 and more[a] - last < ROUNDING:
+            return others
+        last, more[a] = more[a], np.inf
+        if place == most or is_idle[a]:
+            continue
+        costs[found] = cost if a == rows else _paired(of_pairs, limits, a)[0]
+        if a < rows and not costs[found] < min(costs[0] + spread, ceiling):
+            continue
+        for b in range(rows):
+            marks[found, order[b]] = UNPAIRED if a == b else names[b]
+        found += 1
+    while found > 0 and costs[found - 1] > costs[0] + spread:
+        found -= 1
+    return costs[:found], marks[:found]
+
+
+@njit_allocating
+def _paired(
+    of_pairs: tuple[Array, ...], limits: tuple[float, Array], without: int
+) -> tuple[float, float, int]:
+    """Pair all readings but one, the last first; infinite if the search does not.
+
+    Parameters
+    ----------
+    of_pairs : tuple of ndarray
+        ν, Q, h and C of the pairs, and the gains of :func:`condition`.
+    limits : tuple
+        The gate, and λ of each reading.
+    without : int
+        The reading to leave out; −1 for none.  Then all readings are conditioned on
+        each pair, else only those still open, and the search finds this first.
+
+    Returns
+    -------
+    cost, squared, here : float, float, int
+        −2 ln of the likelihood, νᵀ S⁻¹ ν, and the level of ``h`` and ``C``.
+    """
+    (nu, Q, h, C, gains), (gate, missing) = of_pairs, limits
+    cost, squared, here = 0.0, 0.0, 0
+    for a in range(len(missing) - 1, -1, -1):
+        if a == without or a >= len(nu):
+            cost = cost + missing[a]
+            continue
+        c, d = 2 * a, 2 * a + 1
+        n0, n1 = nu[a, a, 0] - h[here, a, 0], nu[a, a, 1] - h[here, a, 1]
+        s00, s11 = C[here, c, c] + Q[a, a, 0], C[here, d, d] + Q[a, a, 1]
+        x, determinant = fit(n0, n1, s00, C[here, d, c], s11)
+        own = x + np.log(determinant)
+        if not (x <= gate and (own < missing[a] or without >= 0)):
+            return np.inf, squared, here
+        cost, squared, to = cost + own, squared + x, 2 if here == 1 else 1
+        count = len(nu) if without < 0 else a
+        condition(nu, Q, a, a, count, h, C, here, to, gains)
+        here = to
+    return cost, squared, here
 
 
 @njit_internal
-def _is_idle(
+def _largest_apart(C: Array, Q: Array) -> float:
+    """Return the largest ‖Q^−½ C Q^−½‖ of two readings, in the norm of Frobenius."""
+    largest = 0.0
+    for a in range(len(Q)):
+        for b in range(a):
+            total = 0.0
+            for i in range(2):
+                for k in range(2):
+                    value = C[2 * a + i, 2 * b + k]
+                    total += value * value / (Q[a, a, i] * Q[b, b, k])
+            largest = max(largest, total)
+    return float(np.sqrt(largest))
+
+
+@njit_internal
+def _without_one(
     rho: tuple[float, float],
     left: tuple[float, float, float],
     q: tuple[float, float],
     missing: float,
     limits: tuple[float, float, float],
-) -> bool:
-    """Return whether it does not matter if one reading is left out.
+) -> tuple[float, bool]:
+    """Return what it costs to leave out one reading, and whether it does not matter.
 
     Given all other pairs, ::
 
@@ -432,21 +513,26 @@ def _is_idle(
     limits : tuple of float
         Additional cost that is too expensive, gate of an ambiguous reading, and change
         below which a belief counts as the same.
+
+    Returns
+    -------
+    more, is_idle : float, bool
+        nan where rounding could spoil it.
     """
     (m00, m10, m11), (q0, q1), (margin, gate, same) = left, q, limits
     x, determinant = fit(rho[0], rho[1], m00, m10, m11)
     share = determinant / (q0 * q1)  # det Q / det S
     if not (m00 > 0 and share >= KNOWN):
-        return False
+        return np.nan, False
     more = missing - x - np.log(q0 * q1 / share)
     if more >= margin:
-        return True
+        return more, True
     half = (m00 / q0 + m11 / q1) / 2
     least = half - np.sqrt(max(half * half - share, 0.0))
     squared = (1 + x) * (1 - least) / least  # of the largest change
     # Then λ < ½ and det S < 4 det Q, which is below `SURE`: its place is certain.
     is_same = squared < same * same * (1 - ROUNDING)
-    return more >= ROUNDING and x <= gate * (1 - ROUNDING) and is_same
+    return more, more >= ROUNDING and x <= gate * (1 - ROUNDING) and is_same
 
 
 # --------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import accumulate
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -65,7 +65,7 @@ from ..filters.gaussian_map import (
 )
 from ..interface import MapView, SlamEstimator, hides_its_belief
 from ..kernels.scan_update import DONE, OUTCOME, SLOT, USED, usable
-from ..models.bearing_range import wrap_angle
+from ..models.bearing_range import wrap_angle, wrap_angle_jit
 from ..models.relative_geometry import variance_from_robot
 from ..models.sensors import BEARING_RANGE
 from .loop_closing import ACCURATE, FEWEST_READINGS, LOCAL_STD, NEAR_STDS
@@ -101,8 +101,8 @@ class ClearScan(NamedTuple):
     names: IntArray
     #: The tentative landmarks after the scan.
     following: TentativeLandmarks
-    #: What `count_clear` returned, where the scan has been taken in at once.
-    counted: tuple[bool, bool] | None
+    #: What `count_clear` returned, where the scan has been taken in at once; else 0.
+    counted: int
     #: −2 ln of the likelihood of the associations to consider, the best first.
     costs: Sequence[float] = (0.0,)
     #: Slot of the map of each reading, `NEW` or `AMBIGUOUS`, shape (M, m).
@@ -177,7 +177,6 @@ class ClearScans:
         ceiling: float,
         candidates: Candidates,
         records: LandmarkRecords,
-        *,
         alone: bool,
     ) -> ClearScan | None:
         """Associate a scan (m, 2); return None if it is not clear.
@@ -199,24 +198,34 @@ class ClearScans:
         if self._tally is None and not self._begin(candidates, records):
             return None
         gaussian, known = self._filter.map, candidates.tentative
-        is_given, count = ids is not None, len(readings)
-        at_once = alone and self._filter is self._slam and not len(known.seen)
-        if at_once and (last := gaussian.newest()) is not None:  # inlined
-            last.detach()
-        names = np.empty(count, np.int64) if ids is None else ids
-        tentative = known.mean, known.covariance, known.seen
-        blocks, flags = (gaussian.block, self._tally), (is_given, at_once)
-        is_taken, is_afar, is_used, found = associate_clear(
-            blocks, tentative, readings, names, ceiling, flags
+        count, way, names = len(readings), ALONE if alone else 0, ids
+        if alone and self._filter is self._slam and not len(known.seen):
+            way |= AT_ONCE
+            if (last := gaussian.newest()) is not None:  # inlined
+                last.detach()
+        if names is None:
+            names = np.empty(count, np.int64)
+        else:
+            way |= GIVEN
+        counted, found = associate_clear(
+            gaussian.block,
+            self._tally,
+            known.mean,
+            known.covariance,
+            known.seen,
+            readings,
+            names,
+            ceiling,
+            way,
         )
-        if found is None and not is_taken:
+        if found is None and not counted:
             return None
         number, row_ids = candidates.scan + self._ahead, tuple(names.tolist())
-        labels, counted = (NO_LABEL,) * count, (is_afar, is_used) if is_taken else None
+        labels = (NO_LABEL,) * count
         scan = ClearScan(readings, number, row_ids, labels, names, known, counted)
         if found is None:
             return scan
-        if is_given:
+        if ids is not None:
             following = known.after_scan(self._policy.confirm[1])
             return scan._replace(slots=found[1], following=following, is_given=True)
         return self._with_rows(scan, *found)
@@ -315,40 +324,38 @@ class ClearScans:
 
     def update(self, scan: ClearScan) -> bool:
         """Update by a scan as associated; return False if the filter refuses it."""
-        recent, before, unused = self._recent, None, tuple[int, ...]()
+        recent, before, unused = self._recent, None, ()
         if scan.tentative_rows:
             before = recent.state_before(scan.number, scan.labels)
         counted = scan.counted or self._updated(scan)
-        if counted is None:
+        if not counted:
             return False
-        is_afar, is_used = counted
         self._ahead += 1
-        if is_afar:
+        if counted & AFAR:
             parts = self._filter.map.parts
             mean, P = parts.mean[:3], parts.covariance[:3, :3]
             self._path.append([scan.number, *mean.tolist(), *P.ravel().tolist()])
-        if not is_used:
+        if counted & UNUSED:
             report = self._slam.report()
             unused = *report.rejected_ids, *report.skipped_ids
         decided = scan.row_ids, scan.labels
         recent.note_clear(scan.number, scan.readings, decided, before, unused)
         return True
 
-    def _updated(self, scan: ClearScan) -> tuple[bool, bool] | None:
-        """Update the filter by a scan, and count it; return None if it refuses."""
+    def _updated(self, scan: ClearScan) -> int:
+        """Update the filter by a scan, and count it; return 0 if it refuses."""
         gaussian, rows = self._filter.map, scan.slots[0] >= 0
         fed = scan.readings[rows], scan.names[rows]
         if self._filter is self._slam:
             if gaussian.take_in(update_map, *fed) != DONE:
-                return None
+                return 0
         else:
             try:
                 self._slam.update(*fed)
             except (ValueError, np.linalg.LinAlgError):
-                return None
+                return 0
         read = scan.readings, scan.slots[0], scan.tentative_slots
-        found: Any = count_clear(gaussian.block, self._tally, *read, scan.is_given)
-        return cast("tuple[bool, bool]", found)
+        return count_clear(gaussian.block, self._tally, *read, int(scan.is_given))
 
     def renew(self, before: Candidates, records: LandmarkRecords) -> Candidates:
         """Return the candidates after the scans taken in; renew the records."""
@@ -417,7 +424,12 @@ def is_near(one: Marginals, other: Marginals) -> bool:
         return False
     gap = other.mean - one.mean
     gap[2] = wrap_angle(float(gap[2]))
-    return bool((gap**2 + other.variances <= (1 + SAME**2) * one.variances).all())
+    return bool(is_near_in(gap, one.variances, other.variances).all())
+
+
+def is_near_in(gap: Any, variance: Any, other: Any) -> Any:
+    """Return whether a second belief is near a first one in some coordinates."""
+    return gap**2 + other <= (1 + SAME**2) * variance
 
 
 # --------------------------------------------------------------------------------------
@@ -429,7 +441,16 @@ COUNT, FIRST_NEW, NEWEST, HAS_PLACE, WHOLE = 0, 1, 2, 3, 4
 
 # The numbers after these: evidence that the run is lost, the sums of the density, the
 # last place on the path, the evidence of the scan that waits, and the settings.
-EVIDENCE, SUMS, SHARE, PLACE, FEWER, SETTINGS, NUMBERS = 0, 8, 11, 13, 15, 16, 34
+EVIDENCE, SUMS, SHARE, PLACE, FEWER, SETTINGS, NUMBERS = 0, 8, 11, 13, 15, 16, 35
+
+
+# How a kernel is to associate a scan: by given landmarks; for the only hypothesis,
+# which may not split; and the filter may take in the scan.
+GIVEN, ALONE, AT_ONCE = 1, 2, 4
+
+# What has become of a scan: the filter has taken it in, but has left readings unused;
+# and the path of the run is to remember the pose.
+TAKEN, UNUSED, AFAR = 1, 2, 4
 
 
 class Tally(NamedTuple):
@@ -468,6 +489,7 @@ class ClearRules(NamedTuple):
     lost: float  # a landmark that is known less well may be lost [m]
     least: float  # landmarks of a constellation that recognises lost ones
     keeps_path: float
+    hypotheses: float  # at most
 
 
 def settings_of(policy: LandmarkPolicy, sensor: AssociationSensor) -> Array:
@@ -489,6 +511,7 @@ def settings_of(policy: LandmarkPolicy, sensor: AssociationSensor) -> Array:
             lost,
             least,
             splits,
+            policy.hypotheses,
         ]
     )
 
@@ -553,9 +576,10 @@ def settings_in(tally: Tally) -> ClearRules:
     s = tally.numbers[SETTINGS:]
     noise, sighting = (s[0], s[1], s[2], s[3]), (s[4], s[5], s[6], s[7])
     first = s[8], s[9], s[10], s[11], s[12], s[13]
-    return ClearRules(noise, sighting, *first, s[14], s[15], s[16], s[17])
+    return ClearRules(noise, sighting, *first, s[14], s[15], s[16], s[17], s[18])
 
 
+is_near_jit = njit_inlined(is_near_in)
 tally_jit, lost_jit = njit_inlined(tally_of), njit_inlined(lost_of)
 settings_jit = njit_inlined(settings_in)
 
@@ -565,23 +589,26 @@ settings_jit = njit_inlined(settings_in)
 
 
 @jit
-def associate_clear(
-    blocks: tuple[Array, Array],
-    tentative: tuple[Array, Array, IntArray],
+def associate_clear(  # noqa: PLR0917 (tuples would reach the kernel later)
+    block: Array,
+    tally_block: Array,
+    tentative_mean: Array,
+    tentative_covariance: Array,
+    tentative_seen: IntArray,
     readings: Array,
     ids: IntArray,
     ceiling: float,
-    flags: tuple[bool, bool],
-) -> tuple[bool, bool, bool, Associations | None]:
+    way: int,
+) -> tuple[int, Associations | None]:
     """Associate a scan; take it in at once if nothing is left to decide.
 
     Parameters
     ----------
-    blocks : tuple of ndarray
+    block, tally_block : ndarray
         The memory of the filter, and that of its hypothesis (:class:`Tally`), in which
         the counts of the scan wait.
-    tentative : tuple
-        Mean, covariance and ``seen`` of the `TentativeLandmarks`.
+    tentative_mean, tentative_covariance, tentative_seen : ndarray
+        Of the `TentativeLandmarks`.
     readings : ndarray, shape (m, 2)
         Rows (β, r) [rad, m].
     ids : ndarray of int64, shape (m,)
@@ -589,39 +616,81 @@ def associate_clear(
         association.
     ceiling : float
         Cost beyond which only the best association is of interest.
-    flags : tuple of bool
-        Whether the landmarks are given, and whether the filter may take in a scan with
-        a single association, of mapped landmarks alone.
+    way : int
+        Any of `GIVEN`, `ALONE` and `AT_ONCE`, added up.
 
     Returns
     -------
-    is_taken : bool
-        Whether the filter has taken in the scan; else its belief stays as it is.
-    is_afar, is_used : bool
-        As of `count_clear`, if so.
+    counted : int
+        As of `count_clear` if the filter has taken in the scan, else 0; its belief then
+        stays as it is.
     found : tuple or None
         If the scan is clear, but not taken in: its associations.
     """
-    (block, tally_block), (is_given, at_once), count = blocks, flags, len(readings)
-    parts, tally = parts_jit(block), tally_jit(tally_block)
+    parts, tally, count = parts_jit(block), tally_jit(tally_block), len(readings)
     if tally.whole[COUNT] != parts.numbers[LANDMARKS]:
-        return False, False, False, None
-    if is_given:
-        found = _given(parts, ids, len(tentative[2]))
+        return 0, None
+    if way & GIVEN:
+        found = _given(parts, ids, len(tentative_seen))
     else:
+        tentative = tentative_mean, tentative_covariance, tentative_seen
         found = _associate(parts, tally, tentative, readings, ceiling)
-    slots = found[1]
+    costs, slots = found[0], found[1]
+    if way & ALONE:
+        costs, slots = _unsplit(block, tally, readings, costs, slots)
     if len(slots) == 0:
-        return False, False, False, None
+        return 0, None
+    is_single = way & AT_ONCE and len(slots) == 1
     for k in range(count):
+        is_single &= slots[0, k] >= 0
         if slots[0, k] >= 0:
             ids[k] = parts.ids[slots[0, k]]
-    is_single = at_once and len(slots) == 1 and (slots >= 0).all()
     if is_single and update_map(block, readings, ids) == DONE:
         read = readings, slots[0], slots[0]
-        is_afar, is_used = count_clear(block, tally_block, *read, is_given)
-        return True, is_afar, is_used, None
-    return False, False, False, found
+        return count_clear(block, tally_block, *read, way & GIVEN), None
+    return 0, (costs, slots, found[2], found[3], found[4])
+
+
+@njit_allocating
+def _unsplit(
+    block: Array, tally: Tally, readings: Array, costs: Array, slots: IntArray
+) -> tuple[Array, IntArray]:
+    """Return the best association of the only hypothesis; none if it splits."""
+    can_split = len(slots) > 1 and settings_jit(tally).hypotheses > 1
+    if can_split and _splits(block, readings, slots):
+        return costs[:0], slots[:0]
+    return costs[:1], slots[:1]
+
+
+@njit_allocating
+def _splits(block: Array, readings: Array, slots: IntArray) -> bool:
+    """Return whether another association leaves a belief that the best one does not.
+
+    It then becomes a hypothesis, as by `differing`; so does one in place of the best
+    one, if the filter refuses this.
+    """
+    first, other = np.empty_like(block), np.empty_like(block)
+    if not _tried(block, readings, slots[0], first):
+        return True
+    one = parts_jit(first)
+    for k in range(1, len(slots)):
+        if _tried(block, readings, slots[k], other):
+            after = parts_jit(other)
+            for c in range(3 + 2 * one.numbers[LANDMARKS]):
+                gap, variance = after.mean[c] - one.mean[c], after.covariance[c, c]
+                if c == 2:
+                    gap = wrap_angle_jit(gap)
+                if not is_near_jit(gap, one.covariance[c, c], variance):
+                    return True
+    return False
+
+
+@njit_allocating
+def _tried(block: Array, readings: Array, slots: IntArray, trial: Array) -> bool:
+    """Fill a belief after an association; return whether the filter accepts it."""
+    ids, rows = parts_jit(block).ids, np.flatnonzero(slots >= 0)
+    trial[:] = block
+    return update_map(trial, readings[rows], ids[slots[rows]]) == DONE
 
 
 @njit_allocating
@@ -865,8 +934,8 @@ def count_clear(
     readings: Array,
     slots: IntArray,
     tentative_slots: IntArray,
-    given: bool,
-) -> tuple[bool, bool]:
+    given: int,
+) -> int:
     """Count a clear scan that the filter has taken in.
 
     Parameters
@@ -877,15 +946,13 @@ def count_clear(
         Rows (β, r) [rad, m].
     slots, tentative_slots : ndarray of int64, shape (m,)
         The best association, and the tentative landmarks, as in `ClearScan`.
-    given : bool
-        Whether the landmarks were given; else the counts of the scan wait.
+    given : int
+        `GIVEN` if the landmarks were given; 0 if the counts of the scan wait.
 
     Returns
     -------
-    is_afar : bool
-        Whether the path of the run is to remember the pose.
-    is_used : bool
-        Whether the filter has used all readings that it was given.
+    int
+        `TAKEN`, with `UNUSED` and `AFAR` added where they apply.
     """
     parts, tally = parts_jit(block), tally_jit(tally_block)
     settings, lost, count = settings_jit(tally), lost_jit(tally), len(readings)
@@ -927,7 +994,7 @@ def count_clear(
     sums[3] = MEMORY * sums[3]
     counts, heading = (tally.miss_counts, tally.information), parts.mean[2]
     add_sightings(counts, seen[0, :used], shown[:used], heading, settings.sighting)
-    return is_afar, used == fed
+    return TAKEN + UNUSED * (used < fed) + AFAR * is_afar
 
 
 @njit_internal

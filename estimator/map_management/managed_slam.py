@@ -228,7 +228,7 @@ class ManagedSlam(FilterWrapper):
         # Refused here if it is not finite, before a filter that checks less has moved.
         displacement = self._settings.motion_noise.motion.moved(reading)
         with changing(self, "predict"):
-            self._step(lambda h: h.predict(reading, dt, displacement))
+            self._step(Hypothesis.predict, reading, dt, displacement)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -294,7 +294,7 @@ class ManagedSlam(FilterWrapper):
         with changing(self, "observe_pose"):
             every = self._hypotheses
             costs = [h.cost for h in every]
-            reports = self._step(lambda h: h.observe_pose(given))
+            reports = self._step(Hypothesis.observe_pose, given)
             if reports[0].degrees_of_freedom:
                 pairs = zip(costs, reports, strict=True)
                 costs = [cost + cost_of(report) for cost, report in pairs]
@@ -375,38 +375,48 @@ class ManagedSlam(FilterWrapper):
         self, readings: Array, ids: IntArray | None
     ) -> UpdateReport | None:
         """Update by a scan if it is clear in every hypothesis; else return None."""
+        if len(self._hypotheses) == 1:
+            return self._update_alone(self._hypotheses[0], readings, ids)
         taken: list[tuple[float, Hypothesis]] = []
         for cost, h, scan in self._clear_branches(readings, ids):
             if h.update_clear(scan):
-                # So that a later error leaves the mark.
-                self.steps += not taken and scan.counted is None
+                self.steps += not taken  # so that a later error leaves the mark
                 taken.append((cost, h))
         if not taken:
             return None
-        if len(self._hypotheses) == 1:
-            return taken[0][1].report
         chosen = distinct([h for _, h in taken], self.policy.hypotheses)
         return self._continue_with([pair for pair in taken if pair[1] in chosen])
+
+    def _update_alone(
+        self, h: Hypothesis, readings: Array, ids: IntArray | None
+    ) -> UpdateReport | None:
+        """Update the only hypothesis by a scan if it is clear; else return None."""
+        scan = h.associate_clear(readings, ids, np.inf, True)
+        if scan is None:
+            return None
+        if scan.counted:
+            self.steps += 1  # so that a later error leaves the mark
+            h.update_clear(scan)
+        elif h.update_clear(scan):
+            self.steps += 1
+        else:
+            return None
+        return h.report
 
     def _clear_branches(
         self, readings: Array, ids: IntArray | None
     ) -> Sequence[ClearBranch]:
-        """Return the best association in each hypothesis; none if it is not clear.
-
-        A single hypothesis may have taken in the scan then: see `ClearScan.counted`.
-        """
-        every, ceiling, others = self._hypotheses, np.inf, 0
+        """Return the best association in each hypothesis; none if it is not clear."""
+        ceiling, others = np.inf, 0
         ranked: list[ClearBranch] = []
-        for h in every:
-            how = ceiling - h.cost, len(every) == 1
-            if (scan := h.associate_clear(readings, ids, *how)) is None:
+        for h in self._hypotheses:
+            scan = h.associate_clear(readings, ids, ceiling - h.cost, False)
+            if scan is None:
                 return ()
-            self.steps += scan.counted is not None
             ranked.append((h.cost + scan.costs[0], h, scan))
             ceiling = min(ceiling, ranked[-1][0] + SPREAD)
             others += len(scan.costs) - 1
-        if len(every) > 1:
-            ranked = sorted([r for r in ranked if r[0] <= ceiling], key=itemgetter(0))
+        ranked = sorted([r for r in ranked if r[0] <= ceiling], key=itemgetter(0))
         return () if others and self._is_split(ranked, ceiling) else ranked
 
     def _is_split(self, ranked: Sequence[ClearBranch], ceiling: float) -> bool:
@@ -530,12 +540,14 @@ class ManagedSlam(FilterWrapper):
             change(best)
             self._continue_with([(0.0, best)])
 
-    def _step(self, step: Callable[[Hypothesis], Result]) -> list[Result]:
+    def _step(self, step: Callable[..., Result], *given: Any) -> list[Result]:
         """Take a step with every hypothesis; the first one refuses what all would."""
-        first, *others = self._hypotheses
-        results = [step(first)]
+        every = self._hypotheses
+        results = [step(every[0], *given)]
         self.steps += 1
-        return results + [step(h) for h in others]
+        if len(every) > 1:
+            results += [step(h, *given) for h in every[1:]]
+        return results
 
     def _changing(self, call: str, *, anew: bool = False) -> changing:
         """Return a block of changes; a refusal takes back what was viewed before it."""
@@ -634,9 +646,11 @@ class Hypothesis:
     def report(self) -> UpdateReport:
         """The report of the last update."""
         scan = self._report
-        if isinstance(scan, UpdateReport):
-            return scan
+        if type(scan) is not ClearScan:
+            return cast("UpdateReport", scan)
         report: UpdateReport = cast("Any", self.filter).report()
+        if scan.counted:  # all rows are of the map
+            return report.completed(row_ids=scan.row_ids)
         return report.completed(
             row_ids=scan.row_ids,
             tentative_rows=scan.tentative_rows,
@@ -662,8 +676,8 @@ class Hypothesis:
         """Associate a scan (m, 2), by its identities if given; None if not clear."""
         if self._clear is None:
             return None
-        known = self._candidates, self.pruner.records
-        return self._clear.associate(readings, ids, ceiling, *known, alone=alone)
+        known, records = self._candidates, self.pruner.records
+        return self._clear.associate(readings, ids, ceiling, known, records, alone)
 
     def tried(self, scan: ClearScan, ceiling: float) -> list[tuple[float, Marginals]]:
         """Return the costs and the beliefs after all associations of a clear scan."""

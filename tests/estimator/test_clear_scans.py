@@ -203,6 +203,28 @@ def test_one_call_takes_in_a_scan_that_leaves_nothing_to_decide(monkeypatch, giv
     assert len(later) < 30
 
 
+def test_the_kernel_decides_whether_the_only_hypothesis_splits(monkeypatch):
+    """The search then splits it: these scans are not clear, and nearly all others."""
+    split, searched, associate = 0, 0, ClearScans.associate
+
+    def watched(*given):
+        scan = associate(*given)
+        assert not given[-1] or scan is None or len(scan.costs) == 1
+        return scan
+
+    monkeypatch.setattr(ClearScans, "associate", watched)
+    slam = make(world=load_scenario("hidden_identities"))
+    for odometry, readings, _ in scans_of("hidden_identities", 400):
+        is_single, before = len(slam.hypotheses) == 1, slam.landmark_ids
+        slam.predict(odometry)
+        report = slam.update(readings)
+        split += is_single and len(slam.hypotheses) > 1
+        is_searched = slam.best._report is report and before == slam.landmark_ids
+        searched += is_single and is_searched and len(slam.hypotheses) == 1
+    assert split > 3
+    assert searched == 0
+
+
 @pytest.mark.parametrize("change", ["remove", "merge", "observe", "load", "resume"])
 def test_changes_between_clear_scans_leave_the_same_filter(count, change):
     scans, world = [*scans_of("loop", 160)], load_scenario("loop")
