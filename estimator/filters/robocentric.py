@@ -79,11 +79,12 @@ class RobocentricEkfSlam(EkfSlam):
         only_placing(self.sensor, "the robocentric filter")
         first = argument_checks.finite_vector("pose", pose, 3)
         std = argument_checks.standard_deviations("pose_std", pose_std, 3)
-        origin, jacobian = _inverse_pose(np.array([0.0, 0.0, first[2]]))
+        c, s = np.cos(first[2]), np.sin(first[2])
+        jacobian = np.array([[-c, -s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
         mean, reference = np.zeros(FIRST_LANDMARK), np.zeros(FIRST_LANDMARK)
         covariance = np.zeros((FIRST_LANDMARK, FIRST_LANDMARK))
         world = slice(ORIGIN, HEADING + 1)
-        mean[world], reference[:3] = origin, first
+        mean[HEADING], reference[:3] = -first[2], first
         reference[ORIGIN:HEADING] = first[:2]
         moved = as_covariance(jacobian @ np.diag(std**2) @ jacobian.T)
         covariance[world, world] = moved
@@ -205,12 +206,3 @@ def _in_world(state: Array, start: Array) -> tuple[Array, Array]:
         jacobian[row : row + 2, ORIGIN:HEADING] = -turn
         jacobian[row : row + 2, HEADING] = y, -x
     return mean, jacobian
-
-
-def _inverse_pose(pose: Array) -> tuple[Array, Array]:
-    """Return the pose of the world in the robot's frame and its Jacobian."""
-    x, y, heading = pose
-    c, s = np.cos(heading), np.sin(heading)
-    inverse = np.array([-c * x - s * y, s * x - c * y, -heading])
-    jacobian = np.array([[-c, -s, inverse[1]], [s, -c, -inverse[0]], [0.0, 0.0, -1.0]])
-    return inverse, jacobian

@@ -232,9 +232,11 @@ def test_merging_tells_no_filter_that_knows_better_its_heading(name):
     assert slam.belief().pose_covariance[2, 2] ** 0.5 == pytest.approx(0.3, abs=1e-9)
 
 
-def test_a_filter_of_ones_own_is_edited_through_its_state():
-    hidden, open_one = doubled("ekf"), doubled("ekf")
-    doors = ("belief", "state_dict", "load_state_dict")  # and nothing else
+@pytest.mark.parametrize("name", ["ekf", "invariant"])
+@pytest.mark.parametrize("more", [(), ("remove",)])
+def test_a_filter_of_ones_own_is_edited_through_its_state(name, more):
+    hidden, open_one = doubled(name), doubled(name)
+    doors = ("belief", "state_dict", "load_state_dict", *more)  # and nothing else
     boxed = SimpleNamespace(**{name: getattr(hidden, name) for name in doors})
     for slam in (boxed, open_one):
         door = MapEditor(slam)

@@ -14,12 +14,14 @@ from scipy.stats import chi2
 from town_drives import TOWN_MOTION_STD, map_all, wander
 
 from slamgym.estimator import check_estimator, list_estimators, make_estimator
+from slamgym.estimator.association.missed_landmarks import LostEvidence
 from slamgym.estimator.map_management import policy as policies
 from slamgym.estimator.map_management.managed_slam import ManagedSlam
 from slamgym.estimator.map_management.policy import FieldOfView, LandmarkPolicy
 from slamgym.estimator.map_management.pruning import LandmarkRecords
 from slamgym.estimator.models.motions import UNICYCLE, differential
 from slamgym.estimator.models.relative_geometry import largest_std, separation
+from slamgym.estimator.registry import find_estimator
 from slamgym.evaluation.nees import normalised_squared_error
 from slamgym.experiments.logs.ground_truth import true_landmarks_of
 from slamgym.experiments.logs.slamlog import OdometryRow, Scan, SlamLog
@@ -632,13 +634,6 @@ def test_two_neighbours_are_not_merged():
     assert in_band(nees, 17)
 
 
-def test_landmarks_seen_side_by_side_are_never_one():
-    slam = make(management={"merge_within": 2.0})
-    pair = polar([(5, 1), (5, 1.001)])
-    for _ in range(50):
-        assert slam.update(pair, [0, 1]).merged_ids == ()
-
-
 @pytest.mark.parametrize("names", [(3, 7), (7, 3)])
 def test_landmarks_seen_together_are_never_merged(names):
     slam = make(management={"merge_within": 1.0})
@@ -663,6 +658,10 @@ def test_two_duplicates_of_a_landmark_are_merged_after_a_scan_of_one():
     slam.load_state_dict(apart.state_dict())
     assert slam.update(polar([(5, 1)]), [2]).merged_ids == ((0, 2), (0, 1))
     assert slam.decisions[-1].merged == ((0, 2), (0, 1))
+    slam.reset((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    for k in range(60):  # half a metre apart, beyond the gate
+        report = slam.update(polar([(5, 1 + 0.5 * (k % 2)), (-3, 2)]), [k % 2, 9])
+        assert report.merged_ids == ()
 
 
 @pytest.mark.parametrize("name", MANAGEABLE)
@@ -787,6 +786,35 @@ def test_members_that_a_filter_passes_on_are_its_own_after_a_state_is_loaded():
     slam.resume(slam.snapshot())
     slam.reset((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
     assert slam.local_view.__self__ is slam.filter
+    assert not hasattr(
+        make("sparse_information", {"association": "hypotheses"}), "local_view"
+    )
+
+
+def test_every_call_is_one_step_and_a_snapshot_holds_their_number_and_the_report():
+    slam = make("ekf", {"confirm": (1, 1)})
+    report = slam.update([(0.5, 4.0)])
+    before, steps = slam.snapshot(), slam.steps
+    slam.predict((0.1, 0.0))
+    slam.observe_pose(0.0, [0, 0, 1], 1.0)
+    slam.update([(0.5, 4.0)])
+    assert slam.steps == steps + 3
+    slam.resume(before)
+    assert (slam.steps, slam.report()) == (steps, report)
+    for largest, is_lost in ((3.0, False), (3.1, True)):
+        known, evidence = slam.best.candidates, LostEvidence(largest=largest)
+        found = known.detections._replace(lost=evidence)
+        slam.best.candidates = known._replace(detections=found)
+        assert (slam.lost_score, slam.probably_lost) == (largest, is_lost)
+
+
+@pytest.mark.parametrize(
+    ("name", "association"),
+    [("ekf", "hypotheses"), ("compressed", "joint"), ("ideal", "joint")],
+)
+def test_the_filter_decides_the_default_association(name, association):
+    for factory in (find_estimator(name), partial(find_estimator(name))):
+        assert ManagedSlam(factory, **NOISE).policy.association == association
 
 
 def test_a_foreign_or_damaged_state_is_refused():

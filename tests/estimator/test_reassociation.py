@@ -227,8 +227,18 @@ def test_only_a_landmark_that_most_scans_show_is_born():
     prices = _prices(search.detections(state.poses, state.places, state.labels))
     assert search.birth(state.poses, costs, price, prices) is None
     for k, place in enumerate(state.places):
-        born = search.birth(state.poses, np.delete(costs, k, 1), price, prices)
+        others = np.delete(costs, k, 1)
+        born = search.birth(state.poses, others, price, prices)
         np.testing.assert_allclose(born, place, atol=0.5)
+        labels = search.assigned(others)
+        paid = np.where(labels == NONE, PRICE, others[search.rows, labels])
+        saved = paid - search.costs(state.poses, born[None])[:, 0]
+        seen = np.where(saved > 0, 0, NONE)
+        worth = np.maximum.reduceat(np.maximum(saved, 0.0), search.starts).sum()
+        worth -= (prices * search.detections(state.poses, born[None], seen)).sum()
+        for gap, is_born in ((-1e-6, True), (1e-6, False)):
+            again = search.birth(state.poses, others, worth + gap, prices)
+            assert (again is not None) == is_born
 
 
 def test_the_readings_of_each_scan_are_assigned_at_the_least_cost():

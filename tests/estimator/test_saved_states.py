@@ -3,7 +3,6 @@
 import copy
 import pickle
 
-import forked
 import numpy as np
 import pytest
 from comparison import digest
@@ -147,14 +146,6 @@ def test_a_filter_continues_bit_for_bit_from_a_pickle_and_from_a_file(
     expected = follow(slam, rest)
     assert follow(twin, rest) == expected
     assert follow(restored, rest) == expected
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["ekf", "submaps"])
-def test_a_managed_filter_continues_in_another_process(name):
-    slam, rest = settled(name, True)
-    there = forked.result_of(follow, slam, rest)
-    assert there == follow(slam, rest)
 
 
 # A managed filter saves what its filter saves, and adds the same to each of them.

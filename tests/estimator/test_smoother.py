@@ -3,6 +3,7 @@
 from dataclasses import replace
 from inspect import signature
 from itertools import permutations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from slamgym.estimator.smoother import (
     Drive,
     RecordedSlam,
     SmoothingSlam,
+    batch_smoother,
     reassociate,
     smooth,
 )
@@ -523,6 +525,25 @@ def test_the_start_does_not_change_the_solution():
     assert again.landmarks == pytest.approx(found.landmarks, abs=1e-8)
 
 
+def test_every_option_reaches_the_smoothing_of_a_repaired_drive(monkeypatch):
+    calls, (made, *_) = [], recorded(steps=2)
+
+    def smoothing(drive, **options):
+        calls.append(options)
+        if len(calls) == 1:
+            raise np.linalg.LinAlgError
+
+    def repaired(drive, start):
+        return SimpleNamespace(drive=drive, poses=start)
+
+    monkeypatch.setattr(batch_smoother, "smooth", smoothing)
+    monkeypatch.setattr(batch_smoother, "reassociate", repaired)
+    options = {"robust": "huber", "robust_scale": 2.0, "tolerance": 1e-5}
+    options |= {"iterations": 7}
+    smooth(made, start="poses", associate=True, **options)
+    assert calls == [{"start": "poses", **options}, options]
+
+
 def test_what_cannot_be_smoothed_is_refused():
     made, *_ = recorded()
     with pytest.raises(np.linalg.LinAlgError, match="did not converge in 1 iteration"):
@@ -595,6 +616,12 @@ def test_a_reading_of_a_pose_without_a_scan_has_a_pose_of_its_own():
     assert [len(made.pose_readings(k)) for k in range(2)] == [0, 1]
     other = made.with_scans([made.sightings(0)._replace(ids=np.array([8]))])
     assert (made.landmark_ids, other.landmark_ids) == ((3,), (8,))
+    made.predict((1.0, 0.0))
+    other = made.with_scans(made.scans)
+    for each in (other, made):  # each has its own motions and readings
+        each.observe_pose(0.1, [0, 0, 1], 0.01)
+        each.observe_pose([1.0, 2.0], np.eye(2, 3), np.eye(2))
+        assert (each.poses, each.pose_components) == (3, 4)
 
 
 def test_a_path_between_scans_is_its_mean_given_both_of_its_ends():
@@ -754,12 +781,16 @@ def test_a_filter_that_goes_back_takes_its_drive_back():
     assert repr(slam.smoothed()) == repr(expected)
     with pytest.raises(ValueError, match="state must hold 'recorded_events'"):
         slam.load_state_dict(make_estimator("invariant", **NOISE).state_dict())
-    slam.reset((1.0, 0, 0), (0, 0, 0))
+    start, std = np.array([1.0, 0.0, 4.0]), np.zeros(3)
+    slam.reset(start, std)
+    start[:], std[:] = 9.0, 9.0  # the recorder has copies
     slam.update([(0.1, 2.0)], [0])
-    assert slam.smoothed().poses.tolist() == [[1.0, 0.0, 0.0]]
+    poses = [[1.0, 0.0, 4.0 - 2 * np.pi]]
+    assert slam.smoothed().poses == pytest.approx(np.array(poses))
+    assert slam.smoothed().belief().frame == "invariant"
     other = SmoothingSlam(**NOISE)
     other.load_state_dict(slam.state_dict())
-    assert other.smoothed().poses.tolist() == [[1.0, 0.0, 0.0]]
+    assert other.smoothed().poses == pytest.approx(np.array(poses))
     for load in (slam.load_state_dict, slam.restore):
         load(before)
         assert repr(slam.smoothed()) == repr(expected)
@@ -784,6 +815,13 @@ def test_the_smoother_follows_any_filter_and_refuses_what_it_cannot_take():
     for reading in ((0.1, 2.0), (0.1, 9.0)):
         gated.update([reading], [0])
     assert gated.recorded().readings == 2
+    keywords = {"min_range": 0.1, "gate_probability": 0.9, "robust": "huber"}
+    name = "ekf[min_range=2.0, gate_probability=0.5]"  # its options come first
+    slam = SmoothingSlam(follow=name, robust_scale=3.0, **keywords, **NOISE)
+    slam.update([(0.1, 1.5), (0.4, 3.0)], [0, 1])
+    assert slam.recorded().landmark_ids == (1,)
+    assert slam.inside.rules.gate == pytest.approx(-2 * np.log(0.5))
+    assert slam.kernel == {"robust": "huber", "robust_scale": 3.0}
     with pytest.raises(TypeError, match="gate_probabilty"):
         SmoothingSlam(gate_probabilty=0.99, **NOISE)
     with pytest.raises(ValueError, match="robust must be"):

@@ -492,6 +492,7 @@ def test_only_files_left_by_ended_processes_of_this_machine_are_removed(
     kept = [
         tmp_path / f".map.{os.getpid()}@{node}-01234567.toml",
         tmp_path / f".map.{ended}@another-01234567.toml",
+        tmp_path / f".map.{10**20}@{node}-01234567.toml",
         tmp_path / f"map.{ended}@{node}-01234567.toml",
     ]
     for path in (gone, *kept):

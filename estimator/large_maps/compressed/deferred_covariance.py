@@ -255,7 +255,7 @@ class DeferredCovariance:
             )
         ends = BLOCK**2 * np.cumsum(np.arange(1, count + 1))
         parts = np.split(flat, ends)[:count]
-        self._blocks = [part.reshape(BLOCK, -1).copy() for part in parts]
+        self._blocks = [part.reshape(BLOCK, -1) for part in parts]
         self._pending = pending
         if pending:
             pending[0].applied.extend(range(int(done)))
