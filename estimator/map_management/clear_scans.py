@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...argument_checks import aligned_zeros
+from ...argument_checks import aligned_copy
 from ...arrays import Array, BoolArray, IntArray
 from ...jit import jit, njit_allocating, njit_inlined, njit_internal
 from ..association.missed_landmarks import (
@@ -57,7 +57,6 @@ from ..filters.gaussian_map import (
     LANDMARKS,
     GaussianMap,
     Parts,
-    copy_memory,
     find_slots,
     parts_jit,
     parts_of,
@@ -77,13 +76,6 @@ from .recent_scans import RecentScans
 #: the best one are discarded.
 SPREAD = 40.0
 _NO_SLOTS: IntArray = np.empty((1, 0), np.int64)  # where nothing is left to decide
-
-
-class Rooms(dict[int, Array]):
-    """Room for trials of clear scans by its size; copies and pickles are empty."""
-
-    def __reduce__(self) -> tuple[type[Rooms], tuple[()]]:
-        return Rooms, ()
 
 
 class ClearScan(NamedTuple):
@@ -127,8 +119,6 @@ class ClearScans:
     sensor : AssociationSensor
     recent : RecentScans
         Of the hypothesis: it notes the scans.
-    rooms : Rooms
-        Those of all hypotheses.
     """
 
     def __init__(
@@ -137,9 +127,8 @@ class ClearScans:
         policy: LandmarkPolicy,
         sensor: AssociationSensor,
         recent: RecentScans,
-        rooms: Rooms,
     ) -> None:
-        self._slam, self._recent, self._rooms = slam, recent, rooms
+        self._slam, self._recent = slam, recent
         self._filter = filter_inside(slam)
         self._policy, self._noise = policy, sensor.noise
         self._settings = settings_of(policy, sensor)
@@ -301,16 +290,11 @@ class ClearScans:
         The best one comes first.  Those that the filter refuses are left out.
         """
         gaussian, found = self._filter.map, list[tuple[float, Marginals]]()
-        block, names = gaussian.block, [*gaussian.slots]
-        if block.size not in self._rooms:
-            self._rooms.clear()
-            self._rooms[block.size] = aligned_zeros(block.size)
-        trial, ids = self._rooms[block.size], gaussian.parts.ids
+        names, ids = [*gaussian.slots], gaussian.parts.ids
         for cost, slots in zip(scan.costs, scan.slots, strict=True):
             if cost > ceiling:
                 continue
-            rows = slots >= 0
-            copy_memory(block, trial)
+            trial, rows = aligned_copy(gaussian.block), slots >= 0
             if update_map(trial, scan.readings[rows], ids[slots[rows]]) == DONE:
                 after = marginals_of(parts_of(trial), names)
                 copies = after.mean.copy(), after.variances.copy()

@@ -50,15 +50,7 @@ from ..interface import (
 from ..models.bearing_range import wrap_angle
 from ..models.motions import UNICYCLE, MotionNoise
 from ..models.rigid_motion import rotation
-from .clear_scans import (
-    SPREAD,
-    ClearScan,
-    ClearScans,
-    Marginals,
-    Rooms,
-    is_near,
-    marginals_of,
-)
+from .clear_scans import SPREAD, ClearScan, ClearScans, Marginals, is_near, marginals_of
 from .loop_closing import AROUND, FEWEST_READINGS, is_astray, places_of_scan
 from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy
@@ -155,7 +147,7 @@ class ManagedSlam(FilterWrapper):
         motion = options.get("motion", UNICYCLE)
         at_rest = options.get("noise_at_rest", True)
         noise_of_motion = MotionNoise.checked(motion_std, at_rest, motion)
-        self._settings = SharedSettings(policy, sensor, noise_of_motion, Rooms())
+        self._settings = SharedSettings(policy, sensor, noise_of_motion)
         self._hypotheses = [Hypothesis(first, self._settings)]
         #: All hypotheses made so far, and those of them that are not in use.
         self._made = self._hypotheses
@@ -573,8 +565,6 @@ class SharedSettings(NamedTuple):
     policy: LandmarkPolicy
     sensor: AssociationSensor
     motion_noise: MotionNoise
-    #: For trials of clear scans.
-    rooms: Rooms
 
 
 class Branch(NamedTuple):
@@ -614,7 +604,7 @@ class Hypothesis:
     """
 
     def __init__(self, slam: SlamEstimator, settings: SharedSettings) -> None:
-        policy, sensor, self.motion_noise, rooms = settings
+        policy, sensor, self.motion_noise = settings
         self.policy, self.sensor = policy, sensor
         self.filter = slam
         #: −2 ln of its probability, relative to the best hypothesis.
@@ -624,7 +614,7 @@ class Hypothesis:
         self.recent = RecentScans(slam, self.editor, policy)
         self._clear: ClearScans | None = None
         if ClearScans.serve(slam, policy):
-            self._clear = ClearScans(slam, policy, sensor, self.recent, rooms)
+            self._clear = ClearScans(slam, policy, sensor, self.recent)
         self._candidates = Candidates()
         #: After a clear scan this scan: the filter can return the report once more.
         self._report: UpdateReport | ClearScan = UpdateReport()

@@ -1,7 +1,5 @@
 """Scans that compiled calls take in, beside the same scans taken in by the search."""
 
-import copy
-import pickle
 from dataclasses import fields
 
 import numpy as np
@@ -341,11 +339,3 @@ def test_an_error_after_a_scan_has_been_taken_in_at_once_leaves_a_mark(monkeypat
     assert (inside.belief().covariance != before).any()
     with pytest.raises(RuntimeError, match="interrupted in update"):
         slam.predict((0.1, 0.0))
-
-
-def test_room_for_trials_is_neither_copied_nor_pickled():
-    slam, _ = standing()
-    before = len(pickle.dumps(slam))
-    slam._settings.rooms[10**6] = np.zeros(10**6)
-    assert len(pickle.dumps(slam)) == before
-    assert not copy.deepcopy(slam)._settings.rooms
