@@ -169,7 +169,8 @@ TESTS = {
         "options_of_commands judging strangers_files space_poses"
     ),
     "experiments/command_line/monte_carlo": (
-        "options_of_commands monte_carlo_command monte_carlo_folder monte_carlo_report"
+        "monte_carlo_command options_of_commands monte_carlo_folder monte_carlo_report "
+        "monte_carlo"
     ),
     "experiments/command_line/noise_study": (
         "options_of_commands noise_study noise_effects_of_many_runs command_line"
@@ -203,7 +204,7 @@ TESTS = {
     f"{STUDY}/verdict": "monte_carlo_report efficiency causes looks monte_carlo",
     "experiments/noise_explorer": "noise_explorer",
     "experiments/noise_fitting": "noise_fitting",
-    "experiments/noise_study": "noise_study noise_effects_of_many_runs",
+    "experiments/noise_study": "noise_study noise_effects_of_many_runs progress_bar",
     "experiments/progress_bar": "progress_bar",
     "experiments/run_and_replay": "replay run_warnings trace simulated_runs",
     "experiments/run_and_replay/log_replay": "replay run_warnings map_management",

@@ -1,15 +1,20 @@
 """``slamgym monte-carlo`` and ``slamgym noise-study --runs``, as a user types them."""
 
+import contextlib
 import json
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import xarray as xr
 from commands import slamgym
 
+from slamgym.experiments.command_line import monte_carlo as command
+from slamgym.experiments.command_line.commands import LostSchedulerError
 from slamgym.experiments.monte_carlo_study import monte_carlo
 from slamgym.experiments.monte_carlo_study.results import load_results
 
@@ -127,6 +132,7 @@ class Careless(EkfSlam):
 """
 
 
+@pytest.mark.usefixtures("_no_figures_in_reports")
 def test_a_filter_of_ones_own_that_is_not_consistent_is_checked(here, monkeypatch):
     (here / "careless.py").write_text(CARELESS)
     monkeypatch.syspath_prepend(here)
@@ -159,6 +165,7 @@ class Sure(EkfSlam):
 """
 
 
+@pytest.mark.usefixtures("_no_figures_in_reports")
 def test_no_finding_about_the_pose_is_quoted_if_only_the_map_is_wrong(
     here, monkeypatch
 ):
@@ -173,6 +180,7 @@ def test_no_finding_about_the_pose_is_quoted_if_only_the_map_is_wrong(
     assert "covariance[5, 5], of l2x and l2x, must be" in text
 
 
+@pytest.mark.usefixtures("_no_figures_in_reports")
 def test_a_study_until_decided_stops_and_states_its_runs_and_evidence(here):
     result = slamgym(
         *("monte-carlo", "six_landmarks", "-e", "ekf", "--runs", 64),
@@ -186,3 +194,58 @@ def test_a_study_until_decided_stops_and_states_its_runs_and_evidence(here):
     assert found["verdict"] == "not consistent"
     assert found["sequential"]["rejected_after"] <= summary["runs"]
     assert "an anytime-valid test rejects it (e " in found["sentence"]
+
+
+def test_filters_are_compiled_in_a_small_world_before_the_runs(monkeypatch):
+    given = []
+
+    def listen(world, *others, **named):
+        given.append((world, *others))
+        raise ValueError("that is enough")
+
+    monkeypatch.setattr("slamgym.experiments.monte_carlo_study.monte_carlo", listen)
+    slamgym("monte-carlo", "hidden_identities", "-e", "ekf")
+    (small, *others), (world, *_) = given
+    assert (small.name, small.steps, *others) == ("six_landmarks", 8, "ekf", 1)
+    assert not small.sensor.identities
+    assert world.name == "hidden_identities"
+
+
+class Client(contextlib.nullcontext):
+    """A client of Dask, with three workers wanted."""
+
+    def __init__(self, status="running"):
+        super().__init__(self)
+        self.status, self.scaled = status, []
+        self.cluster = SimpleNamespace(
+            worker_spec=range(3), workers=[1, 2], scale=self.scaled.append
+        )
+
+
+def test_a_lost_scheduler_ends_the_block_with_its_address(monkeypatch):
+    monkeypatch.setattr(command, "_INTERVAL", 0.01)
+    with pytest.raises(ZeroDivisionError), command._naming_loss(Client(), "tcp://a:1"):
+        raise ZeroDivisionError
+    message = "the Dask scheduler tcp://a:1 is lost; what is finished is kept"
+    with (
+        pytest.raises(LostSchedulerError, match=message),
+        command._naming_loss(Client("closed"), "tcp://a:1"),
+    ):
+        all(time.sleep(0.01) is None for _ in range(900))
+
+
+def test_workers_that_are_gone_are_replaced_until_the_block_ends(monkeypatch):
+    monkeypatch.setattr(command, "_INTERVAL", 0.01)
+    client = Client()
+    with command._with_new_workers(lambda: client):
+        time.sleep(0.1)
+        assert set(client.scaled) == {3}
+        client.cluster.workers.append(3)
+        time.sleep(0.05)
+        count = len(client.scaled)
+        time.sleep(0.05)
+        assert len(client.scaled) == count
+        client.cluster.workers.pop()
+    count = len(client.scaled)
+    time.sleep(0.05)
+    assert len(client.scaled) == count

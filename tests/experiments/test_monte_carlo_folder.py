@@ -9,11 +9,13 @@ import sys
 import textwrap
 
 import forked
+import joblib
 import jobs_to_kill
 import pytest
 import xarray as xr
 from typer.testing import CliRunner
 
+from slamgym.experiments import job_folders
 from slamgym.experiments.command_line.app import main
 from slamgym.experiments.command_line.commands import Reporter
 from slamgym.experiments.command_line.run_files import warm_up
@@ -318,7 +320,62 @@ def test_a_damaged_block_is_not_merged(tmp_path):
         merge_blocks([tmp_path / "one"], tmp_path / "both")
 
 
+def test_a_folder_that_is_still_written_to_is_removed_again_and_again(
+    tmp_path, monkeypatch
+):
+    calls = []
+    monkeypatch.setattr(job_folders, "_BETWEEN", 0.0)
+    monkeypatch.setattr(
+        job_folders.shutil, "rmtree", lambda *_, **named: calls.append(named)
+    )
+    job_folders.remove(tmp_path)
+    assert calls == [{"ignore_errors": True}] * 20 + [{}]
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (PermissionError(13, "No", "inner"), "out cannot be written: No; it is kept"),
+        (OSError("a message of slamgym"), "a message of slamgym"),
+        (RuntimeError("HDF error"), "out cannot be written: HDF error; it is kept"),
+    ],
+)
+def test_what_cannot_be_written_is_named(error, message):
+    with (
+        pytest.raises(OSError, match=f"^{message}$"),
+        job_folders.naming("out", "; it is kept", also=RuntimeError),
+    ):
+        raise error
+
+
 # one job
+
+
+@pytest.mark.parametrize(
+    ("found", "asked", "name"),
+    [
+        ({"a": 1, "b": 2}, {"a": 1, "c": 3}, "b"),
+        ({"a": 1}, {"a": 1, "c": 3}, "c"),
+        ({"a": 1, "b": 2}, {"b": 3, "a": 2}, "a"),
+        ({"a": 1, "b": 2}, {"b": 2, "a": 1}, None),
+    ],
+)
+def test_the_first_difference_of_two_jobs_is_named(found, asked, name):
+    assert job_folders.difference(found, asked) == name
+
+
+def test_workers_are_engaged_as_many_as_asked():
+    cores = joblib.cpu_count()
+    for jobs, backend, at_once in (
+        *((None, None, 1), (1, None, 1), (3, None, 3), (-1, None, cores)),
+        *((1, "threading", 1), (3, "threading", 3), (None, "threading", cores)),
+    ):
+        assert job_folders.blocks_at_once(jobs, backend) == at_once
+        workers = job_folders.engage_workers(jobs, backend)
+        assert (workers is None) == (backend is None and at_once == 1)
+        if backend:
+            calls = [(divmod, (7, k), {}) for k in (2, 3)]
+            assert sorted(workers(calls)) == [(2, 1), (3, 1)]
 
 
 def test_a_job_is_of_the_filter_that_it_began_with(tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 import contextlib
 import inspect
 import json
+import re
 from importlib import import_module
 from pathlib import Path
 from types import GeneratorType, MethodType
@@ -38,66 +39,54 @@ run loop
   → experiments.command_line.run_files.filter_and_write log=loop
     filters=invariant=invariant/0.00884,0,0.0354/0.0349,0.1/0.0001,0.0001,0.0001
     given=0/open_loop/None/0 world=loop/1005/1
-
 run loop -e ekf,invariant --option min_range=2 --seed 5 --steps 9 --controller random
   --set dt=0.5 --out mine --every-step --resolution 0.5
   → experiments.command_line.run_files.filter_and_write log=loop
     filters=ekf=ekf/0.00884,0,0.0354/0.0349,0.1/0.0001,0.0001,0.0001[min_range=2]
     invariant=invariant/0.00884,0,0.0354/0.0349,0.1/0.0001,0.0001,0.0001[min_range=2]
     given=5/random/True/0.5 world=loop/9/0.5
-
 replay little.csv
   → experiments.command_line.run_files.filter_and_write log=little
     filters=invariant=invariant/0.1,0.1,0.05/0.02,0.1/0,0,0[noise_at_rest=False]
     given=0/open_loop/None/0
-
 replay little.csv -e ekf NOISE --landmark-init independent --gate-probability 0.9
   --option min_range=2 --hide-identities --resolution 0.5 --no-every-step
   → experiments.command_line.run_files.filter_and_write log=little/hidden
     filters=ekf=ekf/0.1,0.2,0.3/0.4,0.5/0.6,0.7,0.8[noise_at_rest=True management=True
     landmark_init=independent gate_probability=0.9 range_std_per_metre=0.01 min_range=2]
     given=0/open_loop/False/0.5
-
 smooth little.csv
   → experiments.run_and_replay.smooth_log log=little
     settings=SmoothingSlam/0.1,0.1,0.05/0.02,0.1/0,0,0[noise_at_rest=False
     follow=invariant] associate=False progress=filtering repairing=filtering
-
 smooth little.csv -e ekf NOISE --robust huber --associate --gate-probability 0.9
   --option iterations=2
   → experiments.run_and_replay.smooth_log log=little
     settings=SmoothingSlam/0.1,0.2,0.3/0.4,0.5/0.6,0.7,0.8[noise_at_rest=True
     robust=huber gate_probability=0.9 range_std_per_metre=0.01 iterations=2 follow=ekf]
     associate=True progress=filtering repairing=filtering
-
 fit-noise little.csv
   → experiments.noise_fitting.fit_noise log=little
     settings=invariant/0.1,0.1,0.05/0.02,0.1/0,0,0[noise_at_rest=False] progress=fitting
-
 fit-noise little.csv -e ekf NOISE --option min_range=2 --hide-identities
   → experiments.noise_fitting.fit_noise log=little/hidden
     settings=ekf/0.1,0.2,0.3/0.4,0.5/0.6,0.7,0.8[noise_at_rest=True management=True
     range_std_per_metre=0.01 min_range=2] progress=fitting
-
 monte-carlo loop
   → experiments.monte_carlo_study.monte_carlo scenario=loop/1005/1
-    estimators=ekf,invariant runs=200 seed=0 until=None assumed=loop/1005/1
-    out=results/monte-carlo-loop jobs=None backend=None block_size=64 first_run=0
-    fresh=False resolution=0 progress=running-runs
-
+    estimators=ekf,invariant runs=200 seed=0 assumed=loop/1005/1
+    out=results/monte-carlo-loop block_size=64 first_run=0 fresh=False resolution=0
+    progress=running-runs
 monte-carlo loop -e ekf --runs 9 --until decided --seed 5 --steps 7 --set dt=0.5
   --assume dt=0.25 --resolution 0.5 --jobs 2 --backend dask --scheduler tcp://b:1
   --block-size 3 --first-run 6 --fresh --out mine
   → experiments.monte_carlo_study.monte_carlo scenario=loop/7/0.5 estimators=ekf runs=9
     seed=5 until=decided assumed=loop/7/0.25 out=mine jobs=2 backend=dask block_size=3
     first_run=6 fresh=True resolution=0.5 progress=running-runs cluster=tcp://b:1,2
-
 generate loop --episodes 3
   → experiments.trajectories.generate_trajectories scenario=loop/1005/1
     out=results/loop-waypoints-npz episodes=3 controller=waypoints seed=0 format=npz
-    episodes_per_shard=None smallest_std=None estimator=None jobs=None backend=None
     progress=driving-steps
-
 generate loop --episodes 3 --controller random --seed 5 --format g2o --shard 7
   --smallest-std .01 -e ekf --jobs 2 --backend dask --scheduler tcp://b:1 --steps 9
   --set dt=0.5 --out mine
@@ -105,79 +94,61 @@ generate loop --episodes 3 --controller random --seed 5 --format g2o --shard 7
     episodes=3 controller=random seed=5 format=g2o episodes_per_shard=7
     smallest_std=0.01 estimator=ekf jobs=2 backend=dask progress=driving-steps
     cluster=tcp://b:1,2
-
 judge little.csv
-  → experiments.judging.judge estimates=little.csv drives=None truth=None
-    covariances=None align=None
-
+  → experiments.judging.judge estimates=little.csv
 judge a b --drives c --truth d --truth e --covariances left --align 1,2,3
   → experiments.judging.judge estimates=a,b drives=c truth=d,e covariances=left
     align=1,2,3
-
 judge a --truth b --space left
   → experiments.space_poses.judge_in_space estimates=a truth=b covariances=left
     order=translation-first
-
 judge a b --truth c --space right,rotation-first
   → experiments.space_poses.judge_in_space estimates=a,b truth=c covariances=right
     order=rotation-first
-
 benchmark
   → experiments.consistency_protocol.score_filters estimators=ekf,invariant
     progress=running-worlds
-
 benchmark -e ekf
   → experiments.consistency_protocol.score_filters estimators=ekf
     progress=running-worlds
-
 noise-study little.csv
   → experiments.noise_study.study_log log=little
     settings=invariant/0.1,0.1,0.05/0.02,0.1/0,0,0[noise_at_rest=False]
     progress=filtering
-
 noise-study little.csv -e ekf NOISE --landmark-init independent --gate-probability 0.9
   --option min_range=2 --hide-identities
   → experiments.noise_study.study_log log=little/hidden
     settings=ekf/0.1,0.2,0.3/0.4,0.5/0.6,0.7,0.8[noise_at_rest=True management=True
     landmark_init=independent gate_probability=0.9 range_std_per_metre=0.01 min_range=2]
     progress=filtering
-
 noise-study loop
   → experiments.noise_study.study_scenario scenario=loop/1005/1
     record=0/open_loop/None/0 estimator=invariant options= progress=filtering
-
 noise-study loop -e ekf --option min_range=2 --gate-probability .9 --seed 5 --steps 9
   --controller random --set dt=0.5
   → experiments.noise_study.study_scenario scenario=loop/9/0.5 record=5/random/None/0
     estimator=ekf options=gate_probability=0.9 min_range=2 progress=filtering
-
 noise-study loop --runs 3
   → experiments.noise_study.noise_effects scenario=loop/1005/1 estimators=invariant
-    runs=3 seed=0 changed=both,world,filter jobs=None progress=running-runs
-
+    runs=3 seed=0 changed=both,world,filter progress=running-runs
 noise-study loop --runs 3 -e ekf,invariant[min_range=1] --option min_range=2
   --landmark-init independent --seed 5 --steps 9 --set dt=0.5 --change world --jobs 2
   → experiments.noise_study.noise_effects scenario=loop/9/0.5
     estimators=ekf[landmark_init="independent",min_range=2],invariant[min_range=1,landmark_init="independent"]
     runs=3 seed=5 changed=world jobs=2 progress=running-runs
-
 explore loop
   → experiments.noise_explorer.explore_noise scenario=loop/1005/1
     estimators=ekf,invariant runs=100 seed=0 change=filter progress=running-runs
-
 explore loop -e ekf --runs 9 --seed 5 --steps 7 --set dt=0.5 --change both
   → experiments.noise_explorer.explore_noise scenario=loop/7/0.5 estimators=ekf runs=9
     seed=5 change=both progress=running-runs
-
 render loop --out film.gif
   → envs.rendering.write_video frames=scenario=loop/1005/1
     settings=invariant/0.00884,0,0.0354/0.0349,0.1/0.0001,0.0001,0.0001 driver=OpenLoop
     seed=0 tick=filming path=film.gif fps=30
-
 render loop --out film.gif --steps 120 -e none
-  → envs.rendering.write_video frames=scenario=loop/120/1 settings=None driver=OpenLoop
-    seed=0 tick=filming path=film.gif fps=10
-
+  → envs.rendering.write_video frames=scenario=loop/120/1 driver=OpenLoop seed=0
+    tick=filming path=film.gif fps=10
 render loop --out film.gif -e ekf --option min_range=2 --seed 5 --steps 9 --controller
   random --set dt=0.5 --fps 3
   → envs.rendering.write_video frames=scenario=loop/9/0.5
@@ -186,7 +157,7 @@ render loop --out film.gif -e ekf --option min_range=2 --seed 5 --steps 9 --cont
 """
 REACHED = {
     command.replace("NOISE", NOISE): each.split(" ", 1)
-    for block in COMMANDS.strip().split("\n\n")
+    for block in re.split(r"\n(?=\w)", COMMANDS)[1:]
     for command, each in [" ".join(block.split()).split(" → ")]
 }
 UNCOMPARED = ("command", "folder", "reporter", "small_noise")
@@ -251,8 +222,9 @@ def of_options(given):
     return "/".join(words(getattr(given, name)) for name in names)
 
 
-def compared(arguments):
-    return {k: v for k, v in arguments.items() if k not in UNCOMPARED}
+def compared(given):
+    named = {k: v for k, v in given.items() if k not in UNCOMPARED}
+    return {k: v for k, v in named.items() if v is not None}
 
 
 WORDS = {
