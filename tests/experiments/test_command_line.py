@@ -122,17 +122,6 @@ def test_a_run_writes_pictures_log_scenario_and_numbers(finished_run):
     assert sorted(found) == sorted([MANIFEST, *summary["files"]])
 
 
-@pytest.mark.slow
-def test_a_run_answers_with_the_numbers_of_its_summary_file(finished_run):
-    folder, summary = finished_run
-    saved = json.loads((folder / "summary.json").read_text())
-    assert {**saved, "out": str(folder)} == summary
-    assert summary["steps"] == 2
-    assert set(summary) >= {"landmarks", "pose", "pose_covariance", "nis", "nees"}
-    assert len(summary["landmarks"]) == 6
-    assert np.shape(summary["pose_covariance"]) == (3, 3)
-
-
 def test_a_simulated_log_is_not_searched_for_broken_conventions(
     here, without_pictures, monkeypatch
 ):
@@ -248,14 +237,6 @@ def test_the_course_log_is_replayed_with_its_published_noise(
     first = independent["landmarks"][0]
     assert first["euclidean"] == pytest.approx(0.0024197, abs=1e-6)
     assert first["mahalanobis"] == pytest.approx(0.05452, abs=1e-5)
-
-
-@pytest.mark.slow
-def test_the_pictures_of_single_steps_can_be_left_out(log, monkeypatch):
-    monkeypatch.setattr(figures, "save_figure", lambda _, path, **__: path.touch())
-    files = answered("replay", log, "--no-every-step")["files"]
-    assert "map.png" in files
-    assert not [name for name in files if name.startswith("map_steps")]
 
 
 @pytest.mark.parametrize("flag", ["--every-step", "--no-every-step"])
@@ -766,7 +747,7 @@ def test_the_covariances_of_a_run_are_written_with_the_names_of_their_entries(
     assert 3 < len(first) <= len(rows) + 1
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("without_figure")
 def test_a_noise_study_draws_one_figure_and_tables_eleven_runs(log):
     summary = answered("noise-study", log, "--out", "study")
     sigmas = ("alpha", "beta", "r", "x", "y")
@@ -776,11 +757,9 @@ def test_a_noise_study_draws_one_figure_and_tables_eleven_runs(log):
     assert summary["files"] == [*maps, *texts]
     with (log.parent / "study" / "noise_study.csv").open() as stream:
         table = list(csv.DictReader(stream))
-    assert len(table) == len(summary["rows"]) == 11
     for saved, row in zip(table, summary["rows"], strict=True):
-        assert saved["sigma"] == row["sigma"]
-        assert float(saved["pose_area"]) == row["pose_area"]
-        assert saved["ate"] == ""
+        del row["title"]
+        assert saved == {k: "" if v is None else str(v) for k, v in row.items()}
 
 
 def test_a_film_has_one_frame_per_step_and_one_of_the_start():

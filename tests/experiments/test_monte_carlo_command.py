@@ -180,22 +180,6 @@ def test_no_finding_about_the_pose_is_quoted_if_only_the_map_is_wrong(
     assert "covariance[5, 5], of l2x and l2x, must be" in text
 
 
-@pytest.mark.usefixtures("_no_figures_in_reports")
-def test_a_study_until_decided_stops_and_states_its_runs_and_evidence(here):
-    result = slamgym(
-        *("monte-carlo", "six_landmarks", "-e", "ekf", "--runs", 64),
-        *("--until", "decided", "--block-size", 16, "--out", "out", "--json"),
-    )
-    assert result.exit_code == 0, result.stderr
-    summary = json.loads(result.stdout)
-    found = summary["estimators"]["ekf"]
-    assert summary["runs"] < 64
-    assert summary["until"] == "decided"
-    assert found["verdict"] == "not consistent"
-    assert found["sequential"]["rejected_after"] <= summary["runs"]
-    assert "an anytime-valid test rejects it (e " in found["sentence"]
-
-
 def test_filters_are_compiled_in_a_small_world_before_the_runs(monkeypatch):
     given = []
 
