@@ -25,6 +25,7 @@ from slamgym.experiments.command_line import commands, run_files, tables
 from slamgym.experiments.command_line.app import main
 from slamgym.experiments.job_folders import MANIFEST
 from slamgym.experiments.logs import read_log
+from slamgym.experiments.noise_study import NoiseEffect
 from slamgym.experiments.run_and_replay.filter_settings import (
     estimator_choices,
     settings_for,
@@ -156,17 +157,71 @@ def test_every_score_of_an_association_has_its_place():
     scores |= {"oracle_errors": 0.0123, "resolution": 0.5, "gospa": gospa}
     table = tables.association_table(scores)
     assert table.title == "Association, landmarks nearer than 0.5 m counted as one"
-    assert dict(zip(*(column.cells for column in table.columns), strict=True)) == {
-        "readings": "10 correct, 11 wrong, 12 not used, 13 of clutter used",
-        "new landmarks": "14 correct, 15 duplicates, 16 of clutter",
-        "map size": "17; 18 were seen often enough",
-        "precision": "0.900, recall 0.800",
-        "at best": "a filter that knew pose and map would assign 1.2% wrongly",
-        "GOSPA of the map": (
-            "1.2 m: 3 missed, 2 false, localisation 0.5 m after alignment"
-        ),
-        "… raw": "1.5 m: 3 missed, 2 false, localisation 0.5 m; cut-off 1 m",
+    assert cells(table) == [
+        "readings | 10 correct, 11 wrong, 12 not used, 13 of clutter used",
+        "new landmarks | 14 correct, 15 duplicates, 16 of clutter",
+        "map size | 17; 18 were seen often enough",
+        "precision | 0.900, recall 0.800",
+        "at best | a filter that knew pose and map would assign 1.2% wrongly",
+        "GOSPA of the map | 1.2 m: 3 missed, 2 false, localisation 0.5 m after "
+        "alignment",
+        "… raw | 1.5 m: 3 missed, 2 false, localisation 0.5 m; cut-off 1 m",
+    ]
+
+
+def cells(table):
+    """Return the rows of a table, joined to texts."""
+    columns = (list(column.cells) for column in table.columns)
+    return [" | ".join(map(str, row)) for row in zip(*columns, strict=True)]
+
+
+def test_every_key_figure_of_a_run_has_its_place():
+    counts = dict.fromkeys(tables._FATES, 0) | {"rejected": 3, "ambiguous": 4}
+    error = {"raw": 0.5, "aligned": 0.25}
+    summary = {
+        **{"readings": counts | {"associated": 7, "added": 2}, "landmarks": [None] * 2},
+        **{"steps": 9, "scans": 8, "map_changes": {"confirmed": 1, "removed": 0}},
+        **{"pose": (1.0, None, 0.5), "pose_covariance": np.diag([4.0, 1.0, 0.25])},
+        **{"ate": error, "landmark_rmse": None, "never_placed": [*range(3, 15)]},
+        "nees": {"per_degree": 2.5, "frame": "invariant", "singular": 1},
+        "nis": {"per_degree": 0.4},
     }
+    summary["map_changes"]["merged"] = 5
+    rows = [
+        "steps | 9, with 8 scans",
+        "readings | 7 of known landmarks, 2 of new ones, 3 rejected by the gate, "
+        "4 ambiguous",
+        "map | 2 landmarks, 1 confirmed, 5 merged",
+        "never placed | 12 landmarks: 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, …",
+        "final pose | x 1.000 ± 2.000 m, y - ± 1.000 m, θ 0.500 ± 0.500 rad",
+        "path error | 0.5 m RMS; 0.25 m after alignment",
+        "pose NEES, invariant | 2.5 per degree of freedom; 1 is expected; 1 pose "
+        "without it, whose covariance is singular: overconfident",
+        "NIS | 0.4 per degree of freedom; 1 is expected: the filter assumes too much "
+        "noise",
+    ]
+    assert cells(tables.key_figures(summary)) == rows
+    for key, hidden in (("others", rows[5]), ("mistake", None)):
+        found = cells(tables.key_figures(summary | {key: [1]}))
+        changed = [row for row in rows if row not in found]
+        assert changed == ([hidden] if hidden else rows[6:])
+    assert len(found) == len(rows)
+
+
+def test_the_table_of_a_study_has_a_row_for_each_change_and_a_column_for_each_filter():
+    figures = {"nees_per_degree": 1.234, "nees_per_degree_error": 0.1, "failed": 0}
+    others = dict.fromkeys(NoiseEffect._fields, 0.0)
+    effects = [
+        NoiseEffect(
+            **others | figures | {"changed": place, "sigma": sigma, "factor": factor}
+        )._replace(estimator=name, failed=failed, nees_per_degree_error=error)
+        for place, sigma, factor in (("nothing", "none", 1.0), ("both", "σx", 0.1))
+        for name, failed, error in (("ekf", 0, np.nan), ("invariant", 2, 0.1))
+    ]
+    assert cells(tables.effects_table("loop", 3, effects)) == [
+        "nothing |  | 1.23 | 1.23 ± 0.1 (2 failed)",
+        "both | σx ÷ 10 | 1.23 | 1.23 ± 0.1 (2 failed)",
+    ]
 
 
 def test_a_replay_writes_the_covariance_of_the_whole_state(log, without_pictures):
@@ -944,7 +999,9 @@ def test_the_worst_landmarks_of_a_large_map_are_shown():
     rows[2]["mahalanobis"] = 0.5
     table = tables.landmark_table({"landmarks": rows})
     assert next(iter(table.columns[0].cells)) == "2"
-    few = tables.landmark_table({"landmarks": rows[:10]})
+    del rows[10:]
+    rows[2] |= {"euclidean": None, "mahalanobis": None}  # its truth is unknown
+    few = tables.landmark_table({"landmarks": rows})
     assert list(few.columns[0].cells) == [str(k) for k in range(10)]
 
 
