@@ -607,6 +607,30 @@ def test_a_belief_that_degenerates_is_a_failure_and_no_wrong_input(log):
     assert message.startswith("little, t = 1: the innovation covariance is not")
 
 
+@pytest.mark.parametrize(
+    ("command", "work"),
+    [
+        ("replay", "command_line.run_files.replay"),
+        ("smooth", "run_and_replay.smooth_log"),
+        ("fit-noise", "noise_fitting.fit_noise"),
+    ],
+)
+def test_a_numerical_failure_is_explained_by_the_mistake_of_the_log(
+    command, work, log, monkeypatch
+):
+    def mistake(log, settings):
+        return f"{log.name} is clockwise, with σx {settings.motion_std[0]}"
+
+    def fail(*_, **__):
+        raise np.linalg.LinAlgError("P is singular")
+
+    experiments = "slamgym.experiments"
+    monkeypatch.setattr(f"{experiments}.log_conventions.mistake_in_log", mistake)
+    monkeypatch.setattr(f"{experiments}.{work}", fail)
+    message = refused(command, log, code=1)
+    assert message.endswith("P is singular. little is clockwise, with σx 0.1")
+
+
 def test_a_folder_with_other_things_is_left_alone(log, without_pictures):
     answered("replay", log, "--out", "out")
     (log.parent / "out" / "notes.txt").write_text("mine")
