@@ -4,7 +4,6 @@ import os
 import re
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
 import warnings
@@ -1185,24 +1184,6 @@ def test_results_for_a_closed_output_are_an_error(command, monkeypatch, capsys):
         main(command.split())
     message = "standard output is closed: there is no place for the results"
     assert capsys.readouterr().err == f"slamgym: {message}\n"
-
-
-def test_the_first_sigterm_in_a_block_is_an_error_and_others_are_ignored():
-    usual = signal.getsignal(signal.SIGTERM)
-    try:
-        for before in (signal.SIG_IGN, signal.SIG_DFL):
-            signal.signal(signal.SIGTERM, before)
-            with commands.terminable():
-                inside = signal.getsignal(signal.SIGTERM)
-            assert signal.getsignal(signal.SIGTERM) is before
-            assert (inside is signal.SIG_IGN) == (before is signal.SIG_IGN)
-        with commands.terminable():
-            with pytest.raises(commands.TerminationError):
-                os.kill(os.getpid(), signal.SIGTERM)
-            os.kill(os.getpid(), signal.SIGTERM)
-        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    finally:
-        signal.signal(signal.SIGTERM, usual)
 
 
 def test_an_interrupt_names_the_work_of_the_block_that_it_ends(monkeypatch):
