@@ -3,7 +3,6 @@ import json
 import os
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 import warnings
@@ -554,50 +553,6 @@ def test_the_folder_itself_stays(out, log, here, without_pictures, monkeypatch):
     there = {name for name in os.listdir(here / place) if name != "inner"}
     assert there == {MANIFEST, *files}
     assert os.path.samefile(".", here / "deep" / "inner")
-
-
-@pytest.fixture
-def mounted(here):
-    """Return what mounts a file system of its own at a folder, or skips the test."""
-    folder = here / "mount"
-
-    def mount(*options):
-        folder.mkdir()
-        command = ["mount", *options, "-t", "tmpfs", "slamgym-test", str(folder)]
-        if not shutil.which("mount") or subprocess.run(command, check=False).returncode:
-            pytest.skip("this user or system cannot mount a file system")
-        return folder
-
-    yield mount
-    subprocess.run(["umount", folder], check=False)
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        ("replay", "little.csv"),
-        ("monte-carlo", "six_landmarks", "-e", "ekf", "--runs", 2),
-        ("generate", "six_landmarks", "--episodes", 2),
-    ],
-    ids=lambda command: command[0],
-)
-@pytest.mark.usefixtures("_no_figures_in_reports")
-def test_a_mount_point_is_written(command, mounted, log, without_pictures):
-    mount = mounted()
-    (mount / "lost+found").mkdir()
-    answered(*command, "--out", mount)
-    first = sorted(os.listdir(mount))
-    answered(*command, "--out", mount)
-    assert sorted(os.listdir(mount)) == first
-    assert len(first) > 2
-
-
-@pytest.mark.parametrize("out", ["", "new", "deep/new"])
-def test_a_read_only_folder_is_refused_at_once(out, mounted, log, no_work):
-    folder = mounted("-o", "ro") / out
-    message = refused("replay", log, "--out", folder, code=1)
-    expected = f"the folder {folder} cannot be written: Read-only file s"
-    assert message.startswith(expected)
 
 
 def test_a_belief_that_degenerates_is_a_failure_and_no_wrong_input(log):

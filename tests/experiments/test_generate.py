@@ -301,18 +301,6 @@ def test_rests_of_a_killed_job_are_cleared_away_and_nothing_else(tmp_path):
     assert (out / "notes.txt").read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", ["npz", "slamlog"])
-def test_a_shard_that_was_moved_but_not_listed_is_made_again(name, tmp_path):
-    small(tmp_path / "whole", format=name)
-    out = tmp_path / "out"
-    small(out, format=name)
-    table = json.loads((out / "manifest.json").read_text())
-    table["shards"] = table["shards"][:1]
-    (out / "manifest.json").write_text(json.dumps(table))
-    small(out, format=name)
-    assert tree(out) == tree(tmp_path / "whole")
-
-
 def test_whole_shards_are_not_driven_again(tmp_path, monkeypatch):
     small(tmp_path / "out")
     monkeypatch.setattr(driven_episodes, "drive_episodes", None)
