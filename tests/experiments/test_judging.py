@@ -953,10 +953,10 @@ def test_the_command_judges_two_estimators(drives, beliefs, written, tmp_path):
     assert [e["verdict"] for e in summary["estimators"].values()][1] == "not consistent"
     assert {"report.html", "results.nc", "summary.json"} == set(summary["files"])
     assert "yours" in (out / "report.html").read_text()
-    again = slamgym("judge", drives, "--json", "--out", out)
+    again = slamgym("judge", drives, "--frame", "additive", "--json", "--out", out)
     printed = json.loads(again.stdout)
     assert list(printed["estimators"]) == ["drives"]
-    assert printed["out"] == str(out)
+    assert (printed["out"], printed["frame"]) == (str(out), "additive")
 
 
 @pytest.mark.parametrize(
