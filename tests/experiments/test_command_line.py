@@ -709,6 +709,7 @@ WRONG_FILTERS = {
     "--landmark-init half": "landmark_init must be 'full' or 'independent'",
     "--estimator ekv": "unknown estimator 'ekv'; did you mean 'ekf'?",
     "--option gate": "--option must be KEY=VALUE, got 'gate'",
+    "--option a=1 --option a=2": "--option must name each key once, got a twice",
     "--option gate=1": "has no option 'gate'; did you mean 'gate_prob",
     "-e ekf[iteration=3]": "ekf has no option 'iteration' (there are",
     "-e invariant[iteration=3]": "'iteration'; did you mean 'iterations'?",
@@ -1045,8 +1046,29 @@ def test_a_log_too_large_for_memory_is_named(log, monkeypatch):
     assert message == f"the log {log} does not fit into memory"
 
 
-def test_an_error_without_text_has_a_message():
-    assert commands.message_of(MemoryError()) == "there is not enough memory"
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (MemoryError(), 1, "there is not enough memory"),
+        (
+            PermissionError(13, "Permission denied", "a.csv"),
+            1,
+            "a.csv: Permission denied",
+        ),
+        (ValueError("dt is 0\n  steps is 1"), 2, "dt is 0; steps is 1"),
+        (ImportError("pip install rerun"), 1, "pip install rerun"),
+        (np.linalg.LinAlgError("P is singular"), 1, "P is singular"),
+        (commands.BrokenFilterError("it lacks\n- a"), 2, "it lacks\n- a"),
+        (commands.InterruptedRunError("kept"), 130, "kept"),
+        (
+            *(KeyError("x"), 1),
+            "internal error: KeyError: 'x' (SLAMGYM_TRACEBACK=1 shows where)",
+        ),
+    ],
+)
+def test_every_error_has_a_message_and_an_exit_code(error, code, message):
+    assert commands.message_of(error) == message
+    assert commands.exit_code_of(error) == code
 
 
 @pytest.mark.slow
