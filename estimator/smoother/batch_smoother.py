@@ -241,7 +241,7 @@ def _starts(
             lambda: estimate(*start_of(drive, start)),
             lambda: estimate(*start_of(drive, iterations=ITERATIONS)),
         ]
-    poses = argument_checks.as_floats("start", start).copy()
+    poses = argument_checks.as_floats("start", start)
     if poses.shape != (drive.poses, 3) or not np.isfinite(poses).all():
         raise ValueError(
             f"start must be finite poses ({drive.poses}, 3), got shape {poses.shape}"

@@ -216,6 +216,14 @@ class StartsTooCertain(EkfSlam):
         (KeepsItsMapOnReset, r"after reset\(pose, pose_std\) must have no landmarks"),
         (ReturnsNothing, "must return an UpdateReport, got NoneType"),
         (
+            shows(lambda x, P, ids: (x + (not ids) * (np.arange(len(x)) == 2), P, ids)),
+            r"after a new estimator must be the pose .* got \[1\.0, -2\.0, 1\.5\]",
+        ),
+        (
+            shows(lambda x, P, ids: (x[:5], P[:5, :5], ids[:1])),
+            r"update\(\) of ids 9 and 4 must map them, got \(9,\)",
+        ),
+        (
             shows(lambda x, P, ids: (x, P, tuple(range(len(ids))))),
             r"ids given to update\(\), here 9 and 4, got \(0, 1\)",
         ),
@@ -433,6 +441,7 @@ def test_the_line_of_an_error_inside_a_library_is_that_of_the_caller():
         ({"degrees_of_freedom": 2.5}, "must be a finite int, got 2.5"),
         ({"associated_ids": None}, r"associated_ids must be a tuple of .*, got None"),
         ({"added_ids": (7,)}, r"added_ids must be a tuple of given ids, got \(7,\)"),
+        ({"skipped_ids": (7,)}, r"skipped_ids must be a tuple of given ids, got \(7"),
         ({"added_ids": ([],)}, r"check_reports\(\) cannot use .* unhashable"),
     ],
 )
@@ -767,6 +776,8 @@ def test_every_frequent_mistake_differs_from_the_equations():
 
 def test_the_contract_of_an_estimator_is_checked_by_its_name():
     assert check_estimator("invariant[iterations=3]") == ()
+    with pytest.raises(EstimatorContractError, match=r"unexpected .* 'iterations'"):
+        check_estimator("ekf[iterations=3]")
     with pytest.raises(ValueError, match="unknown estimator 'invarant'"):
         check_estimator("invarant")
 

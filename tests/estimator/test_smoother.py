@@ -521,6 +521,12 @@ def test_the_start_does_not_change_the_solution():
     found = smooth(made)
     poses = found.poses + 0.05 * np.random.default_rng(0).standard_normal((31, 3))
     again = smooth(made, start=poses)
+    spoilt = smooth(made, landmarks={0: found.landmarks[0] + 0.5})
+    assert spoilt.first_cost > found.first_cost + 1.0
+    assert spoilt.landmarks == pytest.approx(found.landmarks, abs=1e-8)
+    made.predict((1.0, 0.0))  # what is smoothed does not follow the drive
+    made.end_motion()
+    assert len(found.path) == 31
     assert again.poses == pytest.approx(found.poses, abs=1e-8)
     assert again.landmarks == pytest.approx(found.landmarks, abs=1e-8)
 
@@ -767,8 +773,17 @@ def test_merged_and_removed_landmarks_leave_the_drive():
     slam.predict((0.5, 0.0))
     slam.update([(0.15, 1.6), (1.0, 2.0)], [2, 3])
     slam.merge(0, 2)
-    slam.remove([3])
+    gone = [3]
+    slam.remove(gone)
+    gone.clear()
     assert slam.landmark_ids == slam.smoothed().landmark_ids == (0, 1)
+    inside = make_estimator("ekf", management={"merge_within": 1.0}, **NOISE)
+    slam = RecordedSlam(inside, **NOISE)
+    for k in range(40):
+        slam.update([(0.1, 2.0), (1.0, 3.0)], [k % 2, 9])
+        slam.predict((0.0, 0.0), 3.0)
+    assert slam.landmark_ids == slam.recorded().landmark_ids == (0, 9)
+    assert slam.recorded().motions[1].steps == ((0.0, 0.0, 3.0),)
 
 
 def test_a_filter_that_goes_back_takes_its_drive_back():
