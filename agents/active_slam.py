@@ -23,10 +23,9 @@ from ..envs import LandmarkWorldEnv
 from ..envs.rendering import RENDER_MODES
 from ..envs.vector import LandmarkWorldVectorEnv
 from ..estimator.filters.batch import BatchBeliefs, BatchStorage
-from ..jit import jit_in_place
 from ..restorable import Restorable
 from ..sim_configs import Scenario
-from .active_slam_kernels import SUCCESS, TERMINATED
+from .active_slam_kernels import ERROR, REWARD, SUCCESS, TERMINATED
 from .active_slam_task import ActiveSlamTask, AssociationRecord, split_settings
 from .belief_observation import (
     ONE_WORLD,
@@ -190,7 +189,7 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         observation, info = super().reset(seed=seed, options=options)
         self._explorers.begin(self.start_estimate[None], ONE_WORLD)
         self._scan(observation, info, moved=False)
-        self.task.begin(self._filters.storage(), ONE_WORLD)
+        self.task.begin(self._filters.storage(), ONE_WORLD, self._landmarks)
         return self._output(info, ended=False)
 
     def step(
@@ -208,10 +207,11 @@ class ActiveSlamEnv(LandmarkWorldEnv):
         self._scan(observation, info, moved=True)
         beliefs, (actions, collisions) = self._filters.storage(), self._driven
         actions[0], collisions[0] = action, info["collision"]
-        results = self.task.proceed(beliefs, ONE_WORLD, actions, collisions)
+        events = actions, collisions, self._landmarks
+        results = self.task.proceed(beliefs, ONE_WORLD, *events)
         (terminated,), (truncated,), _ = results.ends.tolist()
         seen, info = self._output(info, ended=terminated or truncated)
-        return seen, results.rewards.item(), terminated, truncated, info
+        return seen, results.scores.item(REWARD), terminated, truncated, info
 
     @property
     def knowledge(self) -> AgentKnowledge:
@@ -326,16 +326,17 @@ class ActiveSlamVectorEnv(LandmarkWorldVectorEnv):
         if np.count_nonzero(moving) < self.num_envs:
             self._explorers.begin(self._worlds.start_estimates, ~moving)
         self._scan(self._all, moving)
-        results = self.task.proceed(
-            self._filters.storage(), moving, actions, self._worlds.collisions
-        )
-        return results.rewards, results.ends[TERMINATED]
+        collisions, landmarks = self._worlds.collisions, self._worlds.complex_landmarks
+        beliefs, events = self._filters.storage(), (actions, collisions, landmarks)
+        results = self.task.proceed(beliefs, moving, *events)
+        return results.scores[REWARD], results.ends[TERMINATED]
 
     def _follow(self, worlds: BoolArray) -> None:
         """Start the filters of some worlds, each with its first scan."""
         self._explorers.begin(self._worlds.start_estimates, worlds)
         self._scan(worlds, ~worlds)
-        self.task.begin(self._filters.storage(), worlds)
+        landmarks = self._worlds.complex_landmarks
+        self.task.begin(self._filters.storage(), worlds, landmarks)
 
     def _scan(self, worlds: BoolArray, moved: BoolArray) -> None:
         """Update the filters of some worlds with one scan each."""
@@ -370,7 +371,7 @@ class Explorers(Restorable):
 
     def __init__(self, filters: Filters, task: ActiveSlamTask) -> None:
         self._filters, self._task = filters, task
-        by_id, worlds = task.scenario.sensor.identities, len(task.results.rewards)
+        by_id, worlds = task.scenario.sensor.identities, task.results.scores.shape[1]
         self._record = None if by_id else AssociationRecord(worlds)
 
     def begin(self, estimates: Array, worlds: BoolArray) -> None:
@@ -406,10 +407,10 @@ class Explorers(Restorable):
         ended : bool ndarray, shape (B,)
             Worlds whose episode is over.
         """
-        results, beliefs = self._task.results, self._filters.storage()
-        error = map_rmse if self._record is None else matched_rmse
-        success, rmse = results.ends[SUCCESS], error(beliefs, landmarks)
-        infos = self._named(results.counts, success, rmse)
+        results, rmse = self._task.results, self._task.results.scores[ERROR]
+        if self._record is not None:
+            rmse = matched_rmse(self._filters.storage(), landmarks)
+        infos = self._named(results.counts, results.ends[SUCCESS], rmse)
         if self._record is not None and isinstance(self._filters, SeparateFilters):
             infos |= self._record.scores(self._filters.filters, ended)
         return infos
@@ -419,9 +420,9 @@ class Explorers(Restorable):
         if self._record is not None:
             infos = self.infos(landmarks, np.array([ended]))
             return {key: values.item() for key, values in infos.items()}
-        results, beliefs = self._task.results, self._filters.storage()
-        success, rmse = results.ends[SUCCESS].item(), map_rmse(beliefs, landmarks)
-        return self._named(results.counts.ravel().tolist(), success, rmse.item())
+        counts, ends = self._task.results.counts, self._task.results.ends
+        success, rmse = ends.item(SUCCESS), self._task.results.scores.item(ERROR)
+        return self._named(counts.ravel().tolist(), success, rmse)
 
     def _named(self, counts: Any, success: Any, rmse: Any) -> dict[str, Any]:
         mapped, known = counts
@@ -438,39 +439,18 @@ class Explorers(Restorable):
 # How far maps are from the truth: for `info`, never for an observation or a reward.
 
 
-def map_rmse(beliefs: BatchStorage, landmarks: ComplexArray) -> Array:
-    """Compute the root mean square error of maps, (B,) [m]; 0 of an empty one.
+def matched_rmse(beliefs: BatchStorage, landmarks: ComplexArray) -> Array:
+    """Compute the `map_error` of maps that assign their own identities, (B,) [m].
 
-    The error of a landmark is its distance from the truth in the world's frame, with
-    no alignment: an error of the first heading counts.
+    Landmarks of map and truth are matched one to one, so that the sum of the squared
+    distances is smallest. A duplicate is therefore compared with another landmark.
 
     Parameters
     ----------
     beliefs : BatchStorage
         Of B worlds.
     landmarks : complex ndarray, shape (B, N)
-        True positions x + iy [m]; row i is landmark i.
-
-    Examples
-    --------
-    >>> beliefs = BatchStorage(
-    ...     np.array([[0.0, 0.0, 0.0, 3.0, 4.0, 0.0, 0.0]]),
-    ...     np.zeros((1, 7, 7)),
-    ...     np.array([[-1, 0]]),
-    ... )
-    >>> map_rmse(beliefs, np.array([[9.0 + 9.0j, 3.0 + 3.5j]]))
-    array([0.5])
-    """
-    errors = np.empty(len(landmarks))
-    _write_rmse(beliefs.means, beliefs.slots, landmarks, errors)
-    return errors
-
-
-def matched_rmse(beliefs: BatchStorage, landmarks: ComplexArray) -> Array:
-    """Compute the same of maps that assign their own identities, (B,) [m].
-
-    Landmarks of map and truth are matched one to one, so that the sum of the squared
-    distances is smallest. A duplicate is therefore compared with another landmark.
+        True positions x + iy [m].
 
     Examples
     --------
@@ -490,16 +470,3 @@ def matched_rmse(beliefs: BatchStorage, landmarks: ComplexArray) -> Array:
             squares = np.abs(mapped[:, None] - landmarks[b]) ** 2
             errors[b] = math.sqrt(squares[linear_sum_assignment(squares)].mean())
     return errors
-
-
-@jit_in_place
-def _write_rmse(means: Array, slots: IntArray, true: ComplexArray, rmse: Array) -> None:
-    for b in range(len(means)):
-        squares, mapped = 0.0, 0
-        for i in range(slots.shape[1]):
-            if slots[b, i] >= 0:
-                x = 3 + 2 * slots[b, i]
-                dx = means[b, x] - true[b, i].real
-                dy = means[b, x + 1] - true[b, i].imag
-                squares, mapped = squares + dx * dx + dy * dy, mapped + 1
-        rmse[b] = math.sqrt(squares / mapped) if mapped else 0.0

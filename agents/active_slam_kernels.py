@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, BoolArray, IntArray
+from ..arrays import Array, BoolArray, ComplexArray, IntArray
 from ..estimator.kernels.imagine import View, is_hidden, is_in_view
 from ..estimator.kernels.sizes_of_covariances import half_log_det, largest_variance
 from ..jit import (
@@ -45,11 +45,12 @@ class StepResults(NamedTuple):
     # boolean feature, which landmarks are mapped, has none.
     numbers: Array
     mapped: BoolArray  # this feature, shape (B, N)
-    rewards: Array  # shape (B,)
+    scores: Array  # REWARD, ERROR, shape (2, B)
     ends: BoolArray  # TERMINATED, TRUNCATED, SUCCESS, shape (3, B)
     counts: IntArray  # of landmarks mapped, and of those known, shape (2, B)
 
 
+REWARD, ERROR = range(2)
 TERMINATED, TRUNCATED, SUCCESS = range(3)
 
 
@@ -58,6 +59,7 @@ class Worlds(NamedTuple):
 
     actions: Array
     collisions: BoolArray
+    landmarks: ComplexArray  # true positions x + iy, shape (B, N) [m]; for ERROR alone
     beliefs: tuple[Array, Array, IntArray]  # a `BatchStorage`
     episodes: Episodes
     results: StepResults
@@ -93,6 +95,7 @@ def advance(
     moving: BoolArray,
     actions: Array,
     collisions: BoolArray,
+    landmarks: ComplexArray,
     beliefs: tuple[Any, ...],
     episodes: tuple[Any, ...],
     results: tuple[Any, ...],
@@ -109,7 +112,7 @@ def advance(
     """
     starts, (cells, walls, bounds, diagonal, view), rules, scratch = fixed
     now, after = Episodes(*episodes), StepResults(*results)
-    worlds = Worlds(actions, collisions, beliefs, now, after, starts)
+    worlds = Worlds(actions, collisions, landmarks, beliefs, now, after, starts)
     floor, room = Floor(cells, walls, bounds, diagonal, View(*view)), Scratch(*scratch)
     for b in range(len(chosen)):
         if chosen[b]:
@@ -161,7 +164,8 @@ def advance_world(
     if moved:
         reward_step(b, before - uncertainty[b], worlds, rules)
     else:
-        worlds.results.rewards[b], worlds.results.ends[:, b] = 0.0, False
+        worlds.results.scores[REWARD, b], worlds.results.ends[:, b] = 0.0, False
+    worlds.results.scores[ERROR, b] = map_error(mean, slots[b], worlds.landmarks[b])
     write_shares(b, unseen, mapped, worlds, rules, progress)
     write_wall_distances(pose, floor.walls, diagonal, rules.longest_step, distances)
     judged = slots[b], known[b], variances
@@ -219,8 +223,24 @@ def reward_step(b: int, gain: float, worlds: Worlds, rules: TaskRules) -> None:
     if success:
         reward += rules.success_reward * (2.0 - steps / rules.steps)
     ends, ended = worlds.results.ends, success or crashed
-    worlds.results.rewards[b], ends[SUCCESS, b] = reward, success
+    worlds.results.scores[REWARD, b], ends[SUCCESS, b] = reward, success
     ends[TERMINATED, b], ends[TRUNCATED, b] = ended, not ended and steps >= rules.steps
+
+
+@njit_internal
+def map_error(mean: Array, slots: IntArray, true: ComplexArray) -> float:
+    """Compute the root mean square error of a map [m]; 0 of an empty one.
+
+    The error of a landmark is its distance from the truth in the world's frame, with
+    no alignment: an error of the first heading counts.
+    """
+    squares, mapped = 0.0, 0
+    for i in range(len(slots)):
+        if slots[i] >= 0:
+            x = 3 + 2 * slots[i]
+            dx, dy = mean[x] - true[i].real, mean[x + 1] - true[i].imag
+            squares, mapped = squares + dx * dx + dy * dy, mapped + 1
+    return math.sqrt(squares / mapped) if mapped else 0.0
 
 
 @njit_internal

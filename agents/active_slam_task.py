@@ -4,10 +4,11 @@
 computes; `AssociationRecord` scores the association of filters without identities.
 """
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
+from itertools import pairwise, starmap
 from numbers import Real
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from gymnasium import spaces
 from gymnasium.spaces.utils import flatdim, flatten_space
 from numpy.typing import ArrayLike
 
-from ..arrays import AnyArray, Array, BoolArray, IntArray
+from ..arrays import AnyArray, Array, BoolArray, ComplexArray, IntArray
 from ..envs.vector.landmark_world_vector import KEYWORDS
 from ..estimator.filters.batch import BatchStorage
 from ..estimator.map_management.policy import policy_of
@@ -140,8 +141,8 @@ class ActiveSlamTask(Restorable):
         ]
         # Where each entry of one world begins in the array of all numbers.
         starts = np.append(0, np.cumsum(sizes))
-        ends = itertools.pairwise((count * starts).tolist())
-        self._parts = dict(zip(flat, itertools.starmap(slice, ends), strict=True))
+        ends = pairwise((count * starts).tolist())
+        self._keys, self._split = tuple(flat), itemgetter(*starmap(slice, ends))
         rules = _rules(scenario, weights, self.prior_std)
         self._fixed = starts, self.grid.plan, rules, scratch
         self._size = count * starts[-1]
@@ -155,12 +156,17 @@ class ActiveSlamTask(Restorable):
         )
         self.results, self._sets = self._empty_results(), self._empty_sets()
 
-    def begin(self, beliefs: BatchStorage, worlds: BoolArray) -> None:
-        """Begin episodes in some worlds, (B,), after their first scan."""
+    def begin(
+        self, beliefs: BatchStorage, worlds: BoolArray, landmarks: ComplexArray
+    ) -> None:
+        """Begin episodes in some worlds, (B,), after their first scan.
+
+        The true landmarks x + iy, (B, N), only serve to compute the error of the map.
+        """
         last: Any = map(np.copy, self.results)
         self.results = StepResults(*last)
         self._sets = tuple(map(np.copy, self._sets))
-        self._advance(beliefs, worlds, ~worlds, self._at_rest, worlds)
+        self._advance(beliefs, worlds, ~worlds, (self._at_rest, worlds, landmarks))
         self.begun = True
 
     def proceed(
@@ -169,33 +175,30 @@ class ActiveSlamTask(Restorable):
         moving: BoolArray,
         actions: ArrayLike,
         collisions: BoolArray,
+        landmarks: ComplexArray,
     ) -> StepResults:
         """Take moving worlds, (B,), through a step and its scan.
 
-        The others begin episodes, after their first scan.
+        The others begin episodes, after their first scan; see `begin`.
         """
         given = np.asarray(actions, dtype=np.float64, order="C")
         self.results, self._sets = self._empty_results(), self._empty_sets()
-        self._advance(beliefs, self._all, moving, given, collisions)
+        self._advance(beliefs, self._all, moving, (given, collisions, landmarks))
         return self.results
 
     def observations(self) -> dict[str, AnyArray]:
         """Return the observations of all worlds: arrays that no later step changes."""
-        numbers, mapped = self.results.numbers, self.results.mapped
-        flat: dict[str, AnyArray] = {
-            key: numbers[part].reshape(len(mapped), -1)
-            for key, part in self._parts.items()
-        }
+        mapped, parts = self.results.mapped, self._split(self.results.numbers)
+        rows = (part.reshape(len(mapped), -1) for part in parts)
+        flat: dict[str, AnyArray] = dict(zip(self._keys, rows, strict=True))
         flat["belief_mask"] = mapped
         return self._form.cast(flat | dict(zip(_OF_SETS, self._sets, strict=False)))
 
     def observation(self) -> dict[str, AnyArray]:
         """Return the observation of a single world, which no later step changes."""
-        numbers, mapped = self.results.numbers, self.results.mapped
-        first: dict[str, AnyArray] = {
-            key: numbers[part] for key, part in self._parts.items()
-        }
-        first["belief_mask"] = mapped[0]
+        parts = self._split(self.results.numbers)
+        first: dict[str, AnyArray] = dict(zip(self._keys, parts, strict=True))
+        first["belief_mask"] = self.results.mapped[0]
         for key, rows in zip(_OF_SETS, self._sets, strict=False):
             first[key] = rows[0]
         return self._form.cast(first)
@@ -205,12 +208,11 @@ class ActiveSlamTask(Restorable):
         beliefs: BatchStorage,
         worlds: BoolArray,
         moving: BoolArray,
-        actions: Array,
-        collisions: BoolArray,
+        events: tuple[Array, BoolArray, ComplexArray],
     ) -> None:
         held: Any = tuple(beliefs)
-        groups = held, tuple(self.episodes), tuple(self.results), self._fixed
-        advance(worlds, moving, actions, collisions, *groups)
+        groups = tuple(self.episodes), tuple(self.results), self._fixed
+        advance(worlds, moving, *events, held, *groups)
         if self._sets:
             write_landmark_sets(worlds, held, self.episodes.known, *self._sets)
 
@@ -219,7 +221,7 @@ class ActiveSlamTask(Restorable):
         return StepResults(
             np.empty(self._size),
             np.empty(self._shape, np.bool_),
-            np.empty(count),
+            np.empty((2, count)),
             np.empty((3, count), np.bool_),
             np.empty((2, count), np.int64),
         )

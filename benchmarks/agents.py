@@ -75,7 +75,7 @@ def active_cases() -> dict[str, Case]:
             worlds = gymnasium.make_vec(ACTIVE, count, scenario=f"active_{level}")
             cases[name] = steps_of(worlds, at_most=at_most)
         env = ActiveSlamEnv(f"active_{level}")
-        cases[f"ActiveSlam, {level}, single"] = single_case(env, at_most=200.0)
+        cases[f"ActiveSlam, {level}, single"] = single_case(env, at_most=70.0)
     return cases
 
 

@@ -90,7 +90,7 @@ def goals_at(x, y, heading):
     means = np.zeros((1, 27))
     means[0, :3] = x, y, heading
     nothing = BatchStorage.of(means, np.zeros((1, 27, 27)), np.full((1, 12), -1))
-    task.begin(nothing, np.ones(1, dtype=bool))
+    task.begin(nothing, np.ones(1, dtype=bool), np.zeros((1, 12), dtype=complex))
     return task.observations()["goals"][0]
 
 
