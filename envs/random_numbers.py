@@ -85,9 +85,11 @@ class EpisodeStarts:
 
     def poses(self, keys: WordArray) -> tuple[Array, Array]:
         """Return true and estimated start poses, each of shape (K, 3) [m, m, rad]."""
-        steps = np.zeros(len(keys), dtype=np.int64)
         drawn, centre = np.empty((2, len(keys), 3))
-        _draw_poses(keys, steps, self._pose, self._std, drawn, centre)
+        draw_normals(keys, np.zeros(len(keys), dtype=np.int64), START, drawn)
+        drawn *= self._std
+        drawn += self._pose
+        centre[:] = self._pose
         return (drawn, centre) if self._draws_truth else (centre, drawn)
 
     def landmarks(self, keys: WordArray) -> ComplexArray:
@@ -111,18 +113,6 @@ class EpisodeStarts:
         else:
             out[:] = place_landmarks(layout, np.random.default_rng(0))  # draws nothing
         return out.view(np.complex128)[..., 0]
-
-
-@jit_in_place
-def _draw_poses(
-    keys: WordArray, steps: IntArray, pose: Array, std: Array, drawn: Array, mean: Array
-) -> None:
-    """Draw poses, (K, 3), around a pose (3,) with deviations (3,), and repeat it."""
-    draw_normals(keys, steps, START, drawn)
-    for row in range(len(drawn)):
-        for i in range(3):
-            drawn[row, i] = drawn[row, i] * std[i] + pose[i]
-            mean[row, i] = pose[i]
 
 
 @jit_in_place

@@ -16,7 +16,6 @@ d, α   odometry: distance driven, and turn [m, rad]
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -168,18 +167,6 @@ def mistake_in_log(
         return None
     with one_blas_thread():
         return _Comparison(log, settings, given).mistake()
-
-
-@contextlib.contextmanager
-def explaining(log: slamlog.SlamLog, settings: FilterSettings) -> Iterator[None]:
-    """Name the mistake of a log beside the numerical failure that it causes."""
-    try:
-        yield
-    except np.linalg.LinAlgError as error:
-        mistake = mistake_in_log(log, settings)
-        if mistake is None:
-            raise
-        raise np.linalg.LinAlgError(f"{error}. {mistake}") from error
 
 
 def part_of(log: slamlog.SlamLog) -> LogAsRead | None:

@@ -236,10 +236,9 @@ def reading_variances(
 ) -> tuple[float, float]:
     """Return (σβ + b / r)² and (σr + k r)² at r > 0 [m], of a noise (σβ, σr, k, b)."""
     bearing_std, range_std, per_metre, metres = noise
-    return (
-        (bearing_std + metres / distance) ** 2,
-        (range_std + per_metre * distance) ** 2,
-    )
+    bearing_std += metres / distance
+    range_std += per_metre * distance
+    return bearing_std * bearing_std, range_std * range_std
 
 
 def placed(

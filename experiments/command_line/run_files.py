@@ -1,8 +1,8 @@
 """Filter a log for a command: `filter_and_write` writes and prints a run's results."""
 
 import shlex
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -166,10 +166,16 @@ def mistake_in(log: SlamLog, settings: FilterSettings) -> Any:
     return conventions and conventions.mistake_in_log(log, settings)
 
 
-def explaining(log: SlamLog, settings: FilterSettings) -> AbstractContextManager[None]:
+@contextmanager
+def explaining(log: SlamLog, settings: FilterSettings) -> Iterator[None]:
     """Name the mistake of a log beside the numerical failure that it causes."""
-    conventions = leaf("experiments.log_conventions")
-    return conventions.explaining(log, settings) if conventions else nullcontext()
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        mistake = mistake_in(log, settings)
+        if mistake is None:
+            raise
+        raise np.linalg.LinAlgError(f"{error}. {mistake}") from error
 
 
 def write_belief(path: Path, run: Replay) -> None:

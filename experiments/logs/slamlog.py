@@ -229,7 +229,8 @@ def write_events(
     """
     head = list(_rendered_head(log))
     _read_back(log, _text(head), path)
-    write_whole(path, _text([*head, *events, *_rendered_truth(log)]))
+    truth = rows_of(",", repeat("groundtruth"), *map(texts, log.ground_truth.T))
+    write_whole(path, _text([*head, *events, *truth]))
 
 
 def _text(lines: Iterable[str]) -> str:
@@ -424,8 +425,9 @@ def _rendered_events(log: SlamLog) -> Iterator[str]:
             yield from _rendered_scan(event)
 
 
-def _rendered_truth(log: SlamLog) -> list[str]:
-    return rows_of(",", repeat("groundtruth"), *map(texts, log.ground_truth.T))
+def _rendered_truth(log: SlamLog) -> Iterator[str]:
+    for row in log.ground_truth.tolist():  # sooner than a kernel is loaded
+        yield f"groundtruth,{','.join(map(_known, row))}"
 
 
 def _rendered_scan(scan: Scan) -> Iterator[str]:
