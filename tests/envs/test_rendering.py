@@ -150,14 +150,6 @@ def test_belief_is_drawn_as_ellipses_of_three_sigma(renderer):
         assert shown.get_visible()
 
 
-def test_belief_disappears_when_it_is_withdrawn(renderer):
-    renderer.render(snapshot(belief=FixedBelief()))
-    renderer.render(snapshot())
-    moving = moving_parts(renderer)
-    assert not moving.map_ellipses.get_visible()
-    assert not moving.estimate.get_visible()
-
-
 def test_belief_without_landmarks_is_drawn(renderer):
     class Lost(FixedBelief):
         landmarks = np.empty((0, 2))

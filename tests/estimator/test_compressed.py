@@ -112,14 +112,6 @@ def test_it_keeps_the_contract(base):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("base", ["ekf", "invariant"])
-def test_it_equals_the_full_filter_while_300_landmarks_come_and_go(base):
-    slam, phases = follow_both(base, 300, 400, mapped=True)
-    assert 50 < len(slam.landmark_ids) < 280
-    assert phases > 8
-
-
-@pytest.mark.slow
 def test_it_equals_the_full_filter_over_400_steps_among_1000_landmarks():
     """With a twin in numpy and BLAS for the full filter, not its own kernels."""
     slam = map_all(CompressedEkfSlam(*NOISE), 1000)
