@@ -404,15 +404,18 @@ class SubmapElimination:
         updates: list[Array] = []
         for part in parts:
             count, r = len(part.interior), len(part.border)
-            top, rest = np.zeros((count, count + r)), np.zeros((r, r))
             if part.submap >= 0:
                 H, g, cost = quadratic(part.submap)
                 self.cost += cost
                 unknowns = np.append(part.interior, part.border)
                 self._solved[unknowns[part.places[0]]] += g
+                if not count:  # the order is that of the submap
+                    updates.append(H)
+                    continue
                 pieces = [H]
             else:
                 pieces = [updates.pop(-2), updates.pop()]
+            top, rest = np.zeros((count, count + r)), np.zeros((r, r))
             for places, piece in zip(part.places, pieces, strict=True):
                 add_update(top, rest, places, piece)
             if count:

@@ -43,12 +43,18 @@ class FactorError(NamedTuple):
     @property
     def jacobian(self) -> Array:
         """∂e/∂(F_k, F_{k+1}, landmarks), shape (3 + 2n, 6 + 2n)."""
-        size = len(self.columns)
-        points = np.delete(np.arange(size), 2)
-        jacobian = np.zeros((size, 3 + size))
-        jacobian[points[:, None], 3 + points] = times(self.across, np.eye(size - 1))
-        jacobian[:, [0, 1, 2, 5]] = self.columns[:, :4]
-        return jacobian
+        return self.through(np.eye(len(self.columns)))
+
+    def through(self, G: Array) -> Array:
+        """Return the derivative of G e, shape (k, 6 + 2n), for G of shape (k, 3 + 2n).
+
+        Each point has the 2 × 2 block C on the diagonal of the Jacobian.
+        """
+        points = np.delete(np.arange(G.shape[1]), 2)
+        found = np.zeros((len(G), 3 + G.shape[1]))
+        found[:, 3 + points] = times(self.across.conjugate(), G[:, points].T).T
+        found[:, [0, 1, 2, 5]] = G @ self.columns[:, :4]
+        return found
 
 
 def factor_error(
@@ -257,31 +263,22 @@ class Gaussian(NamedTuple):
             return self.covariance[rows, columns]
         return self.covariance[rows].take(self.order[columns], axis=1)
 
-    def taken(self, size: int) -> Array:
-        """Return an array, shape (size, size), that begins with the covariance.
-
-        The array may use the memory of a covariance with an order, which is then lost.
-        """
-        count, P = len(self.mean), self.covariance
-        if self.order is not None and size <= len(P):
-            array = P.reshape(-1)[: size**2].reshape(size, size)
+    def add_to(self, rows: Array, first: int) -> None:
+        """Add rows of the covariance from the first one on, without columns 0 to 2."""
+        P, order = self.covariance[first:], self.order
+        if order is None:
+            rows += P[: len(rows), 3 : 3 + rows.shape[1]]
         else:
-            array = np.empty((size, size))
-        if self.order is None:
-            array[:count, :count] = P
-        else:
-            _sort_columns(P, self.order, np.empty(len(P)), array)
-        return array
+            _add_columns(P, order[3:], np.empty(P.shape[1]), rows)
 
 
 @jit_in_place
-def _sort_columns(matrix: Array, order: IntArray, row: Array, found: Array) -> None:
-    """Write rows with reordered columns, perhaps where the matrix itself begins."""
-    for i in range(len(order)):
+def _add_columns(matrix: Array, order: IntArray, row: Array, found: Array) -> None:
+    for i in range(len(found)):
         for j in range(len(row)):
-            row[j] = matrix[i, j]
-        for j in range(len(order)):
-            found[i, j] = row[order[j]]
+            row[j] = matrix[i, j]  # once through the memory, not in any order
+        for j in range(found.shape[1]):
+            found[i, j] += row[order[j]]
 
 
 def times(factor: complex, rows: Array) -> Array:

@@ -322,10 +322,8 @@ def _composed(
     if frame == "invariant":
         T[:, 5] += T[:, 3:] @ state_of(1j * points_of(own), 0.0)
     at = np.r_[0:3, cut : cut + len(own)]
-    rows = T @ (local.covariance - V[:, at].T @ V)
-    W = _changes(world, lever, V)
-    covariance = world.taken(2 * len(points) + 1)
-    _change_map(covariance, W)
+    rows = T @ local.covariance - (T @ V[:, at].T) @ V
+    covariance = _changed_map(world, 2 * len(points) + 1, _changes(world, lever, V))
     few = np.r_[0:3, cut : len(covariance)]
     covariance[few, 3:cut] = rows[:, 3:cut] + np.outer(rows[:, 2], lever[3:])
     covariance[3:cut, few] = covariance[few, 3:cut].T
@@ -350,16 +348,28 @@ def _changes(world: Gaussian, lever: Array, V: Array) -> Array:
     return np.vstack([u, d, V[:, : len(lever)] + np.outer(V[:, 2], lever)])
 
 
-def _change_map(covariance: Array, W: Array) -> None:
-    """Update the covariance of the map's landmarks with the rows of `_changes`."""
-    left, cut = np.vstack([W[1], W[0], -W[2:]]), W.shape[1]
-    for first in range(3, cut, AT_ONCE):
-        own, so_far = slice(first, min(first + AT_ONCE, cut)), slice(3, first)
+def _changed_map(world: Gaussian, size: int, W: Array) -> Array:
+    """Return an array, shape (size, size), with the rows of `_changes` added.
+
+    Only its entries between two of the map's landmarks are set.  The array may use the
+    memory of a covariance with an order, which is then lost.
+    """
+    P, left = world.covariance, np.vstack([W[1], W[0], -W[2:]])
+    if world.order is not None and size <= len(P):
+        found = P.reshape(-1)[: size**2].reshape(size, size)
+    else:
+        found = np.empty((size, size))
+    room = np.empty((AT_ONCE, W.shape[1]))
+    for first in range(3, W.shape[1], AT_ONCE):
+        own, so_far = slice(first, min(first + AT_ONCE, W.shape[1])), slice(3, first)
         here = slice(3, own.stop)
-        rows = covariance[own, here]
-        rows += left[:, own].T @ W[:, here]
-        covariance[so_far, own] = rows[:, : first - 3].T
-        covariance[own, own] = as_covariance(rows[:, first - 3 :])
+        rows = room[: own.stop - first, here]
+        np.matmul(left[:, own].T, W[:, here], out=rows)
+        world.add_to(rows, first)
+        found[own, so_far] = rows[:, : first - 3]
+        found[so_far, own] = rows[:, : first - 3].T
+        found[own, own] = as_covariance(rows[:, first - 3 :])
+    return found
 
 
 def part_of(

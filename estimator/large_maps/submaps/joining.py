@@ -97,6 +97,7 @@ class JoinedMap:
             [self._unknowns(k) for k in range(self._count)], frames[:-1, :2]
         )
         self._elimination: SubmapElimination | None = None
+        # m̂, L⁻¹ and P⁻¹ of submaps, until the first marginal.
         self._kept: dict[int, tuple[Array, Array, Array]] = {}
         values = np.concatenate([frames[1:].ravel(), self._points.ravel()])
         found = minimise(self._linearise, values, converged, trusted)
@@ -107,7 +108,6 @@ class JoinedMap:
                 "other, as after a wrong landmark_id, or drifted too far"
             )
         self._move(found)
-        self._kept.clear()
 
     @property
     def nbytes(self) -> int:
@@ -137,6 +137,7 @@ class JoinedMap:
             private, where = self._private_landmarks(k, slots[held]), 3 + pairs(held)
             mean[where] = private.points
             owned.append(Owned(where, self._unknowns(k), private))
+        self._kept.clear()
         is_large = len(slots) > 0 and len(mean) > MANY * (cut + self._points.size)
         covariance = self._large_covariance if is_large else self._small_covariance
         return Gaussian(mean, *covariance(len(mean), rows, columns, owned))
@@ -205,21 +206,23 @@ class JoinedMap:
 
     def _normal_equations(self, index: int) -> Quadratic:
         """Return the squared error of a submap as a function of its unknowns."""
-        mean, root, information = self._factor(index)
+        kept = self._kept.get(index)
+        if kept is None:
+            mean, root = self._whitening(index)
+            kept = mean, root, root.T @ root
+            if self._count <= MOST_KEPT:
+                self._kept[index] = kept
+        mean, root, information = kept
         found = self._error(index, mean)
         return quadratic(found, root, information, is_first=index == 0)
 
-    def _factor(self, index: int) -> tuple[Array, Array, Array]:
-        """Return m̂ of the shared part of a submap, L⁻¹, where L Lᵀ = P, and P⁻¹."""
-        found = self._kept.get(index)
-        if found is None:
-            submap, rows = self._load(index), self._rows[index]
-            lower = np.linalg.cholesky(regularised(submap.covariance, rows))
-            root = lapack.dtrtri(lower.T, overwrite_c=1)[0].T
-            found = submap.mean[rows], root, root.T @ root
-            if self._count <= MOST_KEPT:
-                self._kept[index] = found
-        return found
+    def _whitening(self, index: int) -> tuple[Array, Array]:
+        """Return m̂ of the shared part of a submap, and L⁻¹, where L Lᵀ = P."""
+        if index in self._kept:
+            return self._kept[index][:2]
+        submap, rows = self._load(index), self._rows[index]
+        lower = np.linalg.cholesky(regularised(submap.covariance, rows))
+        return submap.mean[rows], lapack.dtrtri(lower.T, overwrite_c=1)[0].T
 
     def _error(self, k: int, mean: Array) -> FactorError:
         """Return the error of the shared part of a submap, and its Jacobian."""
@@ -233,11 +236,14 @@ class JoinedMap:
         return np.concatenate([frames, 3 * self._count + pairs(self._shared[index])])
 
     def _private_landmarks(self, index: int, wanted: IntArray) -> PrivateLandmarks:
-        submap = self._load(index)
-        rows = self._rows[index]
-        factor, start = self._error(index, submap.mean[rows]), self.frames[index]
+        mean, root = self._whitening(index)
         found = private_landmarks(
-            submap, rows, wanted, start, factor, self._error_frame
+            self._load(index),
+            (self._rows[index], root),
+            wanted,
+            self.frames[index],
+            self._error(index, mean),
+            self._error_frame,
         )
         return found if index else found._replace(jacobian=found.jacobian[:, 3:])
 
@@ -441,7 +447,7 @@ class PrivateLandmarks(NamedTuple):
 
 def private_landmarks(
     submap: Submap,
-    shared: IntArray,
+    shared: tuple[IntArray, Array],
     wanted: IntArray,
     start: Array,
     factor: FactorError,
@@ -452,14 +458,14 @@ def private_landmarks(
     Given the error e_b of the shared part, their error is e_p = G e_b + w, with noise
     w::
 
-        G = P_pb P_bb⁻¹,    cov w = P_pp − G P_bp
+        G = P_pb P_bb⁻¹,    cov w = P_pp − G P_bp,    P_bb = L Lᵀ
         Y_p = V(t) (G e_b + w) + R(t) m̂_p,     l = p_k + R(θ_k) Y_p
 
     Parameters
     ----------
     submap : Submap
-    shared : ndarray
-        Rows of the pose and the shared landmarks in the submap's state.
+    shared : tuple of two ndarrays
+        Rows of the pose and the shared landmarks in the submap's state; L⁻¹.
     wanted : ndarray, shape (n,)
         Slots of the landmarks.
     start : ndarray, shape (3,)
@@ -469,32 +475,32 @@ def private_landmarks(
     frame : {"additive", "invariant"}
         Coordinates of the error.
     """
-    error, jacobian = factor.error, factor.jacobian
+    turn = float(factor.error[2])
     sorter = np.argsort(submap.slots)
     rows = 3 + pairs(sorter[np.searchsorted(submap.slots, wanted, sorter=sorter)])
     P = submap.covariance
-    P_bp = P[shared[:, None], rows]
-    lower = np.linalg.cholesky(regularised(P, shared))
-    G = lapack.dpotrs(lower.T, P_bp)[0].T
+    whitened = shared[1] @ P[shared[0][:, None], rows]
+    G = whitened.T @ shared[1]
     points = submap.mean[rows[::2]] + 1j * submap.mean[rows[1::2]]
-    moved = (G @ error).view(np.complex128)
-    by_unknowns = G @ jacobian
+    moved = (G @ factor.error).view(np.complex128)
+    by_unknowns = factor.through(G)
     scale = 1.0 + 0.0j
     if frame == "additive":
         seen = points + moved
     else:
-        turn = float(error[2])
         scale, slope = inverse_spread(turn)
         turned = np.exp(1j * turn) * points
         seen = turned + moved / scale
         by_turn = slope * (seen - turned) - 1j * scale * turned
-        by_unknowns -= np.outer(by_turn.view(np.float64), jacobian[2])
+        # ∂t/∂θ_k = −1, ∂t/∂θ_{k+1} = 1
+        by_unknowns[:, 2] += by_turn.view(np.float64)
+        by_unknowns[:, 5] -= by_turn.view(np.float64)
     out = np.exp(1j * start[2])
     by_unknowns = times(out / scale, by_unknowns)
     by_unknowns[0::2, 0] += 1.0
     by_unknowns[1::2, 1] += 1.0
     by_unknowns[:, 2] += (1j * out * seen).view(np.float64)
-    noise = P[rows[:, None], rows] - G @ P_bp
+    noise = P[rows[:, None], rows] - whitened.T @ whitened
     noise = times(out / scale, times(out / scale, noise).T)
     world = complex(*start[:2]) + out * seen
     return PrivateLandmarks(world.view(np.float64), by_unknowns, (noise + noise.T) / 2)
