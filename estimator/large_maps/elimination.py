@@ -435,6 +435,13 @@ class SubmapElimination:
         solved = [self._solved[node.own] for node in self._nodes]
         return float(sum(y @ y for y in solved))
 
+    def solve(self, g: Array) -> tuple[float, Array]:
+        """Return gᵀ H⁻¹ g and H⁻¹ g for another g, which is overwritten."""
+        substitute_forward(self._nodes, g)
+        decrement = float(g @ g)
+        substitute_back(self._nodes, g)
+        return decrement, g
+
     def covariance(self, rows: csc_array) -> Array:
         """Return A H⁻¹ Aᵀ, shape (v, v), for a sparse A, shape (v, N)."""
         return marginal_covariance(self._nodes, rows)[0]

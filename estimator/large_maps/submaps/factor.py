@@ -46,15 +46,23 @@ class FactorError(NamedTuple):
         return self.through(np.eye(len(self.columns)))
 
     def through(self, G: Array) -> Array:
-        """Return the derivative of G e, shape (k, 6 + 2n), for G of shape (k, 3 + 2n).
-
-        Each point has the 2 × 2 block C on the diagonal of the Jacobian.
-        """
-        points = np.delete(np.arange(G.shape[1]), 2)
-        found = np.zeros((len(G), 3 + G.shape[1]))
-        found[:, 3 + points] = times(self.across.conjugate(), G[:, points].T).T
-        found[:, [0, 1, 2, 5]] = G @ self.columns[:, :4]
+        """Return G ∂e/∂(F_k, F_{k+1}, landmarks) for G of shape (k, 3 + 2n)."""
+        found = np.empty((len(G), 3 + G.shape[1]))
+        _fill_through(G, G @ self.columns[:, :4], self.across, found)
         return found
+
+
+@jit_in_place
+def _fill_through(G: Array, few: Array, across: complex, found: Array) -> None:
+    """Write G J: four columns of J are dense, each other point has the block C."""
+    a, b = across.real, across.imag
+    for i in range(len(G)):
+        found[i, 0], found[i, 1], found[i, 2] = few[i, 0], few[i, 1], few[i, 2]
+        found[i, 5] = few[i, 3]
+        for row in range(0, G.shape[1] - 1, 2):
+            x = row + (row > 0)  # 0, then 3, 5, …
+            found[i, 3 + x] = a * G[i, x] + b * G[i, x + 1]
+            found[i, 4 + x] = a * G[i, x + 1] - b * G[i, x]
 
 
 def factor_error(
@@ -169,6 +177,12 @@ def quadratic(
     H, g = np.empty((size, size)), np.empty(size)
     _fill_quadratic(information, found.across, root.T @ W, W.T @ W, H, g)
     return H, g, float(W[:, -1] @ W[:, -1])
+
+
+def gradient(found: FactorError, root: Array, *, is_first: bool = False) -> Array:
+    """Return g of `quadratic` alone."""
+    response = root.T @ (root @ found.error)
+    return -found.through(response[None])[0, 3 * is_first :]
 
 
 @jit_in_place

@@ -11,7 +11,7 @@ from math import hypot
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import solve_triangular
 
 from .... import argument_checks
 from ....arrays import Array, IntArray
@@ -224,10 +224,9 @@ def fuse(
     """
     mean, own, cut = world.mean, local.mean, len(world.mean)
     V = np.empty((0, cut + len(own)))
-    start = _in_invariant(world, np.arange(3))
     if len(both[0]):
         A, innovation = _difference(mean, own, frame, both)
-        seen = np.concatenate([start, _in_invariant(world, 3 + pairs(both[0]))])
+        seen = _in_invariant(world, np.append(np.arange(3), 3 + pairs(both[0])))
         AP = np.hstack([A[:, : len(seen)] @ seen, A[:, len(seen) :] @ local.covariance])
         used = np.r_[0:3, 3 + pairs(both[0]), cut : cut + len(own)]
         S = AP[:, used] @ A.T
@@ -238,8 +237,7 @@ def fuse(
         V, step = V[:, :-1], V[:, :-1].T @ V[:, -1]
         mean = retract(mean, step[:cut], "invariant")
         own = retract(own, step[cut:], frame)
-    moved = Gaussian(own, block_diag(start, local.covariance))
-    return _composed(world, mean, moved, V, (frame, both[1]))
+    return _composed(world, mean, local._replace(mean=own), V, (frame, both[1]))
 
 
 def _in_invariant(world: Gaussian, rows: IntArray) -> Array:
@@ -294,8 +292,7 @@ def _composed(
     mean : ndarray
         Of the world, after it.
     local : Gaussian
-        The submap's mean after it; the rows of the start and of the submap in the joint
-        covariance before it, in the coordinates ξ and ``frame``.
+        The submap's mean after it, and its covariance before it, in ``frame``.
     V : ndarray, shape (r, ·)
         The joint covariance falls by Vᵀ V.
     of_local : (frame, known)
@@ -322,7 +319,8 @@ def _composed(
     if frame == "invariant":
         T[:, 5] += T[:, 3:] @ state_of(1j * points_of(own), 0.0)
     at = np.r_[0:3, cut : cut + len(own)]
-    rows = T @ local.covariance - (T @ V[:, at].T) @ V
+    start = T[:, :3] @ _in_invariant(world, np.arange(3))
+    rows = np.hstack([start, T[:, 3:] @ local.covariance]) - (T @ V[:, at].T) @ V
     covariance = _changed_map(world, 2 * len(points) + 1, _changes(world, lever, V))
     few = np.r_[0:3, cut : len(covariance)]
     covariance[few, 3:cut] = rows[:, 3:cut] + np.outer(rows[:, 2], lever[3:])
