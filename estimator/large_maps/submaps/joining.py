@@ -18,7 +18,7 @@ from scipy.linalg import lapack
 from scipy.sparse import coo_array
 
 from ....arrays import Array, IntArray
-from ...models.rigid_motion import ErrorFrame, compose, points_of
+from ...models.rigid_motion import ErrorFrame, compose, pose_rotation
 from ..elimination import Quadratic, SubmapElimination, dissect
 from ..multifrontal import pairs
 from .factor import (
@@ -377,10 +377,10 @@ def points_seen(summaries: Sequence[SubmapSummary], frames: Array, count: int) -
     points = np.full((count, 2), np.nan)
     last_first = summaries[::-1]  # of several positions, the last one is kept
     slots = np.concatenate([summary.slots for summary in last_first])
-    landmarks = np.concatenate([points_of(summary.mean)[1:] for summary in last_first])
+    landmarks = np.concatenate([summary.mean[3:] for summary in last_first])
     counts = [len(summary.slots) for summary in last_first]
     x, y, heading = np.repeat(frames[len(summaries) - 1 :: -1], counts, axis=0).T
-    seen = x + 1j * y + np.exp(1j * heading) * landmarks
+    seen = x + 1j * y + np.exp(1j * heading) * landmarks.view(np.complex128)
     points[slots] = seen.view(np.float64).reshape(-1, 2)
     return points
 
@@ -399,7 +399,7 @@ def _merged(
         seen = points_seen(after, right, count)
         common = np.flatnonzero(~np.isnan(goal[:, 0] + seen[:, 0]))
         start = align(start, before[-1].pose_covariance, seen[common], goal[common])
-    moved = np.array([compose(start, frame)[0] for frame in right])
+    moved = start + right @ pose_rotation(start[2]).T
     return np.concatenate([left[:-1], moved])
 
 
