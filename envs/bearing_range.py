@@ -59,6 +59,11 @@ class BearingRangeSensor:
         self._constants = np.array([smallest, *bias, *wraps])
         hides = sensor.occlusion and scenario.walls
         self._sight = LineOfSight(scenario.walls) if hides else None
+        self._room = _room_for((0, 0))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the settings: copies of the room would not share memory."""
+        return {**vars(self), "_room": _room_for((0, 0))}
 
     def scan(
         self,
@@ -93,9 +98,11 @@ class BearingRangeSensor:
             Landmarks that the sensor reads.
         """
         shape = landmarks.shape
-        relative, places = np.empty(shape, np.complex128), np.empty((2, *shape))
+        if self._room[0].shape != shape:
+            self._room = _room_for(shape)
+        relative, places, y, x = self._room
         _relate(landmarks, frame, relative, places)
-        y, x, readings = places[0], places[1], places
+        readings = places
         if self._reads_places is not None:
             readings = np.empty(places.shape)
             readings[0], readings[1] = self._reads_places(x, y)
@@ -114,6 +121,12 @@ class BearingRangeSensor:
             measurements[..., 0] = measurements[..., self._only]
             measurements[..., 1] = 0.0
         return measurements, mask
+
+
+def _room_for(shape: tuple[int, int]) -> tuple[ComplexArray, Array, Array, Array]:
+    """Return room for intermediate results; the last two arrays are parts of one."""
+    places = np.empty((2, *shape))
+    return np.empty(shape, np.complex128), places, places[0], places[1]
 
 
 @jit_in_place
