@@ -17,7 +17,7 @@ from slamgym.estimator import (
     make_estimator,
 )
 from slamgym.estimator.interface import MapView, marginal_without_joining
-from slamgym.estimator.registry import split_labels
+from slamgym.estimator.registry import accepted_models, split_labels
 
 NOISE = {"motion_std": (0.1, 0.1, 0.05), "measurement_std": (0.02, 0.1)}
 
@@ -136,6 +136,13 @@ def test_an_unknown_option_is_refused_with_those_that_there_are(name, option, me
         make_estimator(name, **NOISE, **{option: 1})
     shown = name.rpartition(":")[2]
     assert str(caught.value) == f"{shown} has no option '{option}'{message}"
+
+
+def test_models_that_an_estimator_does_not_take_are_refused():
+    models = {"noise_at_rest": False, "sensor": "position"}
+    assert accepted_models(EkfSlam, models) == models
+    with pytest.raises(ValueError, match="not accept sensor = 'position'"):
+        accepted_models(lambda noise: None, models)
 
 
 def test_a_batch_shows_its_runs():
