@@ -29,6 +29,7 @@ from slamgym.experiments.command_line.commands import (
 )
 from slamgym.experiments.command_line.monte_carlo import connected
 from slamgym.experiments.monte_carlo_study import (
+    filtered_runs,
     monte_carlo,
     run_measures,
     runner,
@@ -45,7 +46,10 @@ from slamgym.experiments.monte_carlo_study.run_measures import (
 )
 from slamgym.experiments.monte_carlo_study.runner import python_call
 from slamgym.experiments.monte_carlo_study.summary import share
-from slamgym.experiments.run_and_replay.filter_settings import estimator_choices
+from slamgym.experiments.run_and_replay.filter_settings import (
+    estimator_choices,
+    settings_for_scenario,
+)
 from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
 
@@ -463,6 +467,16 @@ def test_of_landmarks_that_show_the_same_one_the_first_counts():
     np.testing.assert_array_equal(found.landmarks, [[3.0, 4.0], [5.0, 6.0]])
     np.testing.assert_array_equal(found.covariance.diagonal(), np.arange(1.0, 8.0))
     assert identified(belief, {7: 0}).landmark_ids == (0,)
+
+
+def test_a_batch_fails_in_the_run_whose_final_map_is_not_finite(monkeypatch):
+    answers = iter([True, False, True, True])  # of three runs, and of one run again
+    monkeypatch.setattr(filtered_runs, "is_finite", lambda belief: next(answers))
+    runs = simulate_runs(WORLD.with_changes(steps=6), 3, 0)
+    settings = settings_for_scenario(WORLD, estimator="ekf")
+    found = filtered_runs.filter_runs(settings, runs)
+    assert {run: failure.step for run, failure in found.failures.items()} == {1: 6}
+    assert [belief is None for belief in found.beliefs] == [False, True, False]
 
 
 def test_a_belief_that_is_no_map_of_the_world_ends_its_own_run_only(whole):
