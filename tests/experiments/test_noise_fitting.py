@@ -54,6 +54,7 @@ from slamgym.experiments.noise_fitting.scoring import (
     maximise,
     parts_of,
     sample_of,
+    scores,
     stretches_of,
 )
 from slamgym.experiments.noise_fitting.search import (
@@ -233,13 +234,14 @@ def test_the_advice_states_open_ends_and_what_remains(found, text):
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 64, 401])
 def test_the_bounds_are_those_of_the_products_of_all_lags(count):
     rng = np.random.default_rng(4)
-    nees = lfilter([1.0], [1.0, -0.8], rng.chisquare(3, count))
+    nees = 3 + lfilter([0.6], [1.0, -0.8], rng.chisquare(3, count) - 3)
     excess = nees - 3
     products = [excess[k:] @ excess[:-k] for k in range(1, count // 2)]
     together = 1 + 2 * positive_sum(np.array(products) / (6 * count))
     degrees = max(3.0, 3 * count / together)
     expected = chi2.ppf([0.025, 0.975], degrees) / degrees
     assert nees_bounds(nees) == pytest.approx(expected)
+    assert count < 64 or 3 < degrees < 3 * count
 
 
 def test_whiteness_is_that_of_single_scans_and_of_single_landmarks():
@@ -380,6 +382,27 @@ def test_scoring_finds_the_spread_of_normal_numbers_and_its_interval():
     assert best.parameters[0] == pytest.approx(np.sqrt(np.mean(x**2)), rel=1e-3)
     bent = curvature(likelihoods, np.log(best.parameters), np.array([0.05]))
     assert bent[0, 0] == pytest.approx(2 * len(x), rel=0.01)
+
+
+def test_the_slope_beside_a_jump_is_that_of_the_side_without_it():
+    def likelihoods(parameters):
+        return 3 * np.log(parameters) + (parameters > np.exp(0.005))
+
+    for beside_jumps, slope in ((False, 3 + 1 / 0.02), (True, 3)):
+        found = scores(likelihoods, np.zeros(1), beside_jumps=beside_jumps)
+        assert found.gradient[0] == pytest.approx(slope)
+    assert scores(likelihoods, np.zeros(1)).gradient[0] == pytest.approx(53)
+
+
+@pytest.mark.parametrize("bent", [100.0, -100.0])
+def test_the_width_of_an_interval_is_by_curvature_or_else_by_information(bent):
+    def likelihoods(parameters):
+        return -0.5 * bent * np.log(parameters) ** 2
+
+    information = np.array([[400.0]])
+    (found,) = intervals(likelihoods, np.ones(1), 0.0, information)
+    width = 0.1 if bent > 0 else 0.05
+    assert found[1:] == pytest.approx(np.exp([-1.96 * width, 1.96 * width]))
 
 
 def test_curvature_is_the_second_derivative_along_all_pairs_of_parameters():
@@ -668,6 +691,8 @@ def test_the_associations_of_a_filter_become_identities_of_the_log():
         }
         for each in (log, known)
     )
+    kept = {k: v for k, v in hidden.header.items() if k != "identities"}
+    assert known.header == kept != {}
     pairs = {(true[reading], landmark) for reading, landmark in found.items()}
     assert len(pairs) == len(dict(pairs)) == len({i for _, i in pairs}) == 6
     motions = [e for e in known.events if isinstance(e, OdometryRow)]
@@ -752,8 +777,17 @@ def test_a_search_begins_at_the_most_likely_multiple_and_refuses_to_end_on_its_w
     def unfinished(*arguments, **named):
         return maximise(*arguments, **named)._replace(converged=False)
 
+    events = likelihood.events
+    flipped = replace(likelihood, events=events._replace(readings=-events.readings))
+    for each in (likelihood, flipped):
+        assert search._typical_range(each) == np.median(events.readings[:, 1])
     before = start.noise.copy()
     fit = search._fit(likelihood, start)
+    free = np.arange(7) != 2
+    for std, is_plain in ((0.145, True), (0.155, False)):
+        information = np.diag([1e9, 1, 1, 1, std**-2, 1e9])
+        entry = fit._replace(free=free, information=information)
+        assert search._is_plain(entry, 5) == is_plain
     np.testing.assert_array_equal(start.noise, before)
     search._refuse_diverged(fit._replace(noise=np.full(7, 499.0)))
     with pytest.raises(np.linalg.LinAlgError, match=f"{fit.passes} pas.*metres 501"):
