@@ -18,6 +18,7 @@ from slamgym.estimator.large_maps.elimination import (
     dissect,
 )
 from slamgym.estimator.large_maps.submaps import closed_submaps as closing
+from slamgym.estimator.large_maps.submaps import graph as fusing
 from slamgym.estimator.large_maps.submaps import joining as gauss_newton
 from slamgym.estimator.large_maps.submaps.closed_submaps import Neighbourhood, Region
 from slamgym.estimator.large_maps.submaps.factor import (
@@ -757,9 +758,10 @@ def test_a_world_without_noise_is_mapped_as_it_is():
 @pytest.mark.parametrize("frame", ["additive", "invariant"])
 @pytest.mark.parametrize(("shared", "heading_std"), [(0, 1), (3, 1), (3, 0)])
 def test_a_fusion_equals_a_dense_update_with_numeric_derivatives(
-    frame, shared, heading_std
+    frame, shared, heading_std, monkeypatch
 ):
     """The updated covariance is T (P - K S Kᵀ) Tᵀ; T takes errors to the map."""
+    monkeypatch.setattr(fusing, "AT_ONCE", 5)  # several blocks
     rng = np.random.default_rng(1)
     spread = [rng.normal(size=(size, size)) for size in (15, 13)]
     spread[0][2] *= heading_std
