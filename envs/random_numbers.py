@@ -78,18 +78,16 @@ class EpisodeStarts:
 
     def __init__(self, scenario: Scenario) -> None:
         start, self._layout = scenario.start, scenario.landmarks
-        self._pose, self._std = np.array(start.pose), np.array(start.std)
+        self._pose, self._std = np.array([start.pose]), np.array([start.std])
         self._draws_truth = start.drawn == "truth"
         #: Whether every episode has new landmarks.
         self.redraws_landmarks = self._layout.is_redrawn
 
     def poses(self, keys: WordArray) -> tuple[Array, Array]:
         """Return true and estimated start poses, each of shape (K, 3) [m, m, rad]."""
-        drawn, centre = np.empty((2, len(keys), 3))
-        draw_normals(keys, np.zeros(len(keys), dtype=np.int64), START, drawn)
-        drawn *= self._std
-        drawn += self._pose
-        centre[:] = self._pose
+        unit = np.empty((len(keys), 3))
+        draw_normals(keys, np.zeros(len(keys), dtype=np.int64), START, unit)
+        drawn, centre = unit * self._std + self._pose, self._pose.repeat(len(keys), 0)
         return (drawn, centre) if self._draws_truth else (centre, drawn)
 
     def landmarks(self, keys: WordArray) -> ComplexArray:
