@@ -313,10 +313,9 @@ def settled_assignments(
 ) -> tuple[Array, IntArray]:
     """Return the cheapest assignments if they pair all readings or all but one.
 
-    Readings near no landmark are not paired by any.  The search finds the assignment
-    that pairs all others first, if every pair costs less than its reading left out,
-    given the pairs before it.  Leaving out the readings U costs
-    in addition ::
+    None of these pairs a reading near no landmark.  The search first finds the one that
+    pairs all others, if every pair costs less than its reading left out, given the
+    pairs before it.  Leaving out the readings U costs in addition ::
 
         Σ λ − ln det S_U − ρᵀ (Q − C⁺)⁻¹ ρ
 
@@ -436,7 +435,7 @@ def settled_assignments(
 def _paired(
     of_pairs: tuple[Array, ...], limits: tuple[float, Array], without: int
 ) -> tuple[float, float, int]:
-    """Pair all readings but one, the last first; infinite if the search does not.
+    """Return the cost of pairing all readings but one, the last first.
 
     Parameters
     ----------
@@ -451,7 +450,8 @@ def _paired(
     Returns
     -------
     cost, squared, here : float, float, int
-        −2 ln of the likelihood, νᵀ S⁻¹ ν, and the level of ``h`` and ``C``.
+        −2 ln of the likelihood, infinite if the search does not pair so, νᵀ S⁻¹ ν, and
+        the level of ``h`` and ``C``.
     """
     (nu, Q, h, C, gains), (gate, missing) = of_pairs, limits
     cost, squared, here = 0.0, 0.0, 0
