@@ -39,12 +39,12 @@ class Episodes(NamedTuple):
 
 
 class StepResults(NamedTuple):
-    """What the pass writes of one step in B worlds."""
+    """The results of one step in B worlds."""
 
-    # The values of the first feature for all worlds, then those of the next one. The
-    # boolean feature, which landmarks are mapped, has none.
+    # The values of the first feature for all worlds, then those of the next one, and so
+    # on, without the boolean feature.
     numbers: Array
-    mapped: BoolArray  # this feature, shape (B, N)
+    mapped: BoolArray  # the boolean feature, which landmarks are mapped, shape (B, N)
     scores: Array  # REWARD, ERROR, shape (2, B)
     ends: BoolArray  # TERMINATED, TRUNCATED, SUCCESS, shape (3, B)
     counts: IntArray  # of landmarks mapped, and of those known, shape (2, B)
@@ -63,7 +63,8 @@ class Worlds(NamedTuple):
     beliefs: tuple[Array, Array, IntArray]  # a `BatchStorage`
     episodes: Episodes
     results: StepResults
-    starts: IntArray  # of the features of one world, and the end of the last
+    # Where each feature begins among the numbers of one world, and where the last ends.
+    starts: IntArray
 
 
 class TaskRules(NamedTuple):
@@ -267,7 +268,7 @@ def write_landmark_goals(
     goals: Array,
     uncertain: Array,
 ) -> None:
-    """Write goals and densities of the landmarks, of `judge_landmarks`."""
+    """Write goals and densities of landmarks, from what `judge_landmarks` found."""
     (slots, known, variances), count = judged, 0
     for i in range(len(slots)):
         if slots[i] >= 0 and not known[i]:

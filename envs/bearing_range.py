@@ -62,7 +62,7 @@ class BearingRangeSensor:
         self._room = _room_for((0, 0))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the settings: copies of the room would not share memory."""
+        """Return the settings, with new room: views in a copy share no memory."""
         return {**vars(self), "_room": _room_for((0, 0))}
 
     def scan(
@@ -124,7 +124,7 @@ class BearingRangeSensor:
 
 
 def _room_for(shape: tuple[int, int]) -> tuple[ComplexArray, Array, Array, Array]:
-    """Return room for intermediate results; the last two arrays are parts of one."""
+    """Return room for intermediate results; the last two are rows of the second."""
     places = np.empty((2, *shape))
     return np.empty(shape, np.complex128), places, places[0], places[1]
 

@@ -62,7 +62,7 @@ def progress_bar(
     ) as bar:
         task = bar.add_task(doing, total=None)
 
-        def update(done: int, total: int) -> None:  # the first counts for no speed
+        def update(done: int, total: int) -> None:  # the speed excludes the first call
             bar.update(task, completed=done, total=total)
 
         yield _now_and_then(update)

@@ -324,7 +324,7 @@ def settled_assignments(
     if the reading is then near its landmark and hardly changes the belief
     (`_without_one`).  Leaving out several must be too expensive.  det S_U is at most
     the product of det S before any pair, and the last term at most νᵀ S⁻¹ ν of all
-    pairs.  By Gershgorin's theorem for blocks, C⁺ ⪯ τ Q with the norm of Frobenius in
+    pairs.  By Gershgorin's theorem for blocks, C⁺ ⪯ τ Q with the Frobenius norm in
     τ = max tr Q⁻¹ C⁺ + (u − 1) max ‖Q^−½ C⁺ Q^−½‖ of one reading and of two.  So
     leaving out u readings costs at least the larger of ::
 
@@ -348,8 +348,8 @@ def settled_assignments(
     Returns
     -------
     costs, marks : ndarray, shapes (M,) and (M, m)
-        As the search finds them, to the bit, but for those that do not matter.  Empty
-        if others may be of interest.
+        As the search finds them without its limit of nodes, to the bit, except those
+        that do not matter.  Empty if others may be of interest.
     """
     problem, count = Problem(*of_scan), len(partners)
     others = np.empty(0), np.empty((0, count), np.int64)
@@ -444,8 +444,9 @@ def _paired(
     limits : tuple
         The gate, and λ of each reading.
     without : int
-        The reading to leave out; −1 for none.  Then all readings are conditioned on
-        each pair, else only those still open, and the search finds this first.
+        The reading to leave out; −1 for none.  With −1, the search must find these
+        pairs first, and all readings are conditioned on each pair.  Otherwise, only
+        those still open are.
 
     Returns
     -------
@@ -475,7 +476,7 @@ def _paired(
 
 @njit_internal
 def _largest_apart(C: Array, Q: Array) -> float:
-    """Return the largest ‖Q^−½ C Q^−½‖ of two readings, in the norm of Frobenius."""
+    """Return the largest Frobenius norm ‖Q^−½ C Q^−½‖ of two readings."""
     largest = 0.0
     for a in range(len(Q)):
         for b in range(a):

@@ -428,12 +428,13 @@ COUNT, FIRST_NEW, NEWEST, HAS_PLACE, WHOLE = 0, 1, 2, 3, 4
 EVIDENCE, SUMS, SHARE, PLACE, FEWER, SETTINGS, NUMBERS = 0, 8, 11, 13, 15, 16, 35
 
 
-# How a kernel is to associate a scan: by given landmarks; for the only hypothesis,
-# which may not split; and the filter may take in the scan.
+# How a kernel associates a scan.  GIVEN: the landmarks are given.  ALONE: there is no
+# other hypothesis; a scan that splits it is not clear.  AT_ONCE: the filter may take in
+# the scan.
 GIVEN, ALONE, AT_ONCE = 1, 2, 4
 
-# What has become of a scan: the filter has taken it in, but has left readings unused;
-# and the path of the run is to remember the pose.
+# What has become of a scan.  TAKEN: the filter has taken it in.  UNUSED: it has not
+# used all readings.  AFAR: the path of the run is to remember the pose.
 TAKEN, UNUSED, AFAR = 1, 2, 4
 
 
@@ -606,8 +607,8 @@ def associate_clear(  # noqa: PLR0917 (tuples would reach the kernel later)
     Returns
     -------
     counted : int
-        As of `count_clear` if the filter has taken in the scan, else 0; its belief then
-        stays as it is.
+        As of `count_clear` if the filter has taken in the scan; else 0, and its belief
+        has not changed.
     found : tuple or None
         If the scan is clear, but not taken in: its associations.
     """
@@ -648,10 +649,10 @@ def _unsplit(
 
 @njit_allocating
 def _splits(block: Array, readings: Array, slots: IntArray) -> bool:
-    """Return whether another association leaves a belief that the best one does not.
+    """Return whether a scan splits the only hypothesis.
 
-    It then becomes a hypothesis, as by `differing`; so does one in place of the best
-    one, if the filter refuses this.
+    It does if another association leads to a different belief, see `differing`, or if
+    the filter refuses the best one.
     """
     first, other = np.empty_like(block), np.empty_like(block)
     if not _tried(block, readings, slots[0], first):
@@ -671,7 +672,7 @@ def _splits(block: Array, readings: Array, slots: IntArray) -> bool:
 
 @njit_allocating
 def _tried(block: Array, readings: Array, slots: IntArray, trial: Array) -> bool:
-    """Fill a belief after an association; return whether the filter accepts it."""
+    """Write the belief after an association; return whether the filter accepts it."""
     ids, rows = parts_jit(block).ids, np.flatnonzero(slots >= 0)
     trial[:] = block
     return update_map(trial, readings[rows], ids[slots[rows]]) == DONE

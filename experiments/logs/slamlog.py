@@ -426,7 +426,7 @@ def _rendered_events(log: SlamLog) -> Iterator[str]:
 
 
 def _rendered_truth(log: SlamLog) -> Iterator[str]:
-    for row in log.ground_truth.tolist():  # sooner than a kernel is loaded
+    for row in log.ground_truth.tolist():  # faster than loading a kernel
         yield f"groundtruth,{','.join(map(_known, row))}"
 
 

@@ -278,7 +278,7 @@ class Gaussian(NamedTuple):
         return self.covariance[rows].take(self.order[columns], axis=1)
 
     def add_to(self, rows: Array, first: int) -> None:
-        """Add rows of the covariance from the first one on, without columns 0 to 2."""
+        """Add covariance rows from ``first`` on, without columns 0 to 2, to rows."""
         P, order = self.covariance[first:], self.order
         if order is None:
             rows += P[: len(rows), 3 : 3 + rows.shape[1]]
@@ -290,7 +290,7 @@ class Gaussian(NamedTuple):
 def _add_columns(matrix: Array, order: IntArray, row: Array, found: Array) -> None:
     for i in range(len(found)):
         for j in range(len(row)):
-            row[j] = matrix[i, j]  # once through the memory, not in any order
+            row[j] = matrix[i, j]  # reads the memory in order
         for j in range(found.shape[1]):
             found[i, j] += row[order[j]]
 

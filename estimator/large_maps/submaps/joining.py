@@ -524,9 +524,9 @@ def private_landmarks(
 # Gauss-Newton iteration with step halving and Anderson acceleration.
 
 ITERATIONS, HALVINGS, MEMORY = 200, 8, 5
-# From the first decrement on, steps use the last linearisation while each multiplies
-# the decrement by at most the second number.  They take a third of the time, and go on
-# to the third number times the decrement at which to stop.
+# Below a decrement of `CLOSE`, steps use the last linearisation while each multiplies
+# the decrement by at most `SLOW`.  They take a third of the time, and stop at `CLOSER`
+# times the decrement at which the iteration stops.
 CLOSE, SLOW, CLOSER = 1e3, 0.1, 1e-2
 # Iterations after which an extrapolated step only has to lower the cost.
 #
