@@ -119,7 +119,7 @@ TESTS = {
     "estimator/filters/gaussian_map": (
         "ekf_slam filter_family filter_memory map_management"
     ),
-    "estimator/association": f"{SCANS} joint_assignment",
+    "estimator/association": f"{SCANS} joint_assignment missed_detections",
     "estimator/association/constellations": "constellations loop_closing",
     "estimator/association/missed_landmarks": "missed_detections map_management",
     "estimator/guards": "saved_states errors_change_nothing magnitudes",

@@ -609,8 +609,8 @@ def test_a_refused_scan_leaves_the_drive_as_it_was(scan, ids):
 
 def test_readings_below_the_minimum_range_are_skipped():
     made = Drive(MOTION_STD, MEASUREMENT_STD, min_range=1.0)
-    made.update([(0.0, 0.99), (0.1, 2.0), (0.2, 1.0)], [0, 1, 2])
-    assert made.landmark_ids == (1, 2)
+    made.update([(0.0, 0.99), (0.1, 2.0), (0.2, 1.0)], [0, 9, 2])
+    assert made.landmark_ids == (9, 2)  # in the order of the readings
 
 
 def test_a_reading_of_a_pose_without_a_scan_has_a_pose_of_its_own():
