@@ -385,6 +385,7 @@ def test_noise_that_a_sensor_does_not_have_is_refused(option, message):
         ({"range_noise_at": "true"}, "range_noise_at must be 'expected' or 'reading'"),
         ({"range_std_per_metre": "x"}, "range_std_per_metre must be a finite number"),
         ({"range_std_per_metre": -1.0}, "range_std_per_metre must be a finite"),
+        ({"range_std_per_metre": 1001.0}, r"range_std_per_metre .*, got 1001"),
         ({"bearing_std_metres": -1.0}, "bearing_std_metres must be a finite number"),
     ],
 )

@@ -101,6 +101,16 @@ def test_areas_are_those_of_the_final_3_sigma_ellipses(of_log):
     assert row.predicted_area > row.pose_area
 
 
+def test_errors_are_those_of_the_path_and_of_the_final_map(of_log):
+    for _, row, trace in of_log:
+        for error, estimate, truth in (
+            (row.ate, trace.poses[:, :2], trace.true_poses[:, :2]),
+            (row.landmark_rmse, trace.landmarks, trace.true_landmarks),
+        ):
+            square = ((estimate - truth) ** 2).sum(axis=1).mean()
+            assert error == pytest.approx(math.sqrt(square))
+
+
 def scans(log):
     return np.array([e.measurements for e in log.events if isinstance(e, Scan)])
 
