@@ -60,11 +60,14 @@ def test_a_robot_at_rest_reads_no_fault():
     np.testing.assert_array_equal(odometry, 0.0)
 
 
-def test_a_biased_sensor_adds_to_every_reading_and_moves_no_robot():
-    odometry, readings, poses = gap({"bearing_bias": 0.1, "range_bias": -0.2})
+@pytest.mark.parametrize("bias", [(0.1, -0.2), (0.1, 0.0), (0.0, -0.2)])
+def test_a_biased_sensor_adds_to_every_reading_and_moves_no_robot(bias):
+    odometry, readings, poses = gap(
+        dict(zip(("bearing_bias", "range_bias"), bias, strict=True))
+    )
     wrapped = (readings[..., 0] + np.pi) % (2 * np.pi) - np.pi
-    assert wrapped == pytest.approx(0.1)
-    assert readings[..., 1] == pytest.approx(-0.2)
+    assert wrapped == pytest.approx(bias[0])
+    assert readings[..., 1] == pytest.approx(bias[1])
     assert not odometry.any()
     assert not poses.any()
 

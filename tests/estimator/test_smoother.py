@@ -238,6 +238,18 @@ def test_readings_of_poses_are_those_of_dense_least_squares():
     assert made.cost_per_degree == pytest.approx(2 * made.cost / freedom)
 
 
+def test_a_robust_kernel_weighs_a_pose_reading_by_all_its_numbers():
+    for axis in range(3):
+        made = Drive(**NOISE, initial_pose_std=(0.1, 0.1, 0.1))
+        made.update([(0.0, 2.0)], [0])  # of a new landmark, so it says nothing
+        made.observe_pose(0.6 * np.eye(3)[axis], np.eye(3), 0.01 * np.eye(3))
+        found, x = smooth(made, robust="cauchy"), np.linspace(0, 0.6, 60001)
+        tail = np.log1p(((x - 0.6) / 0.1 / 2.3849) ** 2)
+        cost = (x / 0.1) ** 2 / 2 + 2.3849**2 / 2 * tail
+        assert found.poses[0, axis] == pytest.approx(x[cost.argmin()], abs=1e-4)
+        assert found.cost == pytest.approx(cost.min())
+
+
 def test_only_the_heading_of_a_pose_reading_is_wrapped_in_any_order_of_components():
     costs = []
     for order in permutations(range(3)):

@@ -3,6 +3,7 @@
 import json
 import os
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from commands import slamgym
 from drawn import check_looks
 from drives import MEASUREMENT_STD, MOTION_STD, drive
 
+from slamgym.estimator.interface import ScanDecisions
 from slamgym.estimator.smoother import Drive, SmoothedDrive, smooth
 from slamgym.evaluation.trajectory_error import Alignment
 from slamgym.experiments.figures.smoothed import smoothed_figure
@@ -21,6 +23,7 @@ from slamgym.experiments.logs.slamlog import (
     read_slamlog,
     write_slamlog,
 )
+from slamgym.experiments.run_and_replay import log_smoothing
 from slamgym.experiments.run_and_replay.filter_settings import SMOOTHER, settings_for
 from slamgym.experiments.run_and_replay.log_smoothing import (
     smooth_log,
@@ -121,6 +124,18 @@ def test_a_repair_takes_scans_without_motion_and_motion_without_a_scan():
         assert found.repair is not None
         assert found.repair.poses.shape == found.drive.poses.shape
         assert summarise_smoothing(found)["ate"]["smoother"]["aligned"] < 0.2
+
+
+def test_a_repair_names_each_reading_that_the_filter_gave_to_no_landmark():
+    readings, made = np.array([(0.0, 2.0), (1.0, 3.0)]), Drive(MOTION_STD, (0.1, 0.1))
+    made.update(readings, [0, 1])
+    made.update(readings, [0, 1])
+    slam = SimpleNamespace(
+        decisions=[ScanDecisions((None, 5)), ScanDecisions((5, None))]
+    )
+    log = SimpleNamespace(scans=[Scan(float(t), readings, None) for t in range(2)])
+    whole = log_smoothing._with_all_readings(made, log, slam)
+    assert [scan.ids.tolist() for scan in whole.scans] == [[6, 5], [5, 7]]
 
 
 def test_a_repair_that_finds_nothing_better_leaves_the_smoothed_drive():
