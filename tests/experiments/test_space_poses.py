@@ -302,7 +302,8 @@ def test_the_command_judges_poses_in_space(tmp_path, monkeypatch):
     printed = " ".join(done.stdout.split())
     assert "e: not consistent: the squared errors of the pose" in printed
     assert f"cause: {said_of('right')}" in printed
-    assert printed.endswith(f"Wrote {tmp_path}/out/ nees.svg, summary.json")
+    files = "".join(done.stdout.split())  # a long path is broken
+    assert files.endswith(f"Wrote{tmp_path}/out/nees.svg,summary.json")
     done = slamgym(*call, "--space", "right", "--json")
     assert json.loads(done.stdout)["cause"] == ""
     done = slamgym(*call, "--space", "up")
