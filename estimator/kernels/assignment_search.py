@@ -351,72 +351,27 @@ def settled_assignments(
         As the search finds them without its limit of nodes, to the bit, except those
         that do not matter.  Empty if others may be of interest.
     """
-    problem, count = Problem(*of_scan), len(partners)
-    others = np.empty(0), np.empty((0, count), np.int64)
+    problem = Problem(*of_scan)
+    costs, marks = np.empty(most), np.full((most, len(partners)), UNPAIRED)
     # The search decides the last of these first.
     order = _decision_order(problem.feasible, problem.innovations)[::-1]
     rows = (partners != UNPAIRED).sum()  # those with a landmark come first
     names, missing = partners[order[:rows]], problem.missing[order]
-    nu, Q = np.empty((rows, rows, 2)), np.empty((rows, rows, 2))
-    h, C = np.zeros((3, rows, 2)), np.empty((3, 2 * rows, 2 * rows))
-    for a in range(rows):
-        for i in range(2):
-            nu[a, a, i] = problem.innovations[order[a], names[a], i]
-            Q[a, a, i] = problem.variances[order[a], names[a], i]
-            for b in range(a + 1):
-                for k in range(2):
-                    value = problem.joint[2 * names[a] + i, 2 * names[b] + k]
-                    C[0, 2 * a + i, 2 * b + k] = value
-    saved = np.empty(rows)  # λ − ln det S
-    for a in range(rows):
-        c, d = 2 * a, 2 * a + 1
-        if not (C[0, c, c] < WIDE * Q[a, a, 0] and C[0, d, d] < WIDE * Q[a, a, 1]):
-            return others
-        s00, s11 = C[0, c, c] + Q[a, a, 0], C[0, d, d] + Q[a, a, 1]
-        saved[a] = missing[a] - np.log(s00 * s11 - C[0, d, c] * C[0, d, c])
-    of_pairs, limits = (nu, Q, h, C, np.empty((4, 2 * rows))), (problem.gate, missing)
+    of_pairs, limits = _in_order(problem, order, names), (problem.gate, missing)
     cost, squared, here = _paired(of_pairs, limits, -1)
-    if not cost < np.inf:
-        return others
     limit = min(cost if most == 1 else np.inf, cost + spread, ceiling)
     margin = max(limit - cost, 0.0) + ROUNDING
-    allowed, least_saved = (margin, problem.gate, same), saved.min() if rows else np.inf
-    # What it costs to leave out each reading, and none; whether that does not matter.
-    more, is_idle = np.full(rows + 1, np.inf), np.ones(rows + 1, np.bool_)
-    more[rows], is_idle[rows] = 0.0, False
-    # ρᵀ Q⁻¹ ρ of each reading, and the largest tr Q⁻¹ C⁺.
-    residuals, share = np.empty(rows), 0.0
-    for a in range(rows):
-        c, d, q0, q1 = 2 * a, 2 * a + 1, Q[a, a, 0], Q[a, a, 1]
-        n0, n1 = nu[a, a, 0] - h[here, a, 0], nu[a, a, 1] - h[here, a, 1]
-        left = q0 - C[here, c, c], -C[here, d, c], q1 - C[here, d, d]
-        if least_saved - squared < margin:
-            one = _without_one((n0, n1), left, (q0, q1), missing[a], allowed)
-            if np.isnan(one[0]):
-                return others
-            more[a], is_idle[a] = one
-        residuals[a] = n0 * n0 / q0 + n1 * n1 / q1
-        share = max(share, C[here, c, c] / q0 + C[here, d, d] / q1)
-    apart = 0.0
-    if 2 * least_saved - squared < margin:
-        apart = _largest_apart(C[here], Q)
-    for u in range(2, rows + 1):
-        if u * least_saved - squared >= margin:
-            break
-        least, next_least, tau = np.inf, np.inf, share + (u - 1) * apart
-        for a in range(rows):
-            one_more = saved[a] - residuals[a] / (1 - tau)
-            next_least = min(next_least, max(least, one_more))
-            least = min(least, one_more)
-        if not (tau < 1 and least + (u - 1) * next_least >= margin):
-            return others
-    costs, marks, found, last = np.empty(most), np.full((most, count), UNPAIRED), 0, 0.0
-    for place in range(most + 1):
+    more, is_idle = np.empty(0), np.empty(0, np.bool_)
+    if cost < np.inf:
+        allowed = margin, problem.gate, same
+        more, is_idle = _left_out(of_pairs, (here, squared), missing, allowed)
+    found, last = 0, -np.inf
+    for place in range(most + 1 if len(more) > 0 else 0):
         a = int(np.argmin(more))
         if not more[a] < margin:
             break
-        if place > 0 and more[a] - last < ROUNDING:
-            return others
+        if more[a] - last < ROUNDING:  # which one comes first is not known
+            return costs[:0], marks[:0]
         last, more[a] = more[a], np.inf
         if place == most or is_idle[a]:
             continue
@@ -432,6 +387,92 @@ def settled_assignments(
 
 
 @njit_allocating
+def _in_order(
+    problem: Problem, order: IntArray, names: IntArray
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return ν, Q, h and C of readings and their landmarks, and gains (`condition`).
+
+    Level 0 of h and C is that before any pair; two levels follow for those after some.
+    """
+    rows = len(names)
+    nu, Q = np.empty((rows, rows, 2)), np.empty((rows, rows, 2))
+    h, C = np.zeros((3, rows, 2)), np.empty((3, 2 * rows, 2 * rows))
+    for a in range(rows):
+        for i in range(2):
+            nu[a, a, i] = problem.innovations[order[a], names[a], i]
+            Q[a, a, i] = problem.variances[order[a], names[a], i]
+            for b in range(a + 1):
+                for k in range(2):
+                    value = problem.joint[2 * names[a] + i, 2 * names[b] + k]
+                    C[0, 2 * a + i, 2 * b + k] = value
+    return nu, Q, h, C, np.empty((4, 2 * rows))
+
+
+@njit_allocating
+def _left_out(
+    of_pairs: tuple[Array, ...],
+    after: tuple[int, float],
+    missing: Array,
+    allowed: tuple[float, float, float],
+) -> tuple[Array, BoolArray]:
+    """Return what it costs to leave out each reading, and whether it does not matter.
+
+    The last entry is for none left out.  Both are empty if leaving out several may not
+    be too expensive, see `settled_assignments`, or if rounding could spoil the costs.
+
+    Parameters
+    ----------
+    of_pairs : tuple of ndarray
+        From `_in_order`.
+    after : tuple
+        The level of h and C after all pairs, and their νᵀ S⁻¹ ν.
+    missing : ndarray
+        λ of each reading.
+    allowed : tuple of float
+        ``limits`` of `_without_one`.
+    """
+    (nu, Q, h, C, _), (here, squared), margin = of_pairs, after, allowed[0]
+    rows, spoilt = len(nu), (np.empty(0), np.empty(0, np.bool_))
+    saved = np.empty(rows)  # λ − ln det S
+    for a in range(rows):
+        c, d = 2 * a, 2 * a + 1
+        if not (C[0, c, c] < WIDE * Q[a, a, 0] and C[0, d, d] < WIDE * Q[a, a, 1]):
+            return spoilt
+        s00, s11 = C[0, c, c] + Q[a, a, 0], C[0, d, d] + Q[a, a, 1]
+        saved[a] = missing[a] - np.log(s00 * s11 - C[0, d, c] * C[0, d, c])
+    least_saved = saved.min() if rows else np.inf
+    more, is_idle = np.full(rows + 1, np.inf), np.ones(rows + 1, np.bool_)
+    more[rows], is_idle[rows] = 0.0, False
+    # ρᵀ Q⁻¹ ρ of each reading, and the largest tr Q⁻¹ C⁺.
+    residuals, share = np.empty(rows), 0.0
+    for a in range(rows):
+        c, d, q0, q1 = 2 * a, 2 * a + 1, Q[a, a, 0], Q[a, a, 1]
+        n0, n1 = nu[a, a, 0] - h[here, a, 0], nu[a, a, 1] - h[here, a, 1]
+        left = q0 - C[here, c, c], -C[here, d, c], q1 - C[here, d, d]
+        if least_saved - squared < margin:
+            one = _without_one((n0, n1), left, (q0, q1), missing[a], allowed)
+            if np.isnan(one[0]):
+                return spoilt
+            more[a], is_idle[a] = one
+        residuals[a] = n0 * n0 / q0 + n1 * n1 / q1
+        share = max(share, C[here, c, c] / q0 + C[here, d, d] / q1)
+    apart = 0.0
+    if 2 * least_saved - squared < margin:
+        apart = _largest_apart(C[here], Q)
+    for u in range(2, rows + 1):
+        if u * least_saved - squared >= margin:
+            break
+        least, next_least, tau = np.inf, np.inf, share + (u - 1) * apart
+        for a in range(rows):
+            one_more = saved[a] - residuals[a] / (1 - tau)
+            next_least = min(next_least, max(least, one_more))
+            least = min(least, one_more)
+        if not (tau < 1 and least + (u - 1) * next_least >= margin):
+            return spoilt
+    return more, is_idle
+
+
+@njit_allocating
 def _paired(
     of_pairs: tuple[Array, ...], limits: tuple[float, Array], without: int
 ) -> tuple[float, float, int]:
@@ -440,7 +481,7 @@ def _paired(
     Parameters
     ----------
     of_pairs : tuple of ndarray
-        ν, Q, h and C of the pairs, and the gains of :func:`condition`.
+        From `_in_order`.
     limits : tuple
         The gate, and λ of each reading.
     without : int

@@ -657,16 +657,10 @@ def _splits(block: Array, readings: Array, slots: IntArray) -> bool:
     first, other = np.empty_like(block), np.empty_like(block)
     if not _tried(block, readings, slots[0], first):
         return True
-    one = parts_jit(first)
     for k in range(1, len(slots)):
-        if _tried(block, readings, slots[k], other):
-            after = parts_jit(other)
-            for c in range(3 + 2 * one.numbers[LANDMARKS]):
-                gap, variance = after.mean[c] - one.mean[c], after.covariance[c, c]
-                if c == 2:
-                    gap = wrap_angle_jit(gap)
-                if not is_near_jit(gap, one.covariance[c, c], variance):
-                    return True
+        is_taken = _tried(block, readings, slots[k], other)
+        if is_taken and not _are_near(first, other):
+            return True
     return False
 
 
@@ -676,6 +670,19 @@ def _tried(block: Array, readings: Array, slots: IntArray, trial: Array) -> bool
     ids, rows = parts_jit(block).ids, np.flatnonzero(slots >= 0)
     trial[:] = block
     return update_map(trial, readings[rows], ids[slots[rows]]) == DONE
+
+
+@njit_internal
+def _are_near(block: Array, other: Array) -> bool:
+    """Return whether the map in a block is near that in another, see `is_near`."""
+    one, after = parts_jit(block), parts_jit(other)
+    for c in range(3 + 2 * one.numbers[LANDMARKS]):
+        gap = after.mean[c] - one.mean[c]
+        if c == 2:
+            gap = wrap_angle_jit(gap)
+        if not is_near_jit(gap, one.covariance[c, c], after.covariance[c, c]):
+            return False
+    return True
 
 
 @njit_allocating

@@ -386,13 +386,10 @@ class ManagedSlam(FilterWrapper):
         scan = h.associate_clear(readings, ids, np.inf, True)
         if scan is None:
             return None
-        if scan.counted:
-            self.steps += 1  # so that a later error leaves the mark
-            h.update_clear(scan)
-        elif h.update_clear(scan):
-            self.steps += 1
-        else:
+        self.steps += scan.counted > 0  # so that a later error leaves the mark
+        if not h.update_clear(scan):
             return None
+        self.steps += scan.counted == 0
         return h.report
 
     def _clear_branches(
@@ -534,12 +531,10 @@ class ManagedSlam(FilterWrapper):
 
     def _step(self, step: Callable[..., Result], *given: Any) -> list[Result]:
         """Take a step with every hypothesis; the first one refuses what all would."""
-        every = self._hypotheses
-        results = [step(every[0], *given)]
+        first, *others = self._hypotheses
+        results = [step(first, *given)]
         self.steps += 1
-        if len(every) > 1:
-            results += [step(h, *given) for h in every[1:]]
-        return results
+        return results + [step(h, *given) for h in others]
 
     def _changing(self, call: str, *, anew: bool = False) -> changing:
         """Return a block of changes; a refusal takes back what was viewed before it."""
@@ -636,11 +631,9 @@ class Hypothesis:
     def report(self) -> UpdateReport:
         """The report of the last update."""
         scan = self._report
-        if type(scan) is not ClearScan:
-            return cast("UpdateReport", scan)
+        if isinstance(scan, UpdateReport):
+            return scan
         report: UpdateReport = cast("Any", self.filter).report()
-        if scan.counted:  # all rows are of the map
-            return report.completed(row_ids=scan.row_ids)
         return report.completed(
             row_ids=scan.row_ids,
             tentative_rows=scan.tentative_rows,

@@ -146,7 +146,7 @@ def test_several_hypotheses_take_scans_as_the_search_does(count):
     for seed in range(6):
         rng, twins = np.random.default_rng(seed), [make(clear=c) for c in (True, False)]
         places = rng.uniform((2.0, -5.0), (8.0, 5.0), (7, 2))
-        places[5:] = places[:2] + rng.normal(0.0, 0.3, (2, 2))  # hard to tell apart
+        places[5:] = places[:2] + rng.normal(0.0, 0.3, (2, 2))  # near the first two
         first = predict_measurement(np.zeros(3), places).measurement
         for slam in twins:
             for _ in range(4):

@@ -40,11 +40,6 @@ class FactorError(NamedTuple):
         """e, shape (3 + 2n,)."""
         return self.columns[:, 4]
 
-    @property
-    def jacobian(self) -> Array:
-        """∂e/∂(F_k, F_{k+1}, landmarks), shape (3 + 2n, 6 + 2n)."""
-        return self.through(np.eye(len(self.columns)))
-
     def through(self, G: Array) -> Array:
         """Return G ∂e/∂(F_k, F_{k+1}, landmarks) for G of shape (k, 3 + 2n)."""
         found = np.empty((len(G), 3 + G.shape[1]))
