@@ -13,31 +13,34 @@ import contextlib
 import hashlib
 import json
 import os
+import pickle
 import platform
 import re
 import secrets
 import shutil
 import signal
 import stat
+import tempfile
 import threading
 import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from filelock import FileLock, Timeout
 
 from ..sim_configs.field_types import unknown_choice
-from ..sim_configs.scenario_files import WRITER, replace_when_written
+from ..sim_configs.scenario_files import WRITER, replace_when_written, unfinished
 from .environment_variables import without_scripts_of_the_user
 from .run_and_replay.filter_settings import integer, one_blas_thread
 
 Result = TypeVar("Result")
 Progress = Callable[[int, int], object]
 Call = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]  # joblib's delayed
-Workers = Callable[[Iterable[Call]], Iterable[Any]]
+Workers = Callable[[Iterable[Call]], Generator[Any, None, None]]
 #: Computes a block. It may report steps that are done by the function that it gets;
 #: a worker gets None.
 Work = Callable[[range, Callable[[int], object] | None], Result]
@@ -45,6 +48,8 @@ Work = Callable[[range, Callable[[int], object] | None], Result]
 BACKENDS = ("loky", "threading", "dask")
 #: How long a worker lives on without the process that engaged it [s].
 _PATIENCE = 0.5
+#: Folders to which this process, a worker, has written results.
+_written: set[Path] = set()
 
 
 def blocks_of(runs: range, size: int) -> list[range]:
@@ -172,11 +177,52 @@ def engage_workers(jobs: int | None, backend: str | None) -> Workers | None:
             return_as="generator_unordered", pre_dispatch="2*n_jobs", **begin
         )
 
-    def workers(calls: Iterable[Call]) -> Iterator[Any]:
-        with without_scripts_of_the_user():
-            yield from compute(calls)
+    return partial(_through_files if begin else _directly, compute)
 
-    return workers
+
+def _directly(compute: Workers, calls: Iterable[Call]) -> Generator[Any, None, None]:
+    with without_scripts_of_the_user():
+        results = compute(calls)
+        try:
+            for result in results:  # noqa: UP028 (it would close them itself, and warn)
+                yield result
+        finally:
+            with warnings.catch_warnings(action="ignore", category=UserWarning):
+                results.close()  # which warns of results that nobody has taken
+
+
+def _through_files(
+    compute: Workers, calls: Iterable[Call]
+) -> Generator[Any, None, None]:
+    """Compute calls by workers of loky, which share one pipe for their results.
+
+    A worker that is killed while it waits in the midst of a long message would leave
+    the pipe blocked forever. The path of a file is short enough to go in at once.
+    """
+    folder = Path(tempfile.mkdtemp(prefix="slamgym-"))
+    unfinished.add(folder)
+    into_files: Iterable[Call] = ((_write_result, (folder, call), {}) for call in calls)
+    try:
+        with contextlib.closing(_directly(compute, into_files)) as paths:
+            yield from map(_read_result, paths)
+    finally:
+        remove(folder)
+        unfinished.discard(folder)
+
+
+def _write_result(folder: Path, call: Call) -> Path:
+    _written.add(folder)
+    work, arguments, options = call
+    result = work(*arguments, **options)
+    with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
+        pickle.dump(result, file, pickle.HIGHEST_PROTOCOL)
+    return Path(file.name)
+
+
+def _read_result(path: Path) -> Any:
+    result = pickle.loads(path.read_bytes())
+    path.unlink()
+    return result
 
 
 def blocks_at_once(jobs: int | None, backend: str | None) -> int:
@@ -202,6 +248,8 @@ def _end_with(engaging: int) -> None:
 def _watch(engaging: int) -> None:
     while os.getppid() == engaging:
         time.sleep(_PATIENCE)
+    for folder in _written:
+        shutil.rmtree(folder, ignore_errors=True)
     os._exit(1)
 
 

@@ -1,6 +1,7 @@
 """``slamgym monte-carlo``: many runs, and whether the filters are consistent."""
 
 import contextlib
+import logging
 import re
 import shlex
 import signal
@@ -10,6 +11,7 @@ from _thread import interrupt_main
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import active_children
 from pathlib import Path
 from typing import Any
 
@@ -319,7 +321,21 @@ def _with_new_workers(start: Callable[[], Any]) -> Iterator[None]:
         cluster = client.cluster
         wanted = len(cluster.worker_spec)
         with _repeated(replace):
-            yield
+            try:
+                yield
+            except BaseException:
+                _kill_workers(cluster)
+                raise
+
+
+def _kill_workers(cluster: Any) -> None:
+    """End the workers of a local cluster before they print what they lose."""
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    for nanny in cluster.workers.values():
+        nanny.auto_restart = False
+    for process in active_children():
+        process.kill()
 
 
 @contextlib.contextmanager

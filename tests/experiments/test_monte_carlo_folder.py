@@ -378,6 +378,13 @@ def test_workers_are_engaged_as_many_as_asked():
             assert sorted(workers(calls)) == [(2, 1), (3, 1)]
 
 
+def test_workers_that_are_left_early_end_without_a_warning():
+    calls = ((divmod, (7, k), {}) for k in range(1, 1000))
+    results = job_folders.engage_workers(2, "threading")(calls)
+    assert next(results)[0] > -1
+    results.close()  # a warning would be an error
+
+
 def test_a_job_is_of_the_filter_that_it_began_with(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     source = tmp_path / "edited_filter.py"

@@ -56,9 +56,9 @@ def blocks_in(here):
     return len(list(here.glob("out/blocks/runs-*.npz")))
 
 
-def many_runs(here):
+def many_runs(here, *options):
     """Return a Monte Carlo on two workers that has results, and its processes."""
-    child = begin(here, *JOB.split())
+    child = begin(here, *JOB.split(), *options)
     wait_until(lambda: blocks_in(here) > 1)
     return child, psutil.Process(child.pid).children(recursive=True)
 
@@ -112,8 +112,13 @@ def assert_ends_in_time(child, number, here, message):
     other = ("note: ", "compiling ")  # the kernels of a command may be new
     lines = [line for line in said.splitlines() if not line.startswith(other)]
     assert lines == [f"slamgym: interrupted; {message}"]
+    assert_all_is_gone(processes, here)
+
+
+def assert_all_is_gone(processes, here):
     _, alive = psutil.wait_procs(processes, timeout=10)
     assert alive == []
+    assert list(here.glob("slamgym-*")) == []
 
 
 def message_of(command):
@@ -159,14 +164,7 @@ def test_workers_of_any_kind_end_with_their_job(here, command, made, number):
         pytest.importorskip("distributed")
     child = begin(here, *command.split())
     wait_until(lambda: child.exitcode or len(list(here.glob(f"out/{made}"))) > 1)
-    processes = psutil.Process(child.pid).children(recursive=True)
-    os.kill(child.pid, number)
-    message = message_at_the_end(child, here)
-    assert f"slamgym: interrupted; {message_of(command)}" in message
-    assert child.exitcode == CODES[number]
-    assert "Traceback" not in message
-    _, alive = psutil.wait_procs(processes, timeout=10)
-    assert alive == []
+    assert_ends_in_time(child, number, here, message_of(command))
 
 
 @pytest.mark.slow
@@ -195,8 +193,7 @@ def test_workers_end_when_the_process_that_engaged_them_is_killed(here):
     child, processes = many_runs(here)
     child.kill()
     child.join()
-    _, alive = psutil.wait_procs(processes, timeout=20)
-    assert alive == []
+    assert_all_is_gone(processes, here)
 
 
 @pytest.mark.slow
@@ -213,6 +210,19 @@ def test_a_killed_worker_is_reported_with_how_to_go_on(here):
     assert "slamgym: a worker process was killed, perhaps for" in message
     assert f"{GOES_ON}\n" in message
     assert "Traceback" not in message
+
+
+@pytest.mark.slow
+def test_workers_that_are_killed_amid_a_result_block_no_job(here):
+    child, processes = many_runs(here, "--block-size", "64")  # > 64 KiB, a pipe's room
+    job, workers = psutil.Process(child.pid), workers_among(processes)
+    job.suspend()  # so that the pipe of the results fills
+    wait_until(lambda: all(w.status() == psutil.STATUS_SLEEPING for w in workers))
+    for worker in workers:
+        worker.kill()
+    job.resume()
+    assert "slamgym: a worker process was killed" in message_at_the_end(child, here)
+    assert child.exitcode == 1
 
 
 def time_of(folder):

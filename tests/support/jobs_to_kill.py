@@ -5,6 +5,7 @@ import hashlib
 import itertools
 import os
 import signal
+import tempfile
 import time
 from functools import partial
 from pathlib import Path
@@ -24,8 +25,12 @@ from slamgym.sim_configs import load_scenario
 
 
 def command(folder, *arguments):
-    """Run a command in a folder, with its messages in the file ``messages`` beside."""
+    """Run a command in a folder, with its messages in the file ``messages`` beside.
+
+    What it writes for a time, such as results of workers, lies in the folder too.
+    """
     os.chdir(folder)
+    tempfile.tempdir = str(folder)
     messages = os.open(f"{folder}.messages", os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
     for stream in (1, 2):
         os.dup2(messages, stream)
