@@ -687,11 +687,11 @@ def test_a_world_without_a_render_mode_warns_and_shows_nothing():
 
 @pytest.mark.slow
 def test_worlds_that_are_not_watched_load_no_matplotlib():
-    code = """
-        import sys, slamgym, gymnasium
-        env = gymnasium.make('slamgym/LandmarkWorld-v0')
-        env.reset(seed=0)
-        env.step(env.action_space.sample())
-        print('matplotlib' in sys.modules)
-    """
+    code = f"""{forked.WITHOUT_MATPLOTLIB}
+import sys, slamgym, gymnasium
+env = gymnasium.make('slamgym/LandmarkWorld-v0')
+env.reset(seed=0)
+env.step(env.action_space.sample())
+print('matplotlib' in sys.modules)
+"""
     assert forked.run(code).stdout == "False\n"

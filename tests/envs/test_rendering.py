@@ -443,7 +443,7 @@ def test_window_that_its_user_closed_stays_closed(screen, pyplot):
 
 
 def loaded_modules(program):
-    code = f"{program}\nimport sys\nprint(*sys.modules)"
+    code = f"{forked.WITHOUT_MATPLOTLIB}{program}\nprint(*sys.modules)"
     return set(forked.run(code).stdout.split())
 
 

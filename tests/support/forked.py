@@ -26,6 +26,11 @@ for known in (sys.modules, gymnasium.registry):
     for name in [name for name in known if name.startswith("slamgym")]:
         del known[name]
 """
+#: A `Script` that begins so has neither slamgym nor matplotlib.
+WITHOUT_MATPLOTLIB = f"""{WITHOUT_SLAMGYM}
+for name in [name for name in sys.modules if name.startswith("matplotlib")]:
+    del sys.modules[name]
+"""
 
 _CONTEXT = multiprocessing.get_context("forkserver")
 _CONTEXT.set_forkserver_preload(["forked_preload"])
@@ -64,9 +69,9 @@ class Output(NamedTuple):
 class Script:
     """Lines of Python that run in a process of their own, begun at once.
 
-    The process differs from ``python -c`` in one respect: numba and slamgym are loaded
-    already. It compiles kernels for the environment that it is given, and writes no
-    byte code.
+    The process differs from ``python -c`` in one respect: slamgym and the libraries
+    that it needs are loaded already. It compiles kernels for the environment that it is
+    given, and writes no byte code.
 
     Parameters
     ----------
