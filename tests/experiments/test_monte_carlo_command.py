@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import signal
 import time
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ import xarray as xr
 from commands import slamgym
 
 from slamgym.experiments.command_line import monte_carlo as command
-from slamgym.experiments.command_line.commands import LostSchedulerError
+from slamgym.experiments.command_line.commands import LostSchedulerError, terminable
 from slamgym.experiments.monte_carlo_study import monte_carlo
 from slamgym.experiments.monte_carlo_study.results import load_results
 
@@ -165,16 +166,22 @@ class Client(contextlib.nullcontext):
         )
 
 
-def test_a_lost_scheduler_ends_the_block_with_its_address(monkeypatch):
+@pytest.mark.parametrize("hears", [signal.default_int_handler, signal.SIG_IGN])
+def test_a_lost_scheduler_ends_the_block_with_its_address(monkeypatch, hears):
     monkeypatch.setattr(command, "_INTERVAL", 0.01)
     with pytest.raises(ZeroDivisionError), command._naming_loss(Client(), "tcp://a:1"):
         raise ZeroDivisionError
     message = "the Dask scheduler tcp://a:1 is lost; what is finished is kept"
-    with (
-        pytest.raises(LostSchedulerError, match=message),
-        command._naming_loss(Client("closed"), "tcp://a:1"),
-    ):
-        all(time.sleep(0.01) is None for _ in range(900))
+    usual = signal.signal(signal.SIGINT, hears)  # ignored in the background of a shell
+    try:
+        with (
+            terminable(),
+            pytest.raises(LostSchedulerError, match=message),
+            command._naming_loss(Client("closed"), "tcp://a:1"),
+        ):
+            all(time.sleep(0.01) is None for _ in range(900))
+    finally:
+        signal.signal(signal.SIGINT, usual)
 
 
 def test_workers_that_are_gone_are_replaced_until_the_block_ends(monkeypatch):
