@@ -33,7 +33,7 @@ from typing import Any, NamedTuple, TypeVar
 from filelock import FileLock, Timeout
 
 from ..sim_configs.field_types import unknown_choice
-from ..sim_configs.scenario_files import WRITER, replace_when_written, unfinished
+from ..sim_configs.scenario_files import WRITER, replace_when_written
 from .environment_variables import without_scripts_of_the_user
 from .run_and_replay.filter_settings import integer, one_blas_thread
 
@@ -48,8 +48,6 @@ Work = Callable[[range, Callable[[int], object] | None], Result]
 BACKENDS = ("loky", "threading", "dask")
 #: How long a worker lives on without the process that engaged it [s].
 _PATIENCE = 0.5
-#: Folders to which this process, a worker, has written results.
-_written: set[Path] = set()
 
 
 def blocks_of(runs: range, size: int) -> list[range]:
@@ -184,7 +182,7 @@ def _directly(compute: Workers, calls: Iterable[Call]) -> Generator[Any, None, N
     with without_scripts_of_the_user():
         results = compute(calls)
         try:
-            for result in results:  # noqa: UP028 (it would close them itself, and warn)
+            for result in results:  # noqa: UP028 (closes them too early, and warns)
                 yield result
         finally:
             with warnings.catch_warnings(action="ignore", category=UserWarning):
@@ -196,31 +194,38 @@ def _through_files(
 ) -> Generator[Any, None, None]:
     """Compute calls by workers of loky, which share one pipe for their results.
 
-    A worker that is killed while it waits in the midst of a long message would leave
-    the pipe blocked forever. The path of a file is short enough to go in at once.
+    A worker that is killed halfway through a long message would leave the pipe blocked
+    forever. The path of a file is short enough to go in at once.
     """
+    from joblib.externals.loky.backend import resource_tracker  # noqa: PLC0415
+
     folder = Path(tempfile.mkdtemp(prefix="slamgym-"))
-    unfinished.add(folder)
+    # A process of joblib removes it if this one is killed.
+    resource_tracker.register(str(folder), "folder")
     into_files: Iterable[Call] = ((_write_result, (folder, call), {}) for call in calls)
     try:
         with contextlib.closing(_directly(compute, into_files)) as paths:
             yield from map(_read_result, paths)
     finally:
-        remove(folder)
-        unfinished.discard(folder)
+        with contextlib.suppress(OSError):  # which would hide how the block ended
+            remove(folder)
+            resource_tracker.unregister(str(folder), "folder")
 
 
 def _write_result(folder: Path, call: Call) -> Path:
-    _written.add(folder)
     work, arguments, options = call
     result = work(*arguments, **options)
-    with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
+    with (
+        naming(f"the temporary folder {folder}"),
+        tempfile.NamedTemporaryFile(dir=folder, delete=False) as file,
+    ):
         pickle.dump(result, file, pickle.HIGHEST_PROTOCOL)
     return Path(file.name)
 
 
 def _read_result(path: Path) -> Any:
-    result = pickle.loads(path.read_bytes())
+    with path.open("rb") as file:
+        result = pickle.load(file)
     path.unlink()
     return result
 
@@ -248,8 +253,6 @@ def _end_with(engaging: int) -> None:
 def _watch(engaging: int) -> None:
     while os.getppid() == engaging:
         time.sleep(_PATIENCE)
-    for folder in _written:
-        shutil.rmtree(folder, ignore_errors=True)
     os._exit(1)
 
 

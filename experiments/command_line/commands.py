@@ -163,7 +163,7 @@ def _end_after_a_signal(reader: socket.socket, line: threading.Lock) -> None:
                 os.kill(process.pid, signal.SIGKILL)
     for path in tuple(unfinished):
         with contextlib.suppress(OSError):
-            path.unlink() if path.is_file() else shutil.rmtree(path)
+            path.unlink() if path.is_file() else shutil.rmtree(path, ignore_errors=True)
     os._exit(_CODES[signal.Signals(received[0])])
 
 

@@ -317,25 +317,46 @@ def _with_new_workers(start: Callable[[], Any]) -> Iterator[None]:
         if len(cluster.workers) < wanted:
             cluster.scale(wanted)
 
-    with without_scripts_of_the_user(), start() as client:
+    with contextlib.ExitStack() as ended, without_scripts_of_the_user():
+        client = ended.enter_context(start())
         cluster = client.cluster
         wanted = len(cluster.worker_spec)
-        with _repeated(replace):
-            try:
+        try:
+            with _repeated(replace):
                 yield
-            except BaseException:
+        except BaseException:
+            with _silent():  # until the cluster has ended
                 _kill_workers(cluster)
-                raise
+                ended.close()
+            raise
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Print no messages of Dask during the block."""
+    loggers = [
+        logging.getLogger(name) for name in ("distributed", "distributed.client")
+    ]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 def _kill_workers(cluster: Any) -> None:
-    """End the workers of a local cluster before they print what they lose."""
-    for name in ("distributed", "distributed.client"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    for nanny in cluster.workers.values():
-        nanny.auto_restart = False
+    """End the workers of a local cluster before they print that they lost it."""
+    nannies = tuple(cluster.workers.values())
+    for nanny in nannies:
+        nanny.close_gracefully()  # that is, it starts no other worker
+    workers = {nanny.pid for nanny in nannies}
     for process in active_children():
-        process.kill()
+        with contextlib.suppress(ValueError):  # Dask has just closed it
+            if process.pid in workers:
+                process.kill()
 
 
 @contextlib.contextmanager

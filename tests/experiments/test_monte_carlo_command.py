@@ -2,10 +2,12 @@
 
 import contextlib
 import json
+import logging
 import signal
 import time
 from types import SimpleNamespace
 
+import forked
 import pytest
 import xarray as xr
 from commands import slamgym
@@ -164,6 +166,10 @@ class Client(contextlib.nullcontext):
         self.cluster = SimpleNamespace(
             worker_spec=range(3), workers=[1, 2], scale=self.scaled.append
         )
+        self.at_the_end = lambda: None
+
+    def __exit__(self, *_):
+        self.at_the_end()
 
 
 @pytest.mark.parametrize("hears", [signal.default_int_handler, signal.SIG_IGN])
@@ -182,6 +188,26 @@ def test_a_lost_scheduler_ends_the_block_with_its_address(monkeypatch, hears):
             all(time.sleep(0.01) is None for _ in range(900))
     finally:
         signal.signal(signal.SIGINT, usual)
+
+
+def test_an_error_ends_the_workers_of_dask_alone_and_silently():
+    logger, calm, levels = logging.getLogger("distributed"), [], []
+    usual = logger.level
+    worker, other = (forked.start(time.sleep, 60) for _ in range(2))
+    client = Client()
+    client.at_the_end = lambda: levels.append(logger.level)
+    nanny = SimpleNamespace(pid=worker.pid, close_gracefully=lambda: calm.append(1))
+    starting = SimpleNamespace(pid=None, close_gracefully=lambda: calm.append(2))
+    client.cluster.workers = {"a": nanny, "b": starting}
+    with pytest.raises(ZeroDivisionError), command._with_new_workers(lambda: client):
+        raise ZeroDivisionError
+    worker.join(10)
+    assert worker.exitcode == forked.KILLED
+    assert other.is_alive()
+    other.kill()
+    assert calm == [1, 2]
+    assert levels == [logging.CRITICAL]
+    assert logger.level == usual
 
 
 def test_workers_that_are_gone_are_replaced_until_the_block_ends(monkeypatch):

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+import time
 
 import forked
 import joblib
@@ -201,14 +202,19 @@ def test_what_a_killed_writer_left_is_gone_after_the_next_run(
 
 @pytest.mark.slow
 def test_workers_that_outlive_a_killed_writer_do_not_keep_the_folder(tmp_path, whole):
-    killed(tmp_path, "workers")
+    out = tmp_path / "out"
+    killed(out, "workers")
     done = []
     with monte_carlo(
-        **JOB, runs=RUNS, out=tmp_path, progress=lambda runs, of: done.append(runs)
+        **JOB, runs=RUNS, out=out, progress=lambda runs, of: done.append(runs)
     ) as resumed:
         xr.testing.assert_equal(resumed.load(), whole)
     assert done[0] > 0  # went on
-    assert names(tmp_path) == finished()
+    assert names(out) == finished()
+    deadline = time.monotonic() + 20
+    while list(tmp_path.iterdir()) != [out] and time.monotonic() < deadline:
+        time.sleep(0.05)  # the workers end, and remove what they wrote for the writer
+    assert list(tmp_path.iterdir()) == [out]
 
 
 def test_only_what_slamgym_began_is_removed(tmp_path):
@@ -383,6 +389,29 @@ def test_workers_that_are_left_early_end_without_a_warning():
     results = job_folders.engage_workers(2, "threading")(calls)
     assert next(results)[0] > -1
     results.close()  # a warning would be an error
+
+
+def test_a_temporary_folder_that_cannot_be_written_is_named(tmp_path):
+    folder = tmp_path / "missing"
+    with pytest.raises(OSError, match=f"the temporary folder {folder} cannot be writ"):
+        job_folders._write_result(folder, (divmod, (7, 2), {}))
+    with pytest.raises(FileNotFoundError, match="of the work"):  # it is not blamed
+        job_folders._write_result(tmp_path, (fails, (), {}))
+
+
+def fails():
+    raise FileNotFoundError("of the work")
+
+
+def test_a_temporary_folder_that_cannot_be_removed_spoils_no_results(monkeypatch):
+    def refuse(folder):
+        folder.rmdir()
+        raise OSError("in use")
+
+    monkeypatch.setattr(job_folders, "remove", refuse)
+    calls = [(divmod, (7, k), {}) for k in (2, 3)]
+    results = job_folders._through_files(lambda c: (f(*a) for f, a, _ in c), calls)
+    assert list(results) == [(3, 1), (2, 1)]
 
 
 def test_a_job_is_of_the_filter_that_it_began_with(tmp_path, monkeypatch):

@@ -216,7 +216,7 @@ def test_a_killed_worker_is_reported_with_how_to_go_on(here):
 def test_workers_that_are_killed_amid_a_result_block_no_job(here):
     child, processes = many_runs(here, "--block-size", "64")  # > 64 KiB, a pipe's room
     job, workers = psutil.Process(child.pid), workers_among(processes)
-    job.suspend()  # so that the pipe of the results fills
+    job.suspend()  # if whole results went through the pipe, it would now be full
     wait_until(lambda: all(w.status() == psutil.STATUS_SLEEPING for w in workers))
     for worker in workers:
         worker.kill()

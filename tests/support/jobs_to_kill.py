@@ -27,7 +27,7 @@ from slamgym.sim_configs import load_scenario
 def command(folder, *arguments):
     """Run a command in a folder, with its messages in the file ``messages`` beside.
 
-    What it writes for a time, such as results of workers, lies in the folder too.
+    Its temporary files, such as results of workers, lie in the folder too.
     """
     os.chdir(folder)
     tempfile.tempdir = str(folder)
@@ -136,6 +136,7 @@ def three_blocks(folder, dies_at, began=None):
     At ``"never"`` it stays after the first block, and sets the event ``began``.
     """
     job: dict[str, Any] = {"estimators": "ekf", "runs": 12, "block_size": 4}
+    tempfile.tempdir = str(Path(folder).parent)
     if dies_at == "workers":
         job |= {"progress": _die_after_a_block, "jobs": 2, "backend": "loky"}
     elif dies_at == "never":
