@@ -1,5 +1,7 @@
 """Submaps: independent pieces, joined into the map that all of the data make."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from comparison import assert_close_beliefs, assert_same_bits, part_of
@@ -40,7 +42,7 @@ from slamgym.estimator.large_maps.submaps.store import (
 from slamgym.estimator.large_maps.submaps.submap_slam import BASES, SubmapSlam
 from slamgym.estimator.models.bearing_range import predict_measurement, wrap_angle
 from slamgym.estimator.models.motions import predict_pose
-from slamgym.estimator.models.rigid_motion import invariant_covariance
+from slamgym.estimator.models.rigid_motion import invariant_covariance, rotation
 from slamgym.evaluation.nees import pose_nees
 from slamgym.experiments.run_and_replay.simulated_runs import simulate_runs
 from slamgym.sim_configs import load_scenario
@@ -330,16 +332,17 @@ def test_a_join_needs_few_linearisations(base, monkeypatch):
         assert_close_beliefs(slams[0].belief(), slams[-1].belief(), 1e-6, 1e-7)
     assert counts == sorted(set(counts), reverse=True)
 
-    def linear(x):
+    def linear(x):  # up to 4; beyond, it is flat and high
         step = 3.0 - x
-        return gauss_newton.Iterate(x, 1.0 + step @ step, step @ step, step)
+        cost, decrement = (1.0 + step @ step, step @ step) if x < 4 else (99.0, 0.05)
+        return gauss_newton.Iterate(x, cost, decrement, step)
 
-    def correct(x):
+    def correct(target, x):
         corrected.append(x)
-        return 0.01, 0.5 - x
+        return 0.01, target - x
 
-    for trusted, again in ((0.0, None), (15.0, None), (17.0, None), (0.0, correct)):
-        corrected = []
+    for trusted, target in ((0, None), (15, None), (17, None), (0, 0.5), (0, 5.0)):
+        corrected, again = [], target and partial(correct, target)
         found = gauss_newton.minimise(linear, np.array([-1.0]), 0.1, trusted, again)
         assert found.tolist() == [3.0]
         assert len(corrected) == 2 * (again is not None)  # the second one is too slow
@@ -478,12 +481,28 @@ def test_a_submap_is_the_square_of_its_error_as_dense_products_compute_it(frame,
 
 
 @pytest.mark.parametrize("frame", ["additive", "invariant"])
-def test_retraction_makes_the_error_it_is_given(frame):
-    rng = np.random.default_rng(4)
-    mean, error = rng.normal(size=9), 0.5 * rng.normal(size=9)
+def test_private_landmarks_follow_the_error_of_the_shared_part(frame):
+    rng, slots = np.random.default_rng(6), np.array([7, 2, 9, 4])
+    mean, start, shared = rng.normal(size=11), rng.normal(size=3), [0, 1, 2, 5, 6]
+    P = (root := rng.normal(size=(11, 11))) @ root.T
+    own = P[np.ix_(shared, shared)]
+    whitening = np.array(shared), np.linalg.inv(np.linalg.cholesky(own))
+
+    def found(x):  # two frames, and the landmark 2 in the world
+        error, wanted = factor_error(x[:3], x[3:], mean[shared], frame), slots[[3, 0]]
+        given = Submap(slots, mean, P), whitening, wanted, x[:3], error, frame
+        return gauss_newton.private_landmarks(*given)
+
+    x = np.concatenate([start, rng.normal(size=5)])
+    error = factor_error(start, x[3:], mean[shared], frame).error
+    error = P[:, shared] @ np.linalg.solve(own, error)
     state = retract(mean, error, frame)
-    found = factor_error(np.zeros(3), state, mean, frame).error
-    np.testing.assert_allclose(found, error, rtol=0, atol=1e-12)
+    made = factor_error(np.zeros(3), state, mean, frame).error
+    np.testing.assert_allclose(made, error, rtol=0, atol=1e-12)
+    seen = state[[9, 10, 3, 4]].reshape(2, 2) @ rotation(start[2]).T + start[:2]
+    np.testing.assert_allclose(found(x).points, seen.ravel(), rtol=0, atol=1e-12)
+    expected = numeric_jacobian(lambda x: found(x).points, x)
+    np.testing.assert_allclose(found(x).jacobian, expected, rtol=0, atol=1e-6)
 
 
 def test_the_inverse_spread_has_no_jump_where_its_series_ends():
