@@ -214,6 +214,8 @@ def test_options_are_refused_by_name():
         peer("gtsam_isam2", relinearize_threshold=-1.0)
     with pytest.raises(ValueError, match="cannot run in batches"):
         make_batch("gtsam_isam2", runs=1, landmarks=1, **NOISE)
+    with pytest.raises(ValueError, match="of GtsamIsam2Slam, not of GtsamBatchSlam"):
+        peer("gtsam_batch").load_state_dict(peer("gtsam_isam2").state_dict())
 
 
 def test_a_monte_carlo_compares_a_peer_with_our_filter():

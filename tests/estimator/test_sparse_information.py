@@ -99,10 +99,11 @@ def test_a_small_map_is_the_same_in_dense_form(base, options):
             reports.append(each.update(readings, ids))
             if step == 5:
                 each.remove(each.landmark_ids[:1])
+                each.update(readings[:0], ids[:0])
             if step == 80:
                 each.merge(*each.landmark_ids[:2])
         one, other = reports[-2:]
-        assert counted(one) == counted(other)
+        assert (counted(one), slam.steps) == (counted(other), twin.steps)
         assert one.nis == pytest.approx(other.nis, rel=1e-8)
         assert_same_belief(slam, twin)
         assert slam.active_ids == twin.active_ids
