@@ -232,6 +232,11 @@ def test_a_replay_writes_the_covariance_of_the_whole_state(log, without_pictures
         assert saved["mean"][:3].tolist() == pytest.approx(answer["pose"])
         assert saved["landmark_ids"].tolist() == [7, 9]
         assert len(saved["pose_covariances"]) == len(saved["t"]) == answer["steps"] + 1
+    for count, is_written in ((20, True), (21, False)):
+        scan = [f"measurement,2,{i},0.1,9\n" for i in range(count)]
+        log.write_text(LOG.replace(",7,", ",0,").replace(",9,", ",1,") + "".join(scan))
+        files = answered("replay", log, "--out", "text")["files"]
+        assert ("covariance_final.csv" in files) == is_written
 
 
 def test_a_log_can_be_replayed_without_its_identities(log, without_pictures):
@@ -476,6 +481,9 @@ def test_a_filter_of_the_user_that_cannot_run_is_refused_with_all_that_it_lacks(
     ]
     expected = "has no attribute 'speed' (of_a_user.py, line 10: return self.speed)"
     assert breaches[-1].endswith(expected)
+    if command[0] not in ("monte-carlo", "generate"):  # the others take options
+        text = slamgym(*command, option, of_a_user, "--option", "ekf=3").stderr
+        assert text.startswith("slamgym: Plain cannot run in slamgym:\n")
 
 
 @pytest.mark.usefixtures("_no_figures_in_reports", "without_pictures")
