@@ -6,7 +6,6 @@ import pytest
 from slamgym.estimator.models.bearing_range import reading_slopes
 from slamgym.estimator.models.relative_geometry import (
     largest_std,
-    lever_of,
     reading_covariance,
     relative_separation,
     separation,
@@ -88,10 +87,3 @@ def test_covariance_of_a_reading_is_that_of_bearing_and_range(seed):
     np.testing.assert_allclose([[bb, br], [br, rr]], S, rtol=1e-6, atol=1e-9)
     largest = np.linalg.eigvalsh(C)[-1]
     assert variance_from_robot(P, THIRD, *d) == pytest.approx(largest)
-
-
-def test_a_lever_is_the_derivative_of_a_turn():
-    d, t = np.array([3.0, 1.0]), 1e-6
-    np.testing.assert_allclose(
-        (rotation(t) @ d - rotation(-t) @ d) / (2 * t), lever_of(d), rtol=1e-9
-    )

@@ -588,13 +588,6 @@ def fewer(drive, most=5):
     return [(u, z[:most], ids[:most], pose) for u, z, ids, pose in drive]
 
 
-def test_reset_deletes_the_submaps_of_the_run_it_forgets(tmp_path):
-    slam = run(made(folder=tmp_path / "run"), laps(40))
-    slam.reset(START, (0, 0, 0))
-    assert list((tmp_path / "run").iterdir()) == []
-    assert_same_bits(run(slam, laps(40)).belief(), run(made(), laps(40)).belief())
-
-
 def test_an_earlier_state_of_a_longer_run_leaves_nothing_behind(tmp_path):
     folder, drive = tmp_path / "run", list(laps(60))
     slam = run(made(folder=folder), drive[:30])

@@ -119,6 +119,8 @@ def test_a_run_writes_pictures_log_scenario_and_numbers(finished_run):
     found = [p.relative_to(folder).as_posix() for p in folder.rglob("*.*")]
     assert summary["files"] == sorted(names + texts)
     assert sorted(found) == sorted([MANIFEST, *summary["files"]])
+    world = load_scenario("six_landmarks").with_changes(steps=2)
+    assert load_scenario(folder / "scenario.toml") == world
 
 
 def test_a_simulated_log_is_not_searched_for_broken_conventions(
@@ -275,13 +277,6 @@ def test_a_graph_is_replayed_against_the_truth_of_another_file(here, without_pic
     assert settings["settings"]["options"]["bearing_std_metres"] == pytest.approx(0.1)
     message = refused("replay", "graph.txt", *GRAPH_NOISE, "--truth", "nowhere.g2o")
     assert message == "cannot read the log nowhere.g2o: No such file or directory"
-
-
-@pytest.mark.slow
-def test_the_scenario_of_a_run_is_saved_with_its_changes(finished_run):
-    folder, _ = finished_run
-    expected = load_scenario("six_landmarks").with_changes(steps=2)
-    assert load_scenario(folder / "scenario.toml") == expected
 
 
 @pytest.mark.slow
