@@ -5,7 +5,6 @@ A command ends with one line on standard error and an exit code, whatever happen
 """
 
 import ast
-import atexit
 import contextlib
 import gc
 import importlib
@@ -267,10 +266,10 @@ def rarely_collecting() -> Iterator[None]:
     """
     usual = gc.get_threshold()
     gc.set_threshold(100 * usual[0], *usual[1:])
-    atexit.register(gc.freeze)
     try:
         yield
     finally:
+        gc.freeze()
         gc.set_threshold(*usual)
 
 

@@ -6,6 +6,7 @@ Python: ``NUMBA_DISABLE_JIT=1`` turns compilation off, for a debugger.
 
 import contextlib
 import ctypes
+import gc
 import hashlib
 import os
 import re
@@ -143,12 +144,32 @@ class Checked(compiler.Compiler):
             memory would never be freed.
         """
         compiled: Any = super()
-        result = compiled.compile_extra(function)
+        with _uncollected():
+            result = compiled.compile_extra(function)
         uncounted = not cast("Any", self).state.flags.nrt
         if uncounted and any("array" in str(each) for each in _handed_on(result)):
             name = function.__qualname__
             raise TypeError(f"{name} hands on arrays: use njit_allocating")
         return result
+
+
+@contextlib.contextmanager
+def _uncollected() -> Iterator[None]:
+    """Do not look for cyclic garbage in the block: a seventh of a compilation.
+
+    The block's own garbage then counts as old, or the next look would take as long.
+    Objects that a program has frozen stay so.
+    """
+    is_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if is_on and not gc.get_freeze_count():
+            gc.freeze()
+            gc.unfreeze()
+        if is_on:
+            gc.enable()
 
 
 class Internal(Checked):
