@@ -594,12 +594,12 @@ def with_options(label: str, texts: Sequence[str]) -> str:
     return f"{name}[{','.join([inside, *more] if own else more)}]"
 
 
-def tested_filters(labels: Sequence[str]) -> list[str]:
+def compared_filters(labels: Sequence[str]) -> list[str]:
     """Return the filters for a Monte Carlo that tests these; one gets a companion.
 
     Examples
     --------
-    >>> tested_filters(["invariant"]), tested_filters(["mine:Filter"])
+    >>> compared_filters(["invariant"]), compared_filters(["mine:Filter"])
     (['ekf', 'invariant'], ['mine:Filter', 'invariant'])
     """
     if len(labels) > 1:

@@ -5,7 +5,7 @@ from functools import partial
 
 from ...sim_configs import save_scenario
 from .commands import command
-from .options import Options, ScenarioName, takes, tested_filters, with_options
+from .options import Options, ScenarioName, compared_filters, takes, with_options
 
 
 @command
@@ -49,7 +49,7 @@ def run(scenario: ScenarioName, *, given: Options) -> None:
     if given.steps is not None:
         changed.append(f"--steps={given.steps}")
     texts = given.option_texts or ()
-    tested = tested_filters([with_options(label, texts) for label in filters])
+    tested = compared_filters([with_options(label, texts) for label in filters])
     test = ["slamgym", "monte-carlo", scenario, *changed, "-e", ",".join(tested)]
     reporter.show_verbatim(
         "\nOne run is no test of a filter: its errors depend on the noise. Test with\n"
