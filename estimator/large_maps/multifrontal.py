@@ -402,11 +402,6 @@ def _check_rows(counts: IntArray, links: IntArray, blocks: Array) -> None:
             f"state['matrix_links'] and state['matrix_blocks'] must have "
             f"{counts.sum()} rows, got {len(links)} and {blocks.shape}"
         )
-    if len(links) and not 0 <= links.min() <= links.max() < len(counts):
-        raise ValueError(
-            f"state['matrix_links'] must lie in [0, {len(counts)}), got "
-            f"{links.min()} to {links.max()}"
-        )
     rows = np.repeat(np.arange(len(counts)), counts)
     order, mirrored = np.lexsort((links, rows)), np.lexsort((rows, links))
     same = np.array_equal(rows[order], links[mirrored]) and np.array_equal(
@@ -415,7 +410,9 @@ def _check_rows(counts: IntArray, links: IntArray, blocks: Array) -> None:
     if not same or not np.allclose(
         blocks[order], blocks[mirrored].transpose(0, 2, 1), rtol=1e-9, atol=0
     ):
-        raise ValueError("state['matrix_blocks'] must be a symmetric matrix")
+        raise ValueError(
+            "state['matrix_links'] with state['matrix_blocks'] must be symmetric"
+        )
 
 
 AT_ONCE = 128  # rows that are copied at a time
