@@ -175,6 +175,9 @@ TESTS = {
     "experiments/command_line/noise_study": (
         "options_of_commands noise_study noise_effects_of_many_runs command_line"
     ),
+    "experiments/command_line/options": (
+        "options_of_commands command_line replay generate strangers_files"
+    ),
     "experiments/command_line/output_folder": "hostile_files signals command_line",
     "experiments/command_line/render_video": "options_of_commands video command_line",
     "experiments/command_line/smooth": "options_of_commands smooth_command",
@@ -198,7 +201,7 @@ TESTS = {
     f"{STUDY}/figures": "monte_carlo_report html_report",
     f"{STUDY}/looks": "looks",
     f"{STUDY}/report": "html_report monte_carlo_report efficiency",
-    f"{STUDY}/results": "study_by_hand monte_carlo monte_carlo_folder",
+    f"{STUDY}/results": "study_by_hand monte_carlo monte_carlo_folder looks",
     f"{STUDY}/runner": "study_by_hand monte_carlo monte_carlo_folder looks causes",
     f"{STUDY}/summary": "monte_carlo_report efficiency html_report monte_carlo",
     f"{STUDY}/verdict": "monte_carlo_report efficiency causes looks monte_carlo",
@@ -225,7 +228,7 @@ TESTS = {
     "src/slamgym": "public_names kernel_cache leaves scenario",
     "src/slamgym/argument_checks": (
         "errors_change_nothing magnitudes filter_memory hypothesis_tests association "
-        "batch"
+        "batch nees"
     ),
     "src/slamgym/restorable": "state_and_restore",
     "src/slamgym/suggestions": (
