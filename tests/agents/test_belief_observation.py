@@ -25,7 +25,7 @@ from slamgym.agents.belief_features import (
     write_features,
 )
 from slamgym.agents.belief_features import on_log_scale as log_scale_of_one
-from slamgym.estimator import EkfSlam, InvariantEkfSlam, make_batch
+from slamgym.estimator import EkfSlam, make_batch, make_estimator
 from slamgym.estimator.models.sensors import BEARING_RANGE
 from slamgym.sim_configs import load_scenario
 
@@ -236,10 +236,20 @@ def test_the_belief_does_not_know_the_truth(monkeypatch):
         np.testing.assert_array_equal(seen[key], blind[key])
 
 
-def test_the_belief_is_that_of_a_filter_fed_by_hand():
-    env = BeliefObservation(world(), "invariant")
+@pytest.mark.parametrize(
+    ("name", "label", "growth"),
+    [("loop", "invariant", 0.0), ("coarse_loop", "ekf", 0.1)],
+)
+def test_the_belief_is_that_of_a_filter_fed_by_hand(name, label, growth):
+    env = BeliefObservation(world(name), label)
     scenario = env.scenario
-    slam = InvariantEkfSlam(scenario.motion.std, scenario.sensor.std)
+    slam = make_estimator(
+        label,
+        motion_std=scenario.motion.std,
+        measurement_std=scenario.sensor.std,
+        sensor=BEARING_RANGE.with_noise(range_std_per_metre=growth),
+        noise_at_rest=scenario.motion.noise_at_rest,
+    )
     observation, _ = env.reset(seed=3)
     slam.reset(env.unwrapped.start_estimate, scenario.start.std)
     for _ in range(15):
@@ -254,22 +264,6 @@ def test_an_episode_ends_as_without_the_wrapper():
     env = BeliefObservation(world(steps=2), "ekf")
     env.reset(seed=0)
     assert [env.step(SPIN)[2:4] for _ in range(2)] == [(False, False), (False, True)]
-
-
-def test_the_noise_of_the_world_is_told_to_the_filter():
-    env = BeliefObservation(world("coarse_loop"), "ekf")
-    scenario = env.scenario
-    slam = EkfSlam(
-        scenario.motion.std,
-        scenario.sensor.std,
-        sensor=BEARING_RANGE.with_noise(range_std_per_metre=0.1),
-        noise_at_rest=scenario.motion.noise_at_rest,
-    )
-    observation, _ = env.reset(seed=0)
-    slam.reset(env.unwrapped.start_estimate, scenario.start.std)
-    seen = np.flatnonzero(observation["mask"])
-    slam.update(observation["landmarks"][seen], seen)
-    np.testing.assert_array_equal(env.belief.covariance, slam.belief().covariance)
 
 
 def test_a_filter_without_the_noise_of_the_world_is_refused():

@@ -108,5 +108,7 @@ def test_wrong_poses_and_names_are_named():
         batch.act([(0.0, 0.0, np.nan), (0.0, 0.0, 0.0)], 0)
     with pytest.raises(ValueError, match="did you mean 'waypoints'"):
         make_vector_controller("waypoint", [scenario], generators(1))
-    with pytest.raises(ValueError, match="equally many, at least 1, got 1 and 2"):
-        make_vector_controller("random", [scenario], generators(2))
+    for count, rngs in (1, 2), (0, 0):
+        message = f"equally many, at least 1, got {count} and {rngs}"
+        with pytest.raises(ValueError, match=message):
+            make_vector_controller("random", [scenario] * count, generators(rngs))

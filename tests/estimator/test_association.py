@@ -85,17 +85,17 @@ def noisy_readings(mean, slots, rng, spread):
 @pytest.mark.parametrize("seed", range(5))
 def test_distances_are_those_of_the_dense_model_and_none_is_forgotten(seed):
     mean, P = random_belief(seed)
-    rng = np.random.default_rng(seed)
+    rng, noise = np.random.default_rng(seed), Noise(0.02, 0.1, seed / 9, 0.05)
     readings = noisy_readings(mean, np.arange(12), rng, (0.3, 1.0))
     readings[3, 0] += 4 * np.pi
     room = np.zeros((40, 40))
     room[:27, :27] = P
     view = MapView(np.append(mean, np.zeros(13)), room, range(12))
-    fit = innovation_distances(view, readings, NOISE, 25.0)
+    fit = innovation_distances(view, readings, noise, 25.0)
     within = 0
     for k in range(12):
         for j in range(12):
-            squared, log_det = dense_distance(mean, P, j, readings[k], NOISE)
+            squared, log_det = dense_distance(mean, P, j, readings[k], noise)
             if squared <= 25.0:
                 within += 1
                 assert fit.squared[k, j] == pytest.approx(squared, rel=1e-9)

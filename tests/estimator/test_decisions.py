@@ -81,16 +81,6 @@ def test_a_reading_too_near_to_use_is_given_to_no_landmark():
     assert (slam.decisions[-1].row_ids, slam.decisions[-1].added) == ((None,), ())
 
 
-def test_a_new_run_and_a_loaded_state_begin_without_decisions():
-    slam = managed()
-    slam.update(AHEAD)
-    slam.load_state_dict(slam.state_dict())
-    assert list(slam.decisions) == []
-    slam.update(AHEAD)
-    slam.reset((0, 0, 0), (0, 0, 0))
-    assert list(slam.decisions) == []
-
-
 @pytest.mark.parametrize("backdate", [False, True])
 @pytest.mark.parametrize("method", ["joint", "hypotheses"])
 def test_a_filter_told_the_decisions_has_the_same_belief(method, backdate, slippery):

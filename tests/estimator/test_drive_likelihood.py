@@ -8,8 +8,10 @@ from far_origins import far_origins, rounding
 from slamgym.estimator import UnscentedSlam, make_estimator
 from slamgym.estimator.filters.drive_likelihood import DriveEvents, drive_likelihood
 from slamgym.estimator.kernels.scan_update import ADDED, GATED, SKIPPED
+from slamgym.estimator.models import Motion
 
 NOISE = np.array([*MOTION_STD, *MEASUREMENT_STD, 0.01, 0.02])
+OMNI = Motion("omni", ("ahead", "left"), ("m", "m"), lambda a, b: (a, b, 0 * a))
 GATE_PROBABILITY = 0.95
 GATE = -2 * np.log1p(-GATE_PROBABILITY)
 
@@ -124,6 +126,7 @@ def slow_twin(slam, copy, drive_events, gate):
         ("invariant", {"range_noise_at": "reading"}),
         ("first_estimates", {"noise_at_rest": False}),
         ("observability_constrained", {}),
+        ("ekf", {"motion": OMNI, "noise_at_rest": False}),
     ],
 )
 def test_one_call_equals_the_public_calls_of_the_filter(name, options, gate):

@@ -215,13 +215,18 @@ def test_one_hypothesis_with_one_branch_is_the_joint_assignment(slippery_drive):
     np.testing.assert_array_equal(joint.belief().mean, single.belief().mean)
 
 
-def test_given_identities_go_to_every_hypothesis():
+def test_given_identities_go_to_every_hypothesis(slippery_drive):
     world = slippery_world()
     slam = make(world, association="hypotheses")
     slam.update([(0.1, 3.0), (0.9, 4.0)], landmark_ids=[7, 9])
     assert slam.belief().landmark_ids == (7, 9)
     slam.remove([7])
     assert slam.landmark_ids == (9,)
+    several, _ = several_hypotheses(slippery_drive[1], world)
+    costs = [h.cost for h in several.hypotheses]
+    several.update([(0.1, 90.0)], [99])
+    assert [h.cost for h in several.hypotheses] == pytest.approx(costs)
+    assert costs[-1] > 0.1
 
 
 @pytest.mark.parametrize("name", ["ekf", "compressed", "submaps", "sparse_information"])
@@ -675,7 +680,7 @@ def test_a_reading_too_far_from_a_landmark_for_a_pair_is_new(method, aside, new_
     assert slam.update([(aside, 5.0)]).tentative_rows == new_rows
 
 
-def test_a_loaded_state_and_a_new_run_have_no_report():
+def test_a_loaded_state_and_a_new_run_have_neither_report_nor_decisions():
     """The filters that load it are reused, and have reports of their own."""
     scans = drive(slippery_world(), steps=6)
     slam = make(slippery_world(), association="hypotheses")
@@ -688,4 +693,4 @@ def test_a_loaded_state_and_a_new_run_have_no_report():
     ):
         slam.update(scans[-1][1])
         change()
-        assert slam.report() == UpdateReport()
+        assert (slam.report(), list(slam.decisions)) == (UpdateReport(), [])

@@ -136,6 +136,8 @@ def test_an_unknown_option_is_refused_with_those_that_there_are(name, option, me
         make_estimator(name, **NOISE, **{option: 1})
     shown = name.rpartition(":")[2]
     assert str(caught.value) == f"{shown} has no option '{option}'{message}"
+    with pytest.raises(TypeError, match="argument 'motion_std'"):
+        make_estimator("fractions:Fraction", **NOISE)
 
 
 def test_models_that_an_estimator_does_not_take_are_refused():

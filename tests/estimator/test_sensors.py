@@ -16,12 +16,14 @@ from numeric_jacobian import numeric_jacobian
 from own_noise import OWN_NOISE
 from scipy.optimize import least_squares
 
+from slamgym.argument_checks import LOWEST_ID
 from slamgym.estimator import (
     InvariantEkfSlam,
     make_batch,
     make_estimator,
     register_estimator,
 )
+from slamgym.estimator.filters import delayed_landmarks
 from slamgym.estimator.filters.delayed_landmarks import MOST_POSES, SeenLandmark
 from slamgym.estimator.filters.imagine import imagine
 from slamgym.estimator.models import bearing_range
@@ -701,6 +703,12 @@ def test_a_heading_that_has_drifted_loses_no_run_of_bearings():
     assert np.linalg.norm(errors, axis=1).max() < 0.3
 
 
+def test_the_longer_axis_decides_whether_a_place_is_vague():
+    axes = np.diag([0.01, 2.0])
+    found = [delayed_landmarks._is_vague(axes, distance) for distance in (1.0, 99.0)]
+    assert found == [True, False]
+
+
 def test_waiting_filters_continue_from_a_saved_state_bit_for_bit():
     slam = waiting_filter("invariant", RANGE)
     pose, _ = drive_past(slam, RANGE, 8)
@@ -716,10 +724,11 @@ def test_waiting_filters_continue_from_a_saved_state_bit_for_bit():
         assert slam.update(z, range(5)) == other.update(z, range(5))
     np.testing.assert_array_equal(slam.belief().covariance, other.belief().covariance)
     state = slam.state_dict()
-    state["waiting_ids"] = np.array([[0, 77]])
-    state["waiting_readings"] = np.ones((1, 2))
-    with pytest.raises(ValueError, match="must name poses in the map, got 77"):
-        other.load_state_dict(state)
+    state |= {"waiting_ids": np.array([[0, 77]]), "waiting_readings": np.ones((1, 2))}
+    one_point = [LOWEST_ID + 2 * 77, *state["landmark_ids"][1:]]
+    for wrong in state, state | {"landmark_ids": np.array(one_point)}:
+        with pytest.raises(ValueError, match="must name poses in the map, got 77"):
+            other.load_state_dict(wrong)
 
 
 def test_a_new_run_begins_without_a_report():

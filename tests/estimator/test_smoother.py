@@ -37,6 +37,7 @@ from slamgym.estimator.smoother.drive import Sightings, landmark_order, path_bet
 from slamgym.estimator.smoother.elimination import PART
 from slamgym.estimator.smoother.optimiser import (
     Estimate,
+    Optimiser,
     _Iterate,
     filter_options,
     start_of,
@@ -562,7 +563,7 @@ def test_every_option_reaches_the_smoothing_of_a_repaired_drive(monkeypatch):
     assert calls == [{"start": "poses", **options}, options]
 
 
-def test_what_cannot_be_smoothed_is_refused():
+def test_what_cannot_be_smoothed_is_refused(monkeypatch):
     made, *_ = recorded()
     with pytest.raises(np.linalg.LinAlgError, match="did not converge in 1 iteration"):
         smooth(made, iterations=1)
@@ -576,6 +577,13 @@ def test_what_cannot_be_smoothed_is_refused():
         smooth(blind)
     with pytest.raises(ValueError, match=r"measurement_std must be > 0 to smooth"):
         Drive(MOTION_STD, (0.1, 0.0))
+
+    def damped(_, state):
+        state.moved, state.is_damped = 1e-9, True
+
+    monkeypatch.setattr(Optimiser, "_descend", damped)
+    with pytest.raises(np.linalg.LinAlgError, match="did not converge in 2 iterations"):
+        smooth(made, iterations=2)
 
 
 def test_a_cost_that_no_longer_falls_significantly_is_a_solution():

@@ -462,6 +462,21 @@ def test_the_derivative_of_a_relation_is_that_of_differences(frame, turn):
     expected = numeric_jacobian(error, np.concatenate([start, state]))
     found = factor_error(start, state, mean, frame).through(np.eye(len(state)))
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
+    # The same for a landmark that no other submap holds.
+    own, root = np.append(mean, [3.0, -2.0]), rng.normal(size=(11, 11))
+    submap = Submap(np.arange(4), own, root @ root.T)
+    whitener = np.linalg.inv(np.linalg.cholesky(submap.covariance[:9, :9]))
+
+    def private(x):
+        found = factor_error(x[:3], x[3:], mean, frame)
+        shared = np.arange(9), whitener
+        return gauss_newton.private_landmarks(
+            submap, shared, np.array([3]), x[:3], found, frame
+        )
+
+    x = np.concatenate([start, state])
+    expected = numeric_jacobian(lambda x: private(x).points, x)
+    np.testing.assert_allclose(private(x).jacobian, expected, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("frame", ["additive", "invariant"])
@@ -734,6 +749,7 @@ def test_a_state_that_does_not_fit_is_refused():
         ({"base": "EkfSlam"}, "is of EkfSlam, not of InvariantEkfSlam"),
         ({"chain_joined": np.zeros((0, 3))}, "chain_joined"),
         ({"chain_present": np.full((4, 3), np.nan)}, "must be finite"),
+        ({"chain_start": -state["chain_start"] - 1}, "chain_start'] must"),
         ({"submap_0_slots": state["submap_0_slots"] + 99}, "_slots'] must be below"),
         ({"submap_0_mean": state["submap_0_mean"][:-1]}, "_mean'] must have shape"),
         ({"landmark_ids": state["landmark_ids"][:3]}, "must be 3 ascending numbers"),

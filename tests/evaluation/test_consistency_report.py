@@ -88,6 +88,7 @@ def test_below_10_runs_the_time_averages_have_no_say():
     few = report(nees, nis, freedom)
     assert few.time_average.p_value < 0.001
     assert few.final_step.p_value > 0.02
+    assert (few.deciding_runs, few.ratio_of_others) == (0, few.mean_ratio)
     assert few.accepted
     many = report(*(np.concatenate([a, a[:1]]) for a in (nees, nis, freedom)))
     assert not many.accepted

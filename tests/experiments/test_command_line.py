@@ -712,6 +712,7 @@ WRONG_FILTERS = {
     "--landmark-init half": "landmark_init must be 'full' or 'independent'",
     "--estimator ekv": "unknown estimator 'ekv'; did you mean 'ekf'?",
     "--option gate": "--option must be KEY=VALUE, got 'gate'",
+    "--option gate=": "--option must be KEY=VALUE, got 'gate='",
     "--option a=1 --option a=2": "--option must name each key once, got a twice",
     "--option gate=1": "has no option 'gate'; did you mean 'gate_prob",
     "-e ekf[iteration=3]": "ekf has no option 'iteration' (there are",

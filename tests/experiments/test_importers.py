@@ -376,12 +376,6 @@ def test_a_reversed_edge_is_the_inverse_motion(file):
     assert_events_agree(read_log(file(reversed_edge)).events, log.events, 1e-15)
 
 
-def test_of_two_edges_between_neighbours_the_odometry_leads_forward(file):
-    log = read_log(file("EDGE2 1 0 9 9 9\n" + ISAM.replace("ODOMETRY", "EDGE2")))
-    assert_events_agree(log.events, read_log(file(ISAM)).events, tolerance=0)
-    assert log.header["left_out"] == "1 loop closures between poses"
-
-
 @pytest.mark.parametrize(
     ("odometry", "closure"),
     [
@@ -409,12 +403,6 @@ def test_bearings_and_ranges_of_gtsam_are_those_of_positions(file):
     polar = ISAM.replace("LANDMARK 1 2 3 4 1.5 0 1.5", f"BR 1 2 {math.atan2(4, 3)} 5")
     log = read_log(file(polar))
     assert_events_agree(log.events, read_log(file(ISAM)).events, tolerance=0)
-
-
-def test_measured_poses_of_a_graph_are_left_out_and_counted(file):
-    log = read_log(file("PARAMS_SE2OFFSET 0 0 0 0\nEDGE_PRIOR_SE2 0 1 2 3\n" + ISAM))
-    assert_events_agree(log.events, read_log(file(ISAM)).events, tolerance=0)
-    assert log.header["left_out"] == "1 measured poses"
 
 
 COMMENTED = {
@@ -468,12 +456,20 @@ def test_a_landmark_of_a_graph_that_no_edge_reads_is_named(tmp_path):
     assert log.header["left_out"] == "landmark 3, which no edge reads"
 
 
-@pytest.mark.parametrize("edge", ["EDGE2", "EDGE_SE2"])
-def test_loop_closures_between_poses_are_left_out_and_counted(file, edge):
-    closed = ISAM.replace("ODOMETRY", edge) + f"{edge} 3 0 9 9 9\n{edge} 0 1 8 8 8\n"
-    log = read_log(file(closed))
+@pytest.mark.parametrize(
+    ("first", "edge", "last", "left_out"),
+    [
+        ("", "EDGE2", "EDGE2 3 0 9 9 9\nEDGE2 0 1 8 8 8\n", "2 loop closures between"),
+        ("", "EDGE_SE2", "EDGE_SE2 3 0 9 9 9\n", "1 loop closures between poses"),
+        ("EDGE2 1 0 9 9 9\n", "EDGE2", "", "1 loop closures between poses"),
+        ("PARAMS_SE2OFFSET 0 0 0 0\nEDGE_PRIOR_SE2 0 1 2 3\n", "ODOMETRY", "",
+         "1 measured poses"),
+    ],
+)  # fmt: skip
+def test_other_edges_are_left_out_and_counted(file, first, edge, last, left_out):
+    log = read_log(file(first + ISAM.replace("ODOMETRY", edge) + last))
     assert_events_agree(log.events, read_log(file(ISAM)).events, tolerance=0)
-    assert log.header["left_out"] == "2 loop closures between poses"
+    assert log.header["left_out"].startswith(left_out)
 
 
 @pytest.mark.parametrize("vertex", ["VERTEX2", "VERTEX_SE2"])
@@ -873,7 +869,7 @@ def test_a_car_that_stands_or_backs_does_so(tmp_path):
     [
         ({"speed": np.ones((3, 1))}, "equal length"),
         ({"steering": np.full((81, 1), np.nan)}, "finite numbers in steering"),
-        ({"steering": np.full((81, 1), 0.79)}, "steering within"),
+        ({"steering": np.full((81, 1), -0.79)}, "steering within"),
         ({"time": np.append(np.arange(20967, 22967, 25), 20967)}, "never decreases"),
     ],
 )

@@ -889,7 +889,7 @@ WRONGLY = "; the filter computes or reports these covariances wrongly."
             "5 are 1.1 times.",
         ),
         (
-            a_map([1.0, 3.1, 1.2]),
+            a_map([1.0, 3.1, 1.2], means=[1.3, 2.3, 0.1]),
             "the squared errors of each landmark are 1 to 3.1 times what the "
             "covariances state, those of the whole map 2.4 times: no single scale, "
             "offset or landmark explains this.",

@@ -85,6 +85,10 @@ def test_ellipses_and_paths_are_those_of_the_typical_run(monkeypatch):
     ends = path[[0, -1]] - true[0]
     expected = trace.poses[[0, -1], :2] - trace.true_landmarks[0]
     np.testing.assert_allclose(ends * metres, expected, atol=2 * metres)
+    ovals = np.array(one["poses"]).reshape(-1, 5)
+    rows = noise_explorer._evenly(len(trace.poses), len(ovals))
+    axes = 3 * np.sqrt(eigvalsh(trace.pose_covariances[rows, :2, :2]))[:, ::-1]
+    np.testing.assert_allclose(ovals[:, 2:4] * metres, axes, atol=2 * metres)
     wider = np.array(facts["cells"][3]["filters"][0]["map"]).reshape(-1, 5)
     assert (wider[:, 2] > marks[:, 2]).all()
 

@@ -305,6 +305,7 @@ def test_a_long_run_shows_every_eighth_step_and_says_so(monkeypatch, loop, tmp_p
     assert "one step in 8 of 60." in page
     _, arrays = arrays_of(page)
     assert arrays["step"].tolist() == [*range(0, 57, 8), 60]
+    assert arrays["t"].tolist() == whole.trace.t[arrays["step"]].tolist()
     assert len(arrays["0.id"]) == 9
     assert_readings(arrays, loop)
 

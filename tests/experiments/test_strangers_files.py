@@ -408,6 +408,8 @@ def test_commands_name_the_file_that_they_take_for_the_truth(folder, tmp_path):
     place = folder(odometry=ODOMETRY, measurements=MEASUREMENTS, poses=TRUTH)
     shown = " ".join(slamgym("replay", place, "--out", tmp_path / "r").output.split())
     assert "truth: poses.csv; the log starts at the true pose" in shown
+    given = "--truth", place / "poses.csv", "--out", tmp_path / "given"
+    assert "the log starts at" not in slamgym("replay", place, *given).output
 
 
 # True paths

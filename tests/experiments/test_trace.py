@@ -42,6 +42,7 @@ def test_map_at_a_step_holds_only_what_was_seen():
     ("name", "value", "message"),
     [
         ("poses", np.zeros((13, 2)), r"poses must have shape \(13, 3\), got \(13, 2\)"),
+        ("true_poses", np.zeros((12, 3)), r"true_poses must have shape \(13, 3\)"),
         ("nis", np.zeros(12), r"nis must have shape \(13,\), got \(12,\)"),
         (
             "true_landmarks",

@@ -99,21 +99,16 @@ def test_random_landmarks_fill_their_bounds_evenly():
     assert np.allclose(quarters.mean(axis=0), 0.5, atol=4 * 0.5 / np.sqrt(4000))
 
 
-def test_without_a_seed_the_generator_decides():
-    layout = RandomLayout(count=5, bounds=(0.0, 0.0, 9.0, 9.0))
-    first = place_landmarks(layout, rng(1))
-    assert np.array_equal(first, place_landmarks(layout, rng(1)))
-    assert not np.array_equal(first, place_landmarks(layout, rng(2)))
-
-
-@pytest.mark.parametrize("seed", [0, 5])
-def test_with_a_seed_the_generator_is_left_alone(seed):
+@pytest.mark.parametrize("seed", [0, 5, None])
+def test_with_a_seed_the_generator_is_left_alone_else_it_decides(seed):
     layout = RandomLayout(count=5, bounds=(0.0, 0.0, 9.0, 9.0), seed=seed)
     generator = rng(1)
     before = generator.bit_generator.state
     first = place_landmarks(layout, generator)
-    assert generator.bit_generator.state == before
-    assert np.array_equal(first, place_landmarks(layout, rng(2)))
+    assert (generator.bit_generator.state == before) == (seed is not None)
+    assert np.array_equal(first, place_landmarks(layout, rng(1)))
+    same = np.array_equal(first, place_landmarks(layout, rng(2)))
+    assert same == (seed is not None)
 
 
 def test_landmarks_that_do_not_fit_are_refused():
