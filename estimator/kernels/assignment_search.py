@@ -634,40 +634,36 @@ def fill_expected(
     slots : ndarray of int64, shape (J,)
         Places of the landmarks in the map.
     """
-    H, columns = np.empty((2 * len(slots), 5)), np.empty((len(slots), 5), np.int64)
+    slopes = np.empty((2 * len(slots), 2))
     for j in range(len(slots)):
         c = 3 + 2 * slots[j]
-        columns[j, 0], columns[j, 1], columns[j, 2] = 0, 1, 2
-        columns[j, 3], columns[j, 4] = c, c + 1
         dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
         bearing, expected[j, 1] = expected_reading_jit(dx, dy, mean[2])
         expected[j, 0] = wrap_angle_jit(bearing)
-        slopes = reading_slopes_jit(dx, dy)
-        for i in range(2):
-            x, y = slopes[2 * i], slopes[2 * i + 1]
-            row = H[2 * j + i]
-            row[0], row[1], row[2], row[3], row[4] = -x, -y, i - 1.0, x, y
+        of_bearing_x, of_bearing_y, of_range_x, of_range_y = reading_slopes_jit(dx, dy)
+        slopes[2 * j, 0], slopes[2 * j, 1] = of_bearing_x, of_bearing_y
+        slopes[2 * j + 1, 0], slopes[2 * j + 1, 1] = of_range_x, of_range_y
     for a in range(2 * len(slots)):
-        of_pose = _product(H, P, columns, a, 0), _product(H, P, columns, a, 1)
-        of_heading = _product(H, P, columns, a, 2)
+        row = 3 + 2 * slots[a // 2], a % 2 - 1.0, slopes[a, 0], slopes[a, 1]
+        px, py = _product(row, P, 0), _product(row, P, 1)
+        heading = _product(row, P, 2)
         for j in range(a // 2 + 1):
-            x = _product(H, P, columns, a, columns[j, 3])
-            y = _product(H, P, columns, a, columns[j, 4])
-            for b in (2 * j, 2 * j + 1):
-                value = of_pose[0] * H[b, 0] + of_pose[1] * H[b, 1]
-                value += of_heading * H[b, 2]
-                value += x * H[b, 3]
-                value += y * H[b, 4]
+            c = 3 + 2 * slots[j]
+            x, y = _product(row, P, c), _product(row, P, c + 1)
+            for k in range(2):
+                b, to_x, to_y = 2 * j + k, slopes[2 * j + k, 0], slopes[2 * j + k, 1]
+                value = -px * to_x - py * to_y + heading * (k - 1.0)
+                value += x * to_x
+                value += y * to_y
                 joint[a, b] = joint[b, a] = value
 
 
 @njit_internal
-def _product(H: Array, P: Array, columns: IntArray, a: int, column: int) -> float:
-    """Return an entry of H P."""
-    value = 0.0
-    for k in range(5):
-        value += H[a, k] * P[columns[a // 2, k], column]
-    return value
+def _product(row: tuple[int, float, float, float], P: Array, column: int) -> float:
+    """Return an entry of H P, from the place of a landmark and a row of H."""
+    c, turn, x, y = row
+    of_pose = -x * P[0, column] - y * P[1, column] + turn * P[2, column]
+    return float(of_pose + x * P[c, column] + y * P[c + 1, column])
 
 
 # Numba counts the references to each view of an array, and to each array that it passes

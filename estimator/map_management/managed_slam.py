@@ -220,7 +220,11 @@ class ManagedSlam(FilterWrapper):
         # Refused here if it is not finite, before a filter that checks less has moved.
         displacement = self._settings.motion_noise.motion.moved(reading)
         with changing(self, "predict"):
-            self._step(Hypothesis.predict, reading, dt, displacement)
+            first, *others = self._hypotheses
+            first.predict(reading, dt, displacement)  # it refuses what all would
+            self.steps += 1
+            for h in others:
+                h.predict(reading, dt, displacement)
 
     def update(
         self, measurements: ArrayLike, landmark_ids: LandmarkIds | None = None
@@ -286,7 +290,9 @@ class ManagedSlam(FilterWrapper):
         with changing(self, "observe_pose"):
             every = self._hypotheses
             costs = [h.cost for h in every]
-            reports = self._step(Hypothesis.observe_pose, given)
+            reports = [every[0].observe_pose(given)]  # it refuses what all would
+            self.steps += 1
+            reports += [h.observe_pose(given) for h in every[1:]]
             if reports[0].degrees_of_freedom:
                 pairs = zip(costs, reports, strict=True)
                 costs = [cost + cost_of(report) for cost, report in pairs]
@@ -528,13 +534,6 @@ class ManagedSlam(FilterWrapper):
             best = self._hypotheses[0]
             change(best)
             self._continue_with([(0.0, best)])
-
-    def _step(self, step: Callable[..., Result], *given: Any) -> list[Result]:
-        """Take a step with every hypothesis; the first one refuses what all would."""
-        first, *others = self._hypotheses
-        results = [step(first, *given)]
-        self.steps += 1
-        return results + [step(h, *given) for h in others]
 
     def _changing(self, call: str, *, anew: bool = False) -> changing:
         """Return a block of changes; a refusal takes back what was viewed before it."""

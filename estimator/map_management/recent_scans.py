@@ -47,7 +47,8 @@ class RecentScans(Restorable):
 
     Notes
     -----
-    No scans are kept of filters for large maps, whose states are expensive to copy, and
+    Scans are kept while there are tentative landmarks, from the first sighting on.  No
+    scans are kept of filters for large maps, whose states are expensive to copy, and
     of those that need the truth at every step.
     """
 
@@ -71,7 +72,7 @@ class RecentScans(Restorable):
 
     def note_motions(self, *motions: Motion) -> None:
         """Remember odometry since the last scan, or rows of a reading of the pose."""
-        if self._window:
+        if self.scans:
             self.motions += motions
 
     def note_edits(
@@ -124,8 +125,7 @@ class RecentScans(Restorable):
     def note_scan(self, fed: FedScans, report: UpdateReport) -> None:
         """Remember a scan that the filter has taken in."""
         plan, scans, first = fed
-        if self._window:
-            self.scans, self.motions = scans, ()
+        self._keep(scans)
         self.decisions.append(_decided(plan, report))
         # The readings of scans that were repeated may belong to other landmarks now.
         for scan in [] if first is None else scans[first:-1]:
@@ -150,10 +150,16 @@ class RecentScans(Restorable):
         :meth:`state_before` returned, and ``unused`` the landmarks whose readings the
         filter did not use.
         """
-        if self._window:
+        if self.scans or before is not None:
             scan = RecentScan(number, self.motions, readings.copy(), *decided, before)
-            self.scans, self.motions = [*self.scans[-self._window :], scan], ()
+            self._keep([*self.scans, scan])
         self.decisions.append(ScanDecisions(_without(unused, decided[0])))
+
+    def _keep(self, scans: list[RecentScan]) -> None:
+        """Keep the last scans, from the first one that may be repeated on."""
+        scans = scans[-self._window - 1 :]
+        starts = (k for k, scan in enumerate(scans) if scan.before is not None)
+        self.scans, self.motions = scans[next(starts, len(scans)) :], ()
 
     def _repeat(self, scans: list[RecentScan], first: int) -> list[UpdateReport]:
         """Repeat the scans since one, and renew the states kept before them."""
