@@ -969,9 +969,9 @@ def count_clear(
     if not given:
         _copy(tally.next_detected, tally.detected.ravel())
         _copy(tally.next_miss_chances, tally.miss_chances)
+        is_afar = settings.keeps_path > 0 and _is_afar(parts, tally, longest / RINGS)
         newest = tally.whole[NEWEST]
         lost = evidence_of_misses_jit(lost, tally.numbers[FEWER], newest)
-        is_afar = settings.keeps_path > 0 and _is_afar(parts, tally, longest / RINGS)
     has_map = tally.whole[COUNT] > 0
     lost = evidence_of_heading_jit(lost, parts.covariance[2, 2], has_map)
     if not given:
