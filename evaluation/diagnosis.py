@@ -704,10 +704,10 @@ def _pairs(
 
 
 def _is_small(before: float, after: Array, sign: float) -> bool:
-    """Whether a t-test shows that nothing is left of an excess.
+    """Whether a t-test shows that little is left of an excess.
 
-    Corrected for skewness, which in small samples is mostly chance, it would leave a
-    quarter of the clear cases open.
+    It is not corrected for skewness.  The skewness of few runs is mostly chance, and
+    the correction would leave a quarter of the clear cases open.
     """
     error = after.std(ddof=1) / np.sqrt(len(after))
     excess = sign * (float(after.mean()) - 1)

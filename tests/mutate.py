@@ -239,7 +239,7 @@ PLAIN = (
     *("estimator/models", "estimator/kernels", "evaluation/error_bound"),
     *("estimator/filters/drive_likelihood.py", "estimator/filters/gaussian_map.py"),
 )
-NOT_PLAIN = (  # too slow, of kernels, or Python raises where numba divides by zero
+NOT_PLAIN = (  # too slow, about kernels, or Python raises where numba divides by zero
     "not (nees_and_nis or 1000_steps or order_of_readings or gate_keeps or far_beyond "
     "or a_pass_that_fails or exact_reading_of_an or no_kernels or plain_python)"
 )

@@ -660,7 +660,17 @@ def fill_expected(
 
 @njit_internal
 def _product(row: tuple[int, float, float, float], P: Array, column: int) -> float:
-    """Return an entry of H P, from the place of a landmark and a row of H."""
+    """Return an entry of H P.
+
+    Parameters
+    ----------
+    row : tuple
+        Column of the landmark's x in P, and the row of H: its derivatives with respect
+        to the heading and the landmark's x and y.  Those with respect to the robot's x
+        and y are the negative of the latter.
+    P : ndarray
+    column : int
+    """
     c, turn, x, y = row
     of_pose = -x * P[0, column] - y * P[1, column] + turn * P[2, column]
     return float(of_pose + x * P[c, column] + y * P[c + 1, column])

@@ -47,9 +47,9 @@ class RecentScans(Restorable):
 
     Notes
     -----
-    Scans are kept while there are tentative landmarks, from the first sighting on.  No
-    scans are kept of filters for large maps, whose states are expensive to copy, and
-    of those that need the truth at every step.
+    The oldest scan kept is one in which a tentative landmark was first seen.  No scans
+    are kept of filters for large maps, whose states are expensive to copy, and of those
+    that need the truth at every step.
     """
 
     changing = ("decisions",)
@@ -71,7 +71,7 @@ class RecentScans(Restorable):
         self.decisions: list[ScanDecisions] = []
 
     def note_motions(self, *motions: Motion) -> None:
-        """Remember odometry since the last scan, or rows of a reading of the pose."""
+        """Remember odometry, or rows of a reading of the pose, if scans are kept."""
         if self.scans:
             self.motions += motions
 
@@ -156,7 +156,7 @@ class RecentScans(Restorable):
         self.decisions.append(ScanDecisions(_without(unused, decided[0])))
 
     def _keep(self, scans: list[RecentScan]) -> None:
-        """Keep the last scans, from the first one that may be repeated on."""
+        """Keep the last scans, beginning with one that the filter can return to."""
         scans = scans[-self._window - 1 :]
         starts = (k for k, scan in enumerate(scans) if scan.before is not None)
         self.scans, self.motions = scans[next(starts, len(scans)) :], ()

@@ -155,10 +155,11 @@ class Checked(compiler.Compiler):
 
 @contextlib.contextmanager
 def _uncollected() -> Iterator[None]:
-    """Do not look for cyclic garbage in the block: a seventh of a compilation.
+    """Do not search for cyclic garbage in the block.
 
-    The block's own garbage then counts as old, or the next look would take as long.
-    Objects that a program has frozen stay so.
+    The searches take a seventh of the time of a compilation.  Afterwards, all objects
+    count as old, so that the next search is short, except in a program that has frozen
+    objects: they stay frozen.
     """
     is_on = gc.isenabled()
     gc.disable()

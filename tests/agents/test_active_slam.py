@@ -99,7 +99,7 @@ def test_every_episode_has_another_map():
 @pytest.mark.parametrize("criterion", ["D", "A", "E"])
 def test_rewards_are_what_the_docstring_says(criterion):
     stakes = {"step_cost": 0.1, "effort_cost": 0.3, "crash_cost": 7.0}
-    if criterion == "E":  # the last landmark is seen only after some steps
+    if criterion == "E":  # the landmark is first seen in the second step
         stakes |= {"landmarks": RING | {"count": 1}, "sensor": {"max_range": 1.0}}
     env = ActiveSlamEnv("active_easy", criterion=criterion, accuracy=1e-3, **stakes)
     prior = np.full(2, 12 / math.sqrt(12))

@@ -215,7 +215,7 @@ def test_one_hypothesis_with_one_branch_is_the_joint_assignment(slippery_drive):
     np.testing.assert_array_equal(joint.belief().mean, single.belief().mean)
 
 
-def test_given_identities_go_to_every_hypothesis(slippery_drive):
+def test_given_identities_go_to_every_hypothesis_and_leave_its_cost(slippery_drive):
     world = slippery_world()
     slam = make(world, association="hypotheses")
     slam.update([(0.1, 3.0), (0.9, 4.0)], landmark_ids=[7, 9])
@@ -616,7 +616,7 @@ def test_a_reading_of_the_pose_costs_twice_its_negative_log_likelihood():
 
 @pytest.mark.parametrize("association", ["nearest", "hypotheses"])
 @pytest.mark.parametrize("backdate", [True, False])
-def test_scans_are_kept_from_a_sighting_on_as_long_as_it_may_count(
+def test_scans_are_kept_from_a_first_sighting_on_while_it_may_count(
     association, backdate
 ):
     noise = {"motion_std": (0.1, 0.1, 0.1), "measurement_std": (0.1, 0.1)}

@@ -332,7 +332,7 @@ def test_a_join_needs_few_linearisations(base, monkeypatch):
         assert_close_beliefs(slams[0].belief(), slams[-1].belief(), 1e-6, 1e-7)
     assert counts == sorted(set(counts), reverse=True)
 
-    def linear(x):  # up to 4; beyond, it is flat and high
+    def linear(x):  # linear up to 4; beyond, the cost is high
         step = 3.0 - x
         cost, decrement = (1.0 + step @ step, step @ step) if x < 4 else (99.0, 0.05)
         return gauss_newton.Iterate(x, cost, decrement, step)
@@ -503,7 +503,7 @@ def test_private_landmarks_follow_the_error_of_the_shared_part(frame):
     own = P[np.ix_(shared, shared)]
     whitening = np.array(shared), np.linalg.inv(np.linalg.cholesky(own))
 
-    def found(x):  # two frames, and the landmark 2 in the world
+    def found(x):  # x holds two frames and landmark 2, in the world
         error, wanted = factor_error(x[:3], x[3:], mean[shared], frame), slots[[3, 0]]
         given = Submap(slots, mean, P), whitening, wanted, x[:3], error, frame
         return gauss_newton.private_landmarks(*given)

@@ -783,9 +783,9 @@ def test_more_runs_are_repeated_where_the_repeated_ones_show_too_little(
 
 
 @pytest.mark.parametrize("times", [1.0, 1.25])
-def test_the_sentence_about_less_noise_has_the_interval_of_students_t(times):
+def test_the_sentence_about_less_noise_has_students_interval_without_skewness(times):
     z = np.random.default_rng(21).standard_normal(30)
-    z = np.append(z, -z)  # without skewness
+    z = np.append(z, -z)  # symmetric
     after = times * (1.05 + 0.3 * (z - z.mean()) / z.std())
     pose, still = steady(np.tile([5.0, 7.0], 30)), np.ones((60, 2))
     low, high = stats.t.interval(0.9, 59, after.mean(), stats.sem(after))

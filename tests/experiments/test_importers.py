@@ -466,7 +466,9 @@ def test_a_landmark_of_a_graph_that_no_edge_reads_is_named(tmp_path):
          "1 measured poses"),
     ],
 )  # fmt: skip
-def test_other_edges_are_left_out_and_counted(file, first, edge, last, left_out):
+def test_loop_closures_and_measured_poses_are_left_out_and_counted(
+    file, first, edge, last, left_out
+):
     log = read_log(file(first + ISAM.replace("ODOMETRY", edge) + last))
     assert_events_agree(log.events, read_log(file(ISAM)).events, tolerance=0)
     assert log.header["left_out"].startswith(left_out)

@@ -228,7 +228,7 @@ def test_a_wrong_map_that_a_later_verdict_shows_is_rejected():
     nees, landmarks = honest(rng, 200), 1.35 * some_landmarks(rng, 200)
     few = verdict(nees[:4], landmarks=landmarks[:4])
     assert few.word == "not shown"
-    assert "the map" not in few.reason  # before the pose is shown
+    assert "the map" not in few.reason  # while the pose is not shown
     found = verdict(nees, (4, ""), (8, ""), landmarks=landmarks)
     assert found.word == "not consistent"
     assert "an anytime-valid test rejects the map: " in found.reason

@@ -100,7 +100,7 @@ def test_random_landmarks_fill_their_bounds_evenly():
 
 
 @pytest.mark.parametrize("seed", [0, 5, None])
-def test_with_a_seed_the_generator_is_left_alone_else_it_decides(seed):
+def test_the_generator_decides_only_without_a_seed(seed):
     layout = RandomLayout(count=5, bounds=(0.0, 0.0, 9.0, 9.0), seed=seed)
     generator = rng(1)
     before = generator.bit_generator.state
