@@ -612,9 +612,13 @@ def associate_clear(  # noqa: PLR0917 (tuples would reach the kernel later)
     found : tuple or None
         If the scan is clear, but not taken in: its associations.
     """
-    parts, tally, count = parts_jit(block), tally_jit(tally_block), len(readings)
+    parts, tally = parts_jit(block), tally_jit(tally_block)
     if tally.whole[COUNT] != parts.numbers[LANDMARKS]:
         return 0, None
+    if way == GIVEN + ALONE + AT_ONCE:
+        counted = _taken_as_given(block, tally_block, readings, ids)
+        if counted:
+            return counted, None
     if way & GIVEN:
         found = _given(parts, ids, len(tentative_seen))
     else:
@@ -625,15 +629,37 @@ def associate_clear(  # noqa: PLR0917 (tuples would reach the kernel later)
         costs, slots = _unsplit(block, tally, readings, costs, slots)
     if len(slots) == 0:
         return 0, None
-    is_single = way & AT_ONCE and len(slots) == 1
-    for k in range(count):
-        is_single &= slots[0, k] >= 0
-        if slots[0, k] >= 0:
-            ids[k] = parts.ids[slots[0, k]]
+    is_single = way & (AT_ONCE + GIVEN) == AT_ONCE and len(slots) == 1
+    is_single &= _name_readings(parts.ids, slots[0], ids)
     if is_single and update_map(block, readings, ids) == DONE:
         read = readings, slots[0], slots[0]
-        return count_clear(block, tally_block, *read, way & GIVEN), None
+        return count_clear(block, tally_block, *read, 0), None
     return 0, (costs, slots, found[2], found[3], found[4])
+
+
+@njit_allocating
+def _taken_as_given(
+    block: Array, tally_block: Array, readings: Array, ids: IntArray
+) -> int:
+    """Take in a scan of given landmarks; return 0 if one is new, or it is refused."""
+    slots = np.empty(len(ids), np.int64)
+    if find_slots(parts_jit(block), ids, slots) > 0:
+        return 0
+    if update_map(block, readings, ids) != DONE:
+        return 0
+    return count_clear(block, tally_block, readings, slots, slots, GIVEN)
+
+
+@njit_internal
+def _name_readings(ids: IntArray, slots: IntArray, names: IntArray) -> bool:
+    """Write the landmark of each reading that has one; return whether all have."""
+    have_all = True
+    for k in range(len(slots)):
+        if slots[k] < 0:
+            have_all = False
+        else:
+            names[k] = ids[slots[k]]
+    return have_all
 
 
 @njit_allocating

@@ -15,7 +15,7 @@ from functools import partial
 from itertools import islice
 from math import log
 from operator import itemgetter
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -56,8 +56,6 @@ from .map_editor import MapEditor
 from .policy import LandmarkPolicy, as_policy
 from .pruning import LandmarkRecords, MapPruner
 from .recent_scans import FedScans, RecentScans
-
-Result = TypeVar("Result")
 
 # `benchmarks/association.py` counts the bad runs that these limits decide.
 
@@ -632,7 +630,8 @@ class Hypothesis:
         scan = self._report
         if isinstance(scan, UpdateReport):
             return scan
-        report: UpdateReport = cast("Any", self.filter).report()
+        slam: Any = self.filter
+        report: UpdateReport = slam.report()
         return report.completed(
             row_ids=scan.row_ids,
             tentative_rows=scan.tentative_rows,
