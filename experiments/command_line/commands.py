@@ -262,14 +262,16 @@ def rarely_collecting() -> Iterator[None]:
     """Look for cyclic garbage in the block a hundredth as often, and not at the exit.
 
     The imports of a command create hundreds of thousands of objects that all stay. To
-    visit them again and again takes a fifth of the time of a short command.
+    visit them again and again takes a fifth of the time of a short command. Only the
+    first command of a process freezes them, because its garbage stays, too.
     """
     usual = gc.get_threshold()
     gc.set_threshold(100 * usual[0], *usual[1:])
     try:
         yield
     finally:
-        gc.freeze()
+        if not gc.get_freeze_count():
+            gc.freeze()
         gc.set_threshold(*usual)
 
 
