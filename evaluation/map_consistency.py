@@ -99,13 +99,13 @@ class MapReport(NamedTuple):
             f"interval [{low:.3f}, {high:.3f}]"
         )
         if len(self.landmarks):
-            worst = farthest(self.ratios)
             biased = int((self.means**2).sum(axis=1).argmax())
             size = np.hypot(*self.means[biased])
             text += (
-                f"; landmark {self.landmarks[worst]} seen from the robot has "
-                f"{self.ratios[worst]:.3g}; the largest mean error is {size:.2f} "
-                f"deviations (landmark {self.landmarks[biased]})"
+                f"{self._worst(self.ratios, 'seen from the robot')}"
+                f"{self._worst(self.map_ratios, 'in the frame of the map')}; "
+                f"the largest mean error is {size:.2f} deviations "
+                f"(landmark {self.landmarks[biased]})"
             )
         if self.undefined or self.indefinite:
             missing = self.undefined + self.indefinite
@@ -115,6 +115,13 @@ class MapReport(NamedTuple):
             f"{text}: {outcome}, p = {self.p_value:.2g} (rejects a consistent map in "
             f"at most {ERROR_RATE:.1%})."
         )
+
+    def _worst(self, ratios: Array, where: str) -> str:
+        """Name the landmark whose ratio is farthest from 1, if any is known."""
+        if np.isnan(ratios).all():
+            return ""
+        k = farthest(np.where(np.isnan(ratios), 1.0, ratios))
+        return f"; landmark {self.landmarks[k]} {where} has {ratios[k]:.3g}"
 
 
 def map_test(

@@ -333,7 +333,7 @@ def _draw_nis(axes: Axes, trace: RunTrace) -> None:
     axes.set_ylabel("NIS")
     axes.margins(x=0.01)
     if not used.any():
-        style.write_title(axes, "NIS: no step corrected anything", size=10)
+        style.write_title(axes, "NIS: none was reported", size=10)
         return
     share = np.mean(inside[used])
     style.write_title(axes, f"NIS: {share:.0%} of the steps in the 95% band", size=10)

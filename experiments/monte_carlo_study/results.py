@@ -499,7 +499,7 @@ def problem_with(block: Path, digest: str, names: Iterable[str] = ()) -> str:
     if lacking:
         raise ValueError(
             f"{block} was written before {lacking[0].rpartition('/')[2]} was measured: "
-            "choose another folder, or ask for fresh results"
+            "choose another folder (out), or ask for fresh results (fresh)"
         )
     return ""
 
@@ -570,7 +570,7 @@ def refuse_other(path: Path, found: dict[str, Any], asked: dict[str, Any]) -> No
         raise ValueError(
             f"{path} holds results of {_described(key, found.get(key))}, "
             f"not of {_described(key, asked.get(key))}: "
-            "choose another folder, or ask for fresh results"
+            "choose another folder (out), or ask for fresh results (fresh)"
         )
 
 

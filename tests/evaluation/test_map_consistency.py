@@ -56,7 +56,9 @@ def test_wrong_covariances_between_landmarks_are_rejected_by_the_whole_map():
 
 def test_a_matrix_with_a_negative_eigenvalue_is_rejected():
     nees, freedom = (HONEST**2).sum(axis=(1, 2)), np.full(100, 40)
-    assert "no NEES" not in map_test(HONEST, nees, freedom).sentence()
+    text = map_test(HONEST, nees, freedom).sentence()
+    assert "no NEES" not in text
+    assert "in the frame of the map" not in text
     nees[5:7] = np.inf, np.nan
     found = map_test(HONEST, nees, freedom)
     assert not found.accepted
@@ -131,13 +133,16 @@ def test_a_report_is_made_of_sums_over_the_runs_that_map_a_landmark(joint, size)
     assert found.p_value == pytest.approx(min(1, 4 * min(together, np.min(each))))
     np.testing.assert_array_equal(found.landmark_p_values, np.min(each, axis=0))
     worst = abs(np.log(found.ratios)).argmax()
+    in_frame = abs(np.log(found.map_ratios)).argmax()
     sizes = np.linalg.norm(found.means, axis=1)
     low, high = found.equivalence.interval
     what = "whole map" if joint else "average over the landmarks"
     assert found.sentence() == (
         f"Map at the end, {what}: ratio {(found.equivalence.statistic):.3f}, 90 % "
         f"interval [{low:.3f}, {high:.3f}]; landmark {found.landmarks[worst]} seen "
-        f"from the robot has {found.ratios[worst]:.3g}; the largest mean error is "
+        f"from the robot has {found.ratios[worst]:.3g}; landmark "
+        f"{found.landmarks[in_frame]} in the frame of the map has "
+        f"{found.map_ratios[in_frame]:.3g}; the largest mean error is "
         f"{sizes.max():.2f} deviations (landmark {found.landmarks[sizes.argmax()]}); "
         f"1 of 30 maps have no NEES: {'accepted' if found.accepted else 'rejected'}, "
         f"p = {found.p_value:.2g} (rejects a consistent map in at most 0.5%)."

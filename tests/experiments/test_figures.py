@@ -551,7 +551,7 @@ def test_nis_far_off_gets_a_logarithmic_axis():
 
 def test_run_without_any_update_has_an_empty_nis():
     axes = errors_figure(make_trace(nis_dof=np.zeros(13, int))).axes[-1]
-    assert "no step" in axes.get_title(loc="left")
+    assert axes.get_title(loc="left") == "NIS: none was reported"
 
 
 # ---- noise study

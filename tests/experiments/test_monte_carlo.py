@@ -411,7 +411,7 @@ def test_a_filter_that_has_changed_is_not_mixed_with_what_it_was(tmp_path, monke
     monte_carlo(*asked, out=tmp_path / "out").close()
     monte_carlo(*asked, out=tmp_path / "out").close()
     source.write_text(text + "# repaired\n")
-    with pytest.raises(ValueError, match=r"holds results of code .*ask for fresh"):
+    with pytest.raises(ValueError, match=r"of code .*folder \(out\), .*\(fresh\)"):
         monte_carlo(*asked, out=tmp_path / "out")
     done, note = [], lambda runs, of: done.append(runs)
     monte_carlo(*asked, out=tmp_path / "out", fresh=True, progress=note).close()
