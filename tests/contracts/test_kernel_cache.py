@@ -588,15 +588,17 @@ def test_the_compiler_knows_which_arrays_are_apart(decorate):
 def test_a_compilation_hardly_looks_for_cyclic_garbage():
     looks, usual = [], gc.get_threshold()
     gc.callbacks.append(lambda phase, _: looks.append(phase))
-    gc.set_threshold(100)
-    for _ in range(2):  # the first one loads numba's compiler
-        looks.clear()
-        assert jit(lambda x: x + 1)(1.0) == 2
-    gc.set_threshold(*usual)
-    gc.callbacks.pop()
-    assert gc.isenabled()
-    assert gc.get_freeze_count()  # of conftest.py
-    assert len(looks) < 10
+    try:
+        for threshold in (100, 0):
+            gc.set_threshold(threshold)
+            for _ in range(2):  # the first one loads numba's compiler
+                looks.clear()
+                assert jit(lambda x: x + 1)(1.0) == 2
+            assert gc.get_threshold()[0] == threshold
+            assert len(looks) < 10
+    finally:
+        gc.set_threshold(*usual)
+        gc.callbacks.pop()
 
 
 def modules_of_the_package():
