@@ -640,9 +640,9 @@ def fill_expected(
         dx, dy = mean[c] - mean[0], mean[c + 1] - mean[1]
         bearing, expected[j, 1] = expected_reading_jit(dx, dy, mean[2])
         expected[j, 0] = wrap_angle_jit(bearing)
-        of_bearing_x, of_bearing_y, of_range_x, of_range_y = reading_slopes_jit(dx, dy)
-        slopes[2 * j, 0], slopes[2 * j, 1] = of_bearing_x, of_bearing_y
-        slopes[2 * j + 1, 0], slopes[2 * j + 1, 1] = of_range_x, of_range_y
+        of_reading = reading_slopes_jit(dx, dy)
+        for i in range(4):
+            slopes[2 * j + i // 2, i % 2] = of_reading[i]
     for a in range(2 * len(slots)):
         row = 3 + 2 * slots[a // 2], a % 2 - 1.0, slopes[a, 0], slopes[a, 1]
         px, py = _product(row, P, 0), _product(row, P, 1)

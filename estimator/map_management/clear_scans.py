@@ -617,7 +617,7 @@ def associate_clear(  # noqa: PLR0917 (tuples would reach the kernel later)
         return 0, None
     if way == GIVEN + ALONE + AT_ONCE:
         counted = _taken_as_given(block, tally_block, readings, ids)
-        if counted:
+        if counted:  # else the filter may only need more room
             return counted, None
     if way & GIVEN:
         found = _given(parts, ids, len(tentative_seen))

@@ -47,6 +47,8 @@ Blocks = Iterable[tuple[range, list[run_measures.Block]]]
 _MOST_JOINED = 2**24  # bytes of blocks that are written together
 
 _PACKAGES = ("numpy", "scipy", "numba", "gymnasium", "pymunk", "xarray")
+#: The remedies where a folder holds other results.
+_OTHERWISE = "choose another folder (out), or ask for fresh results (fresh)"
 _FROM_TRUTH = "for a consistent filter, NEES and NIS are χ² with the stated degrees"
 
 
@@ -499,7 +501,7 @@ def problem_with(block: Path, digest: str, names: Iterable[str] = ()) -> str:
     if lacking:
         raise ValueError(
             f"{block} was written before {lacking[0].rpartition('/')[2]} was measured: "
-            "choose another folder (out), or ask for fresh results (fresh)"
+            f"{_OTHERWISE}"
         )
     return ""
 
@@ -569,8 +571,7 @@ def refuse_other(path: Path, found: dict[str, Any], asked: dict[str, Any]) -> No
     if key is not None:
         raise ValueError(
             f"{path} holds results of {_described(key, found.get(key))}, "
-            f"not of {_described(key, asked.get(key))}: "
-            "choose another folder (out), or ask for fresh results (fresh)"
+            f"not of {_described(key, asked.get(key))}: {_OTHERWISE}"
         )
 
 
