@@ -39,6 +39,9 @@ from slamgym.sim_configs import Scenario, load_scenario
 BLOCKS = {"columns": 4, "rows": 3}
 ROUND_EVERY_BLOCK = 736  # steps
 RUNS = {"loop": 200, "city": 50}
+HONEST = (
+    "sparse_information[base=observability_constrained,active_bound=8,dense_limit=0]"
+)
 FULL = {  # of each filter the one that it is to be, None where it is another
     "loop": {
         "ekf": None,
@@ -46,8 +49,8 @@ FULL = {  # of each filter the one that it is to be, None where it is another
         "compressed[local_size=8]": "ekf",
         "compressed[base=invariant,local_size=8]": "invariant",
         "submaps[submap_size=8]": None,
-        "sparse_information[active_bound=8]": None,
-        "sparse_information[base=observability_constrained,active_bound=8]": None,
+        "sparse_information[active_bound=8,dense_limit=0]": None,
+        HONEST: None,
     },
     "city": {
         "ekf": None,

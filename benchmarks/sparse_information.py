@@ -83,12 +83,10 @@ def known_map(landmarks: Array) -> SparseInformationSlam:
     total = total + csr_array((fixed, (anchored, anchored)), shape=total.shape)
     total = ((total + total.T) / 2).tobsr(blocksize=(2, 2))
     slam = SparseInformationSlam(
-        MOTION_STD, MEASUREMENT_STD, initial_pose_std=(0.1, 0.1, 0.1)
+        MOTION_STD, MEASUREMENT_STD, initial_pose_std=(0.1, 0.1, 0.1), dense_limit=0
     )
-    # Too many landmarks for a dense filter: the state is one in information form.
-    ring = np.column_stack([np.linspace(-3, 3, 60), np.full(60, 5.0)])
-    slam.update(ring, range(60))
-    slam.remove(range(60))
+    slam.update([(0.0, 5.0)], [0])  # the state is then one in information form
+    slam.remove([0])
     slam.load_state_dict(
         slam.state_dict()
         | {
@@ -290,7 +288,9 @@ def _follow(world: Scenario, data: SimulatedRuns, kind: str, bound: int) -> floa
     slam: Any = (
         CompressedEkfSlam(**noise)
         if kind == "ekf"
-        else SparseInformationSlam(active_bound=bound, **KINDS[kind], **noise)
+        else SparseInformationSlam(
+            active_bound=bound, dense_limit=0, **KINDS[kind], **noise
+        )
     )
     scores = []
     for step, odometry in enumerate(data.odometry[0]):

@@ -3,7 +3,7 @@
 import comparison
 import numpy as np
 import pytest
-from inner_parts import in_information_form, map_of
+from inner_parts import map_of
 from interrupts import found_after_interrupts
 
 from slamgym.estimator import list_estimators, make_estimator
@@ -20,7 +20,11 @@ KINDS = [(name, managed) for name in list_estimators() for managed in (False, Tr
 POLICIES = [{"association": name} for name in ("nearest", "joint", "compatibility")]
 KINDS += [("smoother", False), *(("ekf", policy) for policy in POLICIES)]
 NAN, INF = float("nan"), float("inf")
-OPTIONS = {"submaps": {"submap_size": 6}, "compressed": {"local_size": 4}}
+OPTIONS = {
+    "submaps": {"submap_size": 6},
+    "compressed": {"local_size": 4},
+    "sparse_information": {"dense_limit": 4},
+}
 
 
 def make(name, managed, **changes):
@@ -130,15 +134,13 @@ def test_an_insane_call_raises_a_plain_error_and_changes_nothing(name, managed):
 
 WRAPPED = [{"association": name, "confirm": (1, 2)} for name in ("joint", "hypotheses")]
 INTERRUPTED = [(name, policy) for name in list_estimators() for policy in WRAPPED]
-INTERRUPTED += [(name, False) for name in ("smoother", "sparse_information", *OPTIONS)]
+INTERRUPTED += [(name, False) for name in ("smoother", *OPTIONS)]
 
 
 @pytest.mark.parametrize(("name", "managed"), INTERRUPTED)
 def test_an_interrupt_leaves_no_filter_mixed_without_a_mark(name, managed):
     slam = driven(name, managed)
     ids = None if managed else [5, 6, 7, 8]
-    if not managed and name == "sparse_information":
-        slam = in_information_form(slam)
     if managed and managed["association"] == "hypotheses":
         for _ in range(6):
             slam.predict((0.2, 0.1))

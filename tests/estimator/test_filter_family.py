@@ -45,8 +45,9 @@ BLIND_TO_A_TURN = [
 
 
 def make(case, **changes):
-    bound = {"active_bound": None} if case == "sparse_information" else {}
-    return make_estimator(case, **{**NOISE, **bound, **changes})
+    exact = {"active_bound": None, "dense_limit": 0}
+    more = exact if case == "sparse_information" else {}
+    return make_estimator(case, **{**NOISE, **more, **changes})
 
 
 def tell_truth(slam, pose, landmarks=TRUE_MAP):

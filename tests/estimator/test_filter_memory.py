@@ -248,7 +248,7 @@ def test_steps_count_what_the_belief_has_taken_in_and_nothing_else():
 
 
 def test_steps_and_report_go_on_where_a_dense_map_becomes_sparse():
-    slam = make_estimator("sparse_information", **NOISE, active_bound=2)
+    slam = make_estimator("sparse_information", **NOISE, dense_limit=2)
     slam.predict((1.0, 0.0))
     slam.update([(0.0, 2.0), (0.5, 3.0)], [1, 2])
     assert (slam.steps, slam.report().added_ids) == (2, (1, 2))

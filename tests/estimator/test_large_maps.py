@@ -34,7 +34,8 @@ EXACT = {
     "compressed[local_size=20]": "ekf",
     "compressed[base=invariant,local_size=20]": "invariant",
 }
-OTHERS = {"submaps": {"submap_size": 20}, "sparse_information": {"active_bound": 12}}
+SPARSE = {"active_bound": 12, "dense_limit": 12}
+OTHERS = {"submaps": {"submap_size": 20}, "sparse_information": SPARSE}
 
 
 @pytest.fixture(scope="module")
@@ -103,10 +104,10 @@ WAYS = {
     "compressed": ("compressed", {"local_size": 20}),
     "compressed invariant": ("compressed", {"local_size": 20, "base": "invariant"}),
     "compressed, managed": ("compressed", {"local_size": 20, "management": TIDY}),
-    "sparse_information": ("sparse_information", {"active_bound": 12}),
+    "sparse_information": ("sparse_information", SPARSE),
     "sparse_information, managed": (
         "sparse_information",
-        {"active_bound": 12, "management": TIDY},
+        SPARSE | {"management": TIDY},
     ),
     "submaps": ("submaps", {"submap_size": 20}),
     "submaps, managed": ("submaps", {"submap_size": 20, "management": TIDY}),
@@ -240,7 +241,7 @@ def test_stopped_after_any_call_it_goes_on_in_another_process(both_processes, wa
 
 MANAGED = {
     "compressed": ("compressed", {"base": "invariant", "local_size": 16}),
-    "sparse_information": ("sparse_information", {"active_bound": 8}),
+    "sparse_information": ("sparse_information", {"active_bound": 8, "dense_limit": 8}),
     "submaps": ("submaps", {"submap_size": 16}),
 }
 DRIVES, STEPS = 4, 128  # past two blocks, round each of which a loop is closed

@@ -55,7 +55,7 @@ def make(name, managed, noise=NOISE):
     small = {  # fewer than are mapped: else it is dense
         "submaps": {"submap_size": 6},
         "compressed": {"local_size": 4},
-        "sparse_information": {"active_bound": 4},
+        "sparse_information": {"active_bound": 4, "dense_limit": 4},
     }
     options = small.get(name, {})
     return make_estimator(name, **noise, management=managed or None, **options)

@@ -25,7 +25,7 @@ NOISES = [
 OPTIONS = {
     "submaps": {"submap_size": 6},
     "compressed": {"local_size": 6},
-    "sparse_information": {"active_bound": 4},  # dense while the map holds no more
+    "sparse_information": {"active_bound": 4, "dense_limit": 4},
 }
 POLICIES = [
     None,

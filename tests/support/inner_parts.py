@@ -26,12 +26,6 @@ def neighbourhood_of(slam):
     return slam._neighbourhood
 
 
-def in_information_form(slam):
-    """Return a sparse filter that stores no dense covariance from now on."""
-    slam._held = slam._belief
-    return slam
-
-
 def map_of(slam):
     """Return the map of a compressed filter."""
     return slam._map

@@ -6,7 +6,7 @@ its belief to a saved state and back.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -43,12 +43,12 @@ class SparseInformationSlam(Interruptible):
     loses odometry information, so its belief is less certain than that of the EKF, and
     never more certain.
 
-    As long as the map holds no more landmarks than ``active_bound``, and at most 50,
-    no link is ever cut: the filter is then the EKF, and stores its dense covariance.
-    Later, means and covariances near the robot follow from a small dense matrix, from
-    which all other landmarks have been eliminated.  This matrix is valid until
-    the robot leaves its local map.  The elimination then repeats only the branches of
-    the map that the robot left or entered.
+    As long as the map holds no more than ``dense_limit`` landmarks, the filter is the
+    EKF itself, which is many times faster there, and cuts no link.  Later, means and
+    covariances near the robot follow from a small dense matrix, from which all other
+    landmarks have been eliminated.  This matrix is valid until the robot leaves its
+    local map.  The elimination then repeats only the branches of the map that the robot
+    left or entered.
 
     Parameters
     ----------
@@ -66,6 +66,8 @@ gate_probability, noise_at_rest, min_range
     sparsify : {"relocate", "prune"}
         "prune" cuts the weakest links between pose and landmarks instead, as the SEIF
         does [2]_.  This makes the filter overconfident; it is meant for comparisons.
+    dense_limit : int
+        Largest number of landmarks whose dense covariance is stored instead of Λ.
     belief_limit : int
         Largest number of landmarks for which ``belief`` computes a dense covariance.
 
@@ -103,6 +105,7 @@ gate_probability, noise_at_rest, min_range
         base: str = "ekf",
         active_bound: int | None = 20,
         sparsify: str = "relocate",
+        dense_limit: int = 100,
         belief_limit: int = 5000,
         **settings: Any,
     ) -> None:
@@ -114,8 +117,7 @@ gate_probability, noise_at_rest, min_range
             sparsify=sparsify,
             **settings,
         )
-        largest = local_information.SMALLEST_LOCAL_MAP
-        self._largest_dense = min(self._scan_rules.bound, largest)
+        self._dense_limit = argument_checks.whole("dense_limit", dense_limit, 0)
         self.belief_limit = argument_checks.whole("belief_limit", belief_limit, 1)
         self.reset(initial_pose, initial_pose_std)
 
@@ -162,8 +164,12 @@ gate_probability, noise_at_rest, min_range
         ids = argument_checks.identities(landmark_ids, len(readings), self)
         argument_checks.refuse_unusable(readings, ids)
         self.refuse_interrupted()
-        if isinstance(self._held, EkfSlam) and self._stays_dense(ids):
-            return self._held.update(readings, ids)
+        if isinstance(self._held, EkfSlam):
+            mapped = self._held.map.slots.keys()
+            if len(mapped) + len(ids) <= self._dense_limit or (
+                len(mapped | set(ids)) <= self._dense_limit
+            ):
+                return self._held.update(readings, ids)
         belief = self._belief
         if not ids:
             vars(belief).update(report=UpdateReport(), steps=belief.steps + 1)
@@ -200,13 +206,6 @@ gate_probability, noise_at_rest, min_range
         held = self._held
         return held.map.slots if isinstance(held, EkfSlam) else held.slots
 
-    def _stays_dense(self, ids: Sequence[int]) -> bool:
-        """Return whether a scan needs no limit of links, nor more than a local map.
-
-        A dense filter is then the same, and many times faster.
-        """
-        return len(self._slots.keys() | set(ids)) <= self._largest_dense
-
     def remove(self, landmark_ids: LandmarkIds) -> None:
         """Remove landmarks by marginalisation; the belief about all else is unchanged.
 
@@ -241,12 +240,14 @@ gate_probability, noise_at_rest, min_range
         ------
         ValueError
             If one is not in the map or both are the same; nothing is merged.
+        numpy.linalg.LinAlgError
+            As :meth:`EkfSlam.merge`, while the map is dense.
         """
         argument_checks.two_landmarks(kept, gone, self._slots)
-        belief = self._belief
-        with changing(self, "merge", belief.checkpoint()):
-            belief.merge(kept, gone)
-            self._held = belief
+        held = self._held
+        undo = None if isinstance(held, EkfSlam) else held.checkpoint()
+        with changing(self, "merge", undo):
+            held.merge(kept, gone)
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
         """Return a snapshot of the belief, for the whole map or a part of it.
@@ -305,7 +306,10 @@ gate_probability, noise_at_rest, min_range
     @property
     def landmarks(self) -> Array:
         """Positions of all landmarks, shape (n, 2) [m]; no covariance is computed."""
-        return self._belief.landmarks()
+        held = self._held
+        if isinstance(held, EkfSlam):
+            return held.map.mean[3 : held.map.size].reshape(-1, 2).copy()
+        return held.landmarks()
 
     @property
     def pose(self) -> Array:
@@ -323,7 +327,10 @@ gate_probability, noise_at_rest, min_range
     @property
     def nbytes(self) -> int:
         """Memory of the belief [bytes]."""
-        return self._belief.nbytes
+        held = self._held
+        if isinstance(held, EkfSlam):
+            return sum(array.nbytes for array in held.map.arrays)
+        return held.nbytes
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of the whole state, as arrays."""
