@@ -338,6 +338,9 @@ MOST_REJECTED = 0.05
 #: NIS per degree of freedom that causes no warning.
 NIS_RANGE = (0.5, 2.0)
 
+#: Largest time between two rows of odometry, relative to the median.
+LONG_GAP = 30.0
+
 #: A landmark within reach in this many scans should be in one of them.
 MANY_SCANS = 10
 
@@ -390,7 +393,7 @@ def run_warnings(replay: Replay, settings: FilterSettings | None = None) -> list
     """
     found = [LOST * bool(replay.probably_lost)]
     found += [_rejections(replay), _nis(replay), _crowded_map(replay)]
-    found += [_coarse(replay.log, settings)]
+    found += [_coarse(replay.log, settings), _gap(replay)]
     trace = replay.trace
     found += exchange_warnings(
         replay.log, trace.landmark_ids, trace.landmarks, trace.true_landmarks
@@ -469,10 +472,20 @@ def _nis(replay: Replay) -> str:
     freedom = trace.nis_dof.sum()
     if not freedom:
         return ""
-    ratio = float(trace.nis[trace.nis_dof > 0].sum() / freedom)
+    nis = np.where(trace.nis_dof > 0, trace.nis, 0.0)
+    ratio = float(nis.sum() / freedom)
     low, high = NIS_RANGE
     if low <= ratio <= high:
         return ""
+    worst = int(nis.argmax())
+    rest = freedom - trace.nis_dof[worst]
+    if ratio > high and rest and nis[worst] > nis.sum() / 2:
+        without = (nis.sum() - nis[worst]) / rest
+        return (
+            f"The NIS is {ratio:.3g} per degree of freedom, where 1 is expected, and "
+            f"{without:.3g} without the scan at {_at(trace, worst)}: one of its "
+            "readings is probably wrong."
+        )
     associates = ground_truth.hides_identities(replay.log)
     return f"The {nis_suspicion(ratio, associates=associates)}"
 
@@ -497,6 +510,23 @@ def nis_suspicion(ratio: float, *, associates: bool) -> str:
     return (
         f"NIS is {ratio:.3g} per degree of freedom, where 1 is expected: the filter "
         f"assumes {amount} noise{other}."
+    )
+
+
+def _at(trace: RunTrace, step: int) -> str:
+    return f"t = {round(trace.t[step], 3):.15g}" + " s" * (trace.time_unit == "s")
+
+
+def _gap(replay: Replay) -> str:
+    trace = replay.trace
+    spans = np.diff(trace.t)
+    moved = spans[spans > 0]
+    if not len(moved) or moved.max() <= LONG_GAP * np.median(moved):
+        return ""
+    step = int(spans.argmax())
+    return (
+        f"The log has no odometry between {_at(trace, step)} and "
+        f"{_at(trace, step + 1)}: how the robot moved there is not known."
     )
 
 

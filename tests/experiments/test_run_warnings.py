@@ -115,6 +115,23 @@ def test_rejections_and_innovations_are_told_beyond_their_limits():
         assert [w[:15] for w in told] == [f"The NIS is {ratio}"] * (not 0.5 < ratio < 2)
 
 
+def test_one_wrong_reading_and_a_gap_of_odometry_are_told_with_their_time():
+    *events, last = standing([PLACES] * 40, ids=[1, 2, 3]).events
+    wrong = last.measurements * [[1, 1], [1, 1000], [1, 1]]
+    for reading, gap in ((last.measurements, 29.5), (wrong, 31.25)):
+        late = OdometryRow(38 + gap, 0.0, 0.0, 1.0)
+        scan = replace(last, t=38 + gap, measurements=reading)
+        log = SlamLog("standing", events=[*events[:-1], late, scan])
+        told = run_warnings(run(log))
+        assert len(told) == 2 * (gap > 30)
+    nis, hole = told
+    assert re.fullmatch(
+        r"The NIS is .*e\+07 per.*, and 0\.[7-9]\d* without the scan at t = 69.25 s.*",
+        nis,
+    )
+    assert hole.startswith("The log has no odometry between t = 38 s and t = 69.25 s:")
+
+
 def test_landmarks_out_of_view_are_not_missed():
     # after 20 scans the robot turns round, and sees others
     events = list(standing([PLACES] * 40).events)
