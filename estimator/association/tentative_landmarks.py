@@ -393,18 +393,23 @@ def fill_density(
 def count_readings(
     cells: Array, readings: Array, new: IntArray, lengths: tuple[float, float]
 ) -> tuple[float, float]:
-    """Count new readings in their cells; return the longest ranges of all scans [m]."""
+    """Count new readings in their cells; return the longest ranges of all scans [m].
+
+    The rows of the new readings ascend.
+    """
     farthest, known = lengths
-    is_new = np.zeros(len(readings), np.bool_)
-    is_new[new] = True
+    passed = 0
     for k in range(len(readings)):
         bearing, distance = readings[k, 0], readings[k, 1]
+        is_new = passed < len(new) and new[passed] == k
+        passed += is_new
         if np.isfinite(bearing) and np.isfinite(distance):
             farthest = max(farthest, distance)
-            if not is_new[k]:
+            if not is_new:
                 known = max(known, distance)
     longest = longest_jit(farthest, known)
-    for bearing, distance in readings[new]:
+    for k in new:
+        bearing, distance = readings[k, 0], readings[k, 1]
         if np.isfinite(bearing) and np.isfinite(distance):
             cells[_cell(bearing, distance, longest)] += 1.0
     return farthest, known

@@ -331,8 +331,8 @@ def add_sightings(
     for k in range(len(slots)):
         misses[slots[k]] = 0
         bearing, distance = readings[k, 0] + heading, readings[k, 1]
-        along = (range_std + per_metre * distance) ** -2.0
-        across = (max(distance, 1e-12) * bearing_std + metres) ** -2.0
+        along = (range_std + per_metre * distance) ** -2
+        across = (max(distance, 1e-12) * bearing_std + metres) ** -2
         cos, sin = np.cos(bearing), np.sin(bearing)
         row = information[slots[k]]
         row[0] += along * cos * cos + across * sin * sin
