@@ -34,7 +34,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array, BoolArray, IntArray
-from ...jit import jit, njit_allocating, njit_inlined, njit_internal
+from ...jit import jit, jit_in_place, njit_allocating, njit_inlined, njit_internal
 from ..guards import saved_states
 from ..interface import MapView
 from ..models.bearing_range import predict_measurement, wrap_angle
@@ -340,10 +340,11 @@ class UnexplainedDensity(NamedTuple):
         self, readings: Array, new: Sequence[int], landmarks: int = 0
     ) -> "UnexplainedDensity":
         """Count one more scan (m, 2), its rows of no landmark, and those confirmed."""
-        rows = np.array(new, dtype=np.int64)
+        slots = np.zeros(len(readings), dtype=np.int64)
+        slots[[*new]] = -1
         cells = self.cells.copy() if new else self.cells
         lengths = self.farthest, self.known
-        farthest, known = count_readings(cells, readings, rows, lengths)
+        farthest, known = count_readings(cells, readings, slots, slots, lengths)
         sums = MEMORY * self.readings + len(new), MEMORY * self.scans + 1
         confirmed = MEMORY * self.landmarks + landmarks
         return UnexplainedDensity(*sums, farthest, confirmed, known, cells)
@@ -389,28 +390,27 @@ def fill_density(
         density[k] = mean * (sectors[sector] / usual * rings[ring] / usual_ring)
 
 
-@jit
+@jit_in_place
 def count_readings(
-    cells: Array, readings: Array, new: IntArray, lengths: tuple[float, float]
+    cells: Array,
+    readings: Array,
+    slots: IntArray,
+    tentative_slots: IntArray,
+    lengths: tuple[float, float],
 ) -> tuple[float, float]:
-    """Count new readings in their cells; return the longest ranges of all scans [m].
-
-    The rows of the new readings ascend.
-    """
+    """Count readings with neither slot; return the longest ranges of all scans [m]."""
     farthest, known = lengths
-    passed = 0
     for k in range(len(readings)):
         bearing, distance = readings[k, 0], readings[k, 1]
-        is_new = passed < len(new) and new[passed] == k
-        passed += is_new
         if np.isfinite(bearing) and np.isfinite(distance):
             farthest = max(farthest, distance)
-            if not is_new:
+            if slots[k] >= 0 or tentative_slots[k] >= 0:
                 known = max(known, distance)
     longest = longest_jit(farthest, known)
-    for k in new:
+    for k in range(len(readings)):
         bearing, distance = readings[k, 0], readings[k, 1]
-        if np.isfinite(bearing) and np.isfinite(distance):
+        is_new = slots[k] < 0 and tentative_slots[k] < 0
+        if is_new and np.isfinite(bearing) and np.isfinite(distance):
             cells[_cell(bearing, distance, longest)] += 1.0
     return farthest, known
 

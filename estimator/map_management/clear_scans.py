@@ -23,7 +23,7 @@ import numpy as np
 
 from ...argument_checks import aligned_copy
 from ...arrays import Array, BoolArray, IntArray
-from ...jit import jit, njit_allocating, njit_inlined, njit_internal
+from ...jit import jit, jit_in_place, njit_allocating, njit_inlined, njit_internal
 from ..association.missed_landmarks import (
     PROVEN,
     LostEvidence,
@@ -69,7 +69,7 @@ from ..models.relative_geometry import variance_from_robot
 from ..models.sensors import BEARING_RANGE
 from .loop_closing import ACCURATE, FEWEST_READINGS, LOCAL_STD, NEAR_STDS
 from .policy import LandmarkPolicy
-from .pruning import LandmarkRecords, add_sightings, noise_of_sightings
+from .pruning import LandmarkRecords, add_sighting, noise_of_sightings
 from .recent_scans import RecentScans
 
 #: Difference of −2 ln of probabilities: hypotheses e²⁰ = 5e8 times less probable than
@@ -196,17 +196,7 @@ class ClearScans:
             names = np.empty(count, np.int64)
         else:
             way |= GIVEN
-        counted, found = associate_clear(
-            gaussian.block,
-            self._tally,
-            known.mean,
-            known.covariance,
-            known.seen,
-            readings,
-            names,
-            ceiling,
-            way,
-        )
+        counted, found = self._by_kernel(known, readings, names, ceiling, way)
         if found is None and not counted:
             return None
         number, row_ids = candidates.scan + self._ahead, tuple(names.tolist())
@@ -218,6 +208,23 @@ class ClearScans:
             following = known.after_scan(self._policy.confirm[1])
             return scan._replace(slots=found[1], following=following, is_given=True)
         return self._with_rows(scan, *found)
+
+    def _by_kernel(
+        self,
+        known: TentativeLandmarks,
+        readings: Array,
+        names: IntArray,
+        ceiling: float,
+        way: int,
+    ) -> tuple[int, Associations | None]:
+        """Call `take_given` or `associate_clear`."""
+        block, tally = self._filter.map.block, self._tally
+        if way == GIVEN + ALONE + AT_ONCE:
+            counted = take_given(block, tally, readings, names)
+            if counted:  # else the filter may only need more room
+                return counted, None
+        tentative = known.mean, known.covariance, known.seen
+        return associate_clear(block, tally, *tentative, readings, names, ceiling, way)
 
     def _begin(self, candidates: Candidates, records: LandmarkRecords) -> bool:
         """Make the memory of the kernels, if scans of this map may be clear."""
@@ -615,10 +622,6 @@ def associate_clear(  # noqa: PLR0917 (tuples would reach the kernel later)
     parts, tally = parts_jit(block), tally_jit(tally_block)
     if tally.whole[COUNT] != parts.numbers[LANDMARKS]:
         return 0, None
-    if way == GIVEN + ALONE + AT_ONCE:
-        counted = _taken_as_given(block, tally_block, readings, ids)
-        if counted:  # else the filter may only need more room
-            return counted, None
     if way & GIVEN:
         found = _given(parts, ids, len(tentative_seen))
     else:
@@ -637,15 +640,18 @@ def associate_clear(  # noqa: PLR0917 (tuples would reach the kernel later)
     return 0, (costs, slots, found[2], found[3], found[4])
 
 
-@njit_allocating
-def _taken_as_given(
-    block: Array, tally_block: Array, readings: Array, ids: IntArray
-) -> int:
-    """Take in a scan of given landmarks; return 0 if one is new, or it is refused."""
-    slots = np.empty(len(ids), np.int64)
-    if find_slots(parts_jit(block), ids, slots) > 0:
+@jit_in_place
+def take_given(block: Array, tally_block: Array, readings: Array, ids: IntArray) -> int:
+    """Take in a scan of given landmarks at once, and count it.
+
+    The arguments are those of `associate_clear`.  Returns 0 if a landmark is new, or if
+    the filter refuses the scan; then nothing has changed.
+    """
+    parts, tally = parts_jit(block), tally_jit(tally_block)
+    slots = parts.ledger[SLOT]
+    if tally.whole[COUNT] != parts.numbers[LANDMARKS] or len(ids) > len(slots):
         return 0
-    if update_map(block, readings, ids) != DONE:
+    if find_slots(parts, ids, slots) > 0 or update_map(block, readings, ids) != DONE:
         return 0
     return count_clear(block, tally_block, readings, slots, slots, GIVEN)
 
@@ -945,7 +951,7 @@ def _of_density(tally: Tally) -> tuple[float, float, float]:
     return sums[1], per_scan_jit(sums[0], sums[1]), longest_jit(sums[2], sums[4])
 
 
-@jit
+@jit_in_place
 def count_clear(
     block: Array,
     tally_block: Array,
@@ -976,24 +982,24 @@ def count_clear(
     settings, lost, count = settings_jit(tally), lost_jit(tally), len(readings)
     scans, per_scan, longest = _of_density(tally)
     outcomes, is_afar = parts.ledger[OUTCOME], False
-    seen, new, shown = np.empty((2, count), np.int64), 0, np.empty((count, 2))
-    fed, used, strange = 0, 0, 0
+    counts, heading = (tally.miss_counts, tally.information), parts.mean[2]
+    fed, used, new, strange = 0, 0, 0, 0
     for k in range(count):
         if slots[k] < 0:
             if tentative_slots[k] < 0:
-                seen[1, new], new = k, new + 1
+                new += 1
                 strange += slots[k] == NEW
             continue
         j = parts.ledger[SLOT, fed]
         if not given:
             tally.shown[j] = min(tally.shown[j] + 1, PROVEN)
         if outcomes[fed] == USED:
-            seen[0, used] = j
-            shown[used, 0], shown[used, 1] = readings[k, 0], readings[k, 1]
+            add_sighting(counts, j, readings[k], heading, settings.sighting)
             used += 1
         fed += 1
     if not given:
-        _copy(tally.next_detected, tally.detected.ravel())
+        flat = tally.detected.reshape(tally.next_detected.shape)
+        _copy(tally.next_detected, flat)
         _copy(tally.next_miss_chances, tally.miss_chances)
         is_afar = settings.keeps_path > 0 and _is_afar(parts, tally, longest / RINGS)
         newest = tally.whole[NEWEST]
@@ -1007,11 +1013,11 @@ def count_clear(
     e[5], e[6], e[7] = lost.unknown, lost.unexplained, lost.explained
     sums = tally.numbers[SUMS:PLACE]
     lengths = sums[2], sums[4]
-    sums[2], sums[4] = count_readings(tally.cells, readings, seen[1, :new], lengths)
+    sums[2], sums[4] = count_readings(
+        tally.cells, readings, slots, tentative_slots, lengths
+    )
     sums[0], sums[1] = MEMORY * sums[0] + new, MEMORY * sums[1] + 1
     sums[3] = MEMORY * sums[3]
-    counts, heading = (tally.miss_counts, tally.information), parts.mean[2]
-    add_sightings(counts, seen[0, :used], shown[:used], heading, settings.sighting)
     return TAKEN + UNUSED * (used < fed) + AFAR * is_afar
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array, IntArray
-from ...jit import jit_in_place
+from ...jit import jit_in_place, njit_internal
 from ...restorable import Restorable
 from ..association.scan_assignments import Noise
 from ..association.scan_association import ScanAssociation
@@ -326,15 +326,27 @@ def add_sightings(
     ``counts`` are misses, and the information as xx, xy, yy.  ``slots`` are the places
     of the landmarks of the readings.
     """
+    for k in range(len(slots)):
+        add_sighting(counts, slots[k], readings[k], heading, noise)
+
+
+@njit_internal
+def add_sighting(
+    counts: tuple[IntArray, Array],
+    slot: int,
+    reading: Array,
+    heading: float,
+    noise: tuple[float, float, float, float],
+) -> None:
+    """Do so for one reading."""
     misses, information = counts
     bearing_std, range_std, per_metre, metres = noise
-    for k in range(len(slots)):
-        misses[slots[k]] = 0
-        bearing, distance = readings[k, 0] + heading, readings[k, 1]
-        along = (range_std + per_metre * distance) ** -2
-        across = (max(distance, 1e-12) * bearing_std + metres) ** -2
-        cos, sin = np.cos(bearing), np.sin(bearing)
-        row = information[slots[k]]
-        row[0] += along * cos * cos + across * sin * sin
-        row[1] += (along - across) * cos * sin
-        row[2] += along * sin * sin + across * cos * cos
+    misses[slot] = 0
+    bearing, distance = reading[0] + heading, reading[1]
+    along = (range_std + per_metre * distance) ** -2
+    across = (max(distance, 1e-12) * bearing_std + metres) ** -2
+    cos, sin = np.cos(bearing), np.sin(bearing)
+    row = information[slot]
+    row[0] += along * cos * cos + across * sin * sin
+    row[1] += (along - across) * cos * sin
+    row[2] += along * sin * sin + across * cos * cos
