@@ -216,7 +216,7 @@ class ManagedSlam(FilterWrapper):
         if type(dt) is not float or dt != 1.0:
             argument_checks.duration(dt)
         # Refused here if it is not finite, before a filter that checks less has moved.
-        displacement = self._settings.motion_noise.motion.moved(reading)
+        displacement = self._settings.motion_noise.motion.moved_by(*reading)
         with changing(self, "predict"):
             first, *others = self._hypotheses
             first.predict(reading, dt, displacement)  # it refuses what all would

@@ -90,14 +90,17 @@ class Motion:
 
     def moved(self, odometry: ArrayLike) -> tuple[float, float, float]:
         """Return b of one reading, or refuse it."""
-        first, second = argument_checks.pair("odometry", odometry)
+        return self.moved_by(*argument_checks.pair("odometry", odometry))
+
+    def moved_by(self, first: float, second: float) -> tuple[float, float, float]:
+        """Return b of two numbers of a usable size, or refuse it."""
         if self.displacement is _ahead:  # already checked; three times as fast
             return first, 0.0, second
         dx, dy, turn = map(float, self.displacement(first, second))
         if not (abs(dx) <= LARGEST and abs(dy) <= LARGEST and abs(turn) <= LARGEST):
             raise ValueError(
                 f"odometry must give a finite displacement with motion '{self.name}', "
-                f"got {odometry!r}"
+                f"got {(first, second)!r}"
             )
         return dx, dy, turn
 
