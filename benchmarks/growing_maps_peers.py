@@ -1,4 +1,4 @@
-"""References for the compressed filter: the fastest known full filter, and iSAM2."""
+"""References for the compressed filter: a full filter by dsyrk, and iSAM2."""
 
 from collections.abc import Sequence
 from importlib import import_module
