@@ -180,7 +180,7 @@ def test_the_command_replaces_only_its_own_pages(tmp_path, monkeypatch, capsys):
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
     path = tmp_path_factory.mktemp("page") / "explore.html"
-    world = load_scenario("loop").with_changes(steps=150)
+    world = load_scenario("loop").with_changes(steps=60)
     facts = explore_noise(world, "ekf,invariant,iterated", 2)
     write_explorer(path, facts)
     return path, facts
