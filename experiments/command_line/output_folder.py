@@ -167,6 +167,17 @@ def default_folder(*names: str) -> Path:
     return Path("results") / re.sub(r"[^\w.-]+", "_", "-".join(names))
 
 
+def folder_of_log(*names: str) -> Path:
+    """Return such a folder for what a command makes of a log.
+
+    It is another one where `run` has written: its log may be this one, and its scenario
+    would be lost.
+    """
+    folder = default_folder(*names)
+    made_by_run = (folder / "scenario.toml").exists()
+    return default_folder("replay", *names) if made_by_run else folder
+
+
 def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
     """Write summary.json with the list of all files in the folder.
 

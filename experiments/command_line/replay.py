@@ -58,7 +58,7 @@ def replay(
     slamgym replay graph.txt --truth true.g2o --noise-from-file
     """
     from ..run_and_replay.filter_settings import settings_for
-    from .output_folder import default_folder, output_folder
+    from .output_folder import folder_of_log, output_folder
     from .run_files import check_rerun, filter_and_write, show_run
 
     reporter = given.reporter()
@@ -66,7 +66,7 @@ def replay(
     drive = given.read(log, reporter)
     stds = given.stds()
     filters = given.filters(partial(settings_for, drive, **stds))
-    place = given.out or default_folder(drive.name, *filters)
+    place = given.out or folder_of_log(drive.name, *filters)
     with output_folder(place) as folder:
         summary = filter_and_write(drive, filters, folder, given, reporter)
     chosen = {*stds, *given.named_options()}

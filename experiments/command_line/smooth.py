@@ -51,7 +51,7 @@ def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
         noise_or_assumed,
         settings_for,
     )
-    from .output_folder import default_folder, output_folder, write_summary
+    from .output_folder import folder_of_log, output_folder, write_summary
     from .run_files import explaining, mistake_in
     from .tables import heading, smoothing_figures, smoothing_table, written
 
@@ -64,7 +64,7 @@ def smooth(log: options.LogFile, *, given: SmoothOptions) -> None:
     with reporter.warnings():
         stds = noise_or_assumed(drive, stated)
     settings = settings_for(drive, estimator=SMOOTHER, **stds, options=chosen)
-    place = given.out or default_folder(drive.name, "smoother")
+    place = given.out or folder_of_log(drive.name, "smoother")
     with output_folder(place) as folder:
         with (
             reporter.progress("filtering") as tick,

@@ -287,6 +287,16 @@ def test_the_log_of_a_run_replays_to_the_same_numbers(finished_run, without_pict
         assert again[key] == summary[key]
 
 
+def test_a_replay_of_a_run_does_not_replace_it(here, without_pictures):
+    answered("run", "six_landmarks", "--steps", 2)
+    place = here / "results/six_landmarks-invariant"
+    before = (place / "summary.json").read_text()
+    for log in (place, place.with_name("replay-six_landmarks-invariant")):
+        assert "scenario.toml" not in answered("replay", log / "log.csv")["files"]
+        assert (place / "summary.json").read_text() == before
+        assert (place / "scenario.toml").exists()
+
+
 def test_a_replay_prints_every_landmark_with_both_distances(log, without_pictures):
     lines = printed("replay", log).splitlines()
     rows = [line.split() for line in lines if line.strip().startswith(("7 ", "9 "))]
