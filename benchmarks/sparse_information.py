@@ -39,6 +39,7 @@ from slamgym.estimator.large_maps.sparse_information.sparse_information_slam imp
 )
 from slamgym.estimator.models.bearing_range import predict_measurement
 from slamgym.estimator.models.motions import predict_pose
+from slamgym.estimator.models.sensors import BEARING_RANGE
 from slamgym.evaluation.nees import pose_nees
 from slamgym.experiments.run_and_replay.simulated_runs import (
     SimulatedRuns,
@@ -281,7 +282,9 @@ def _follow(world: Scenario, data: SimulatedRuns, kind: str, bound: int) -> floa
     noise: dict[str, Any] = {
         "motion_std": world.motion.std,
         "measurement_std": world.sensor.std,
-        "range_std_per_metre": world.sensor.range_std_per_metre,
+        "sensor": BEARING_RANGE.with_noise(
+            range_std_per_metre=world.sensor.range_std_per_metre
+        ),
         "initial_pose_std": world.start.std,
         "initial_pose": data.initial_poses[0],
     }

@@ -449,7 +449,7 @@ def loop_nees(make):
 def test_in_the_loop_it_errs_like_the_ekf_and_pruning_far_beyond():
     # A handful of landmarks in view and four that may be linked.  All share the EKF's
     # linearisation, which is overconfident here by itself (benchmarks/
-    # sparse_information.py --nees has more runs: 6.2, 7.9 and 92), but the last.
+    # sparse_information.py --nees has more runs: 11, 11 and 158), but the last.
     four = partial(sparse, active_bound=4)
     relocate = loop_nees(partial(four, sparsify="relocate"))
     assert relocate < 2.5 * loop_nees(EkfSlam)
