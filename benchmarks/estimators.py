@@ -295,8 +295,12 @@ def clear_scans(
     slam: Any, scans: list[NDArray[np.float64]]
 ) -> list[NDArray[np.float64]]:
     """Return the scans that leave one hypothesis."""
-    step = drive_step(slam, scans, None)
-    return [scan for scan in scans if step() is None and len(slam.hypotheses) == 1]
+    step, clear = drive_step(slam, scans, None), []
+    for scan in scans:
+        step()
+        if len(slam.hypotheses) == 1:
+            clear.append(scan)
+    return clear
 
 
 def drive_step(

@@ -39,7 +39,7 @@ from slamgym.sim_configs import Scenario, load_scenario
 BLOCKS = {"columns": 4, "rows": 3}
 ROUND_EVERY_BLOCK = 736  # steps
 RUNS = {"loop": 200, "city": 50}
-HONEST = (
+CONSTRAINED = (
     "sparse_information[base=observability_constrained,active_bound=8,dense_limit=0]"
 )
 FULL = {  # of each filter the one that it is to be, None where it is another
@@ -50,7 +50,7 @@ FULL = {  # of each filter the one that it is to be, None where it is another
         "compressed[base=invariant,local_size=8]": "invariant",
         "submaps[submap_size=8]": None,
         "sparse_information[active_bound=8,dense_limit=0]": None,
-        HONEST: None,
+        CONSTRAINED: None,
     },
     "city": {
         "ekf": None,

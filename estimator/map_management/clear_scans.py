@@ -645,7 +645,7 @@ def take_given(block: Array, tally_block: Array, readings: Array, ids: IntArray)
     """Take in a scan of given landmarks at once, and count it.
 
     The arguments are those of `associate_clear`.  Returns 0 if a landmark is new, or if
-    the filter refuses the scan; then nothing has changed.
+    the filter refuses the scan; then its belief has not changed.
     """
     parts, tally = parts_jit(block), tally_jit(tally_block)
     slots = parts.ledger[SLOT]

@@ -321,11 +321,7 @@ def add_sightings(
     heading: float,
     noise: tuple[float, float, float, float],
 ) -> None:
-    """Forgive the misses of landmarks seen; Λ ← Λ + H_lᵀ Q⁻¹ H_l.
-
-    ``counts`` are misses, and the information as xx, xy, yy.  ``slots`` are the places
-    of the landmarks of the readings.
-    """
+    """Note the readings (m, 2) of the landmarks in these slots (m,)."""
     for k in range(len(slots)):
         add_sighting(counts, slots[k], readings[k], heading, noise)
 
@@ -338,7 +334,10 @@ def add_sighting(
     heading: float,
     noise: tuple[float, float, float, float],
 ) -> None:
-    """Do so for one reading."""
+    """Forgive the misses of a landmark seen; Λ ← Λ + H_lᵀ Q⁻¹ H_l.
+
+    ``counts`` are those of all landmarks: their misses, and Λ as xx, xy, yy.
+    """
     misses, information = counts
     bearing_std, range_std, per_metre, metres = noise
     misses[slot] = 0

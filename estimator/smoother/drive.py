@@ -166,7 +166,7 @@ class Drive:
         """Move by odometry (d, α) [m, rad]; dt multiplies the noise variance."""
         reading = argument_checks.pair("odometry", odometry)
         noise = self.motion_noise
-        noise.over(noise.motion.moved(reading), dt)  # refuses a wrong dt
+        noise.over(noise.motion.moved_by(*reading), dt)  # refuses a wrong dt
         self._pending.append((*reading, float(dt)))
 
     def update(

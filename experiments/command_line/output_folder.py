@@ -18,6 +18,8 @@ from .commands import BadInputError
 
 #: Every output folder holds it; its ``files`` lists the files of the command.
 SUMMARY = "summary.json"
+#: What `run` writes, beside its log, and no other command.
+SCENARIO = "scenario.toml"
 #: The folder of unfinished output, inside the output folder.
 STAGING = ".slamgym_partial"
 
@@ -168,14 +170,13 @@ def default_folder(*names: str) -> Path:
 
 
 def folder_of_log(*names: str) -> Path:
-    """Return such a folder for what a command makes of a log.
+    """Return `default_folder`, or another one where that holds what `run` has written.
 
-    It is another one where `run` has written: its log may be this one, and its scenario
-    would be lost.
+    The log may be that of the run, whose scenario would be lost.
     """
     folder = default_folder(*names)
-    made_by_run = (folder / "scenario.toml").exists()
-    return default_folder("replay", *names) if made_by_run else folder
+    is_of_run = (folder / SCENARIO).exists()
+    return default_folder("replay", *names) if is_of_run else folder
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:

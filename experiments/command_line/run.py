@@ -31,7 +31,7 @@ def run(scenario: ScenarioName, *, given: Options) -> None:
     slamgym run mine.toml --controller random --estimator mine:MyFilter
     """
     from ..run_and_replay.filter_settings import settings_for_scenario
-    from .output_folder import default_folder, output_folder
+    from .output_folder import SCENARIO, default_folder, output_folder
     from .run_files import check_rerun, filter_and_write, show_run
 
     world = given.scenario(scenario)
@@ -42,7 +42,7 @@ def run(scenario: ScenarioName, *, given: Options) -> None:
     with output_folder(place) as folder:
         with reporter.progress("driving") as tick:
             log = given.record(world, tick)
-        save_scenario(world, folder / "scenario.toml")
+        save_scenario(world, folder / SCENARIO)
         summary = filter_and_write(log, filters, folder, given, reporter, world=world)
     show_run(summary, place, given, reporter)
     changed = [f"--set={change}" for change in given.set_ or ()]

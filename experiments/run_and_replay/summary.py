@@ -473,14 +473,15 @@ def _nis(replay: Replay) -> str:
     if not freedom:
         return ""
     nis = np.where(trace.nis_dof > 0, trace.nis, 0.0)
-    ratio = float(nis.sum() / freedom)
+    total = float(nis.sum())
+    ratio = total / freedom
     low, high = NIS_RANGE
     if low <= ratio <= high:
         return ""
     worst = int(nis.argmax())
     rest = freedom - trace.nis_dof[worst]
-    if ratio > high and rest and nis[worst] > nis.sum() / 2:
-        without = (nis.sum() - nis[worst]) / rest
+    if ratio > high and rest and nis[worst] > total / 2:
+        without = (total - nis[worst]) / rest
         return (
             f"The NIS is {ratio:.3g} per degree of freedom, where 1 is expected, and "
             f"{without:.3g} without the scan at {_at(trace, worst)}: one of its "
@@ -520,8 +521,8 @@ def _at(trace: RunTrace, step: int) -> str:
 def _gap(replay: Replay) -> str:
     trace = replay.trace
     spans = np.diff(trace.t)
-    moved = spans[spans > 0]
-    if not len(moved) or moved.max() <= LONG_GAP * np.median(moved):
+    lasting = spans[spans > 0]
+    if not len(lasting) or lasting.max() <= LONG_GAP * np.median(lasting):
         return ""
     step = int(spans.argmax())
     return (

@@ -43,12 +43,12 @@ class SparseInformationSlam(Interruptible):
     loses odometry information, so its belief is less certain than that of the EKF, and
     never more certain.
 
-    As long as the map holds no more than ``dense_limit`` landmarks, the filter is the
-    EKF itself, which is many times faster there, and cuts no link.  Later, means and
-    covariances near the robot follow from a small dense matrix, from which all other
-    landmarks have been eliminated.  This matrix is valid until the robot leaves its
-    local map.  The elimination then repeats only the branches of the map that the robot
-    left or entered.
+    As long as the map holds no more than ``dense_limit`` landmarks, the filter is that
+    of ``base`` itself, which is many times faster there, and cuts no link.  Later,
+    means and covariances near the robot follow from a small dense matrix, from which
+    all other landmarks have been eliminated.  This matrix is valid until the robot
+    leaves its local map.  The elimination then repeats only the branches of the map
+    that the robot left or entered.
 
     Parameters
     ----------
@@ -165,10 +165,8 @@ gate_probability, noise_at_rest, min_range
         argument_checks.refuse_unusable(readings, ids)
         self.refuse_interrupted()
         if isinstance(self._held, EkfSlam):
-            mapped = self._held.map.slots.keys()
-            if len(mapped) + len(ids) <= self._dense_limit or (
-                len(mapped | set(ids)) <= self._dense_limit
-            ):
+            mapped = self._held.map.slots
+            if len(mapped) + len(set(ids).difference(mapped)) <= self._dense_limit:
                 return self._held.update(readings, ids)
         belief = self._belief
         if not ids:
@@ -222,11 +220,9 @@ gate_probability, noise_at_rest, min_range
             If one is not in the map; no landmark is then removed.
         """
         ids = argument_checks.mapped_identities(landmark_ids, self._slots)
-        held = self._held
-        undo = None if isinstance(held, EkfSlam) else held.checkpoint()
-        with changing(self, "remove", undo):
+        with self._changing("remove"):
             if ids:
-                held.remove(ids)
+                self._held.remove(ids)
 
     def merge(self, kept: int, gone: int) -> None:
         """Condition on two landmarks being the same, and remove the second.
@@ -244,10 +240,14 @@ gate_probability, noise_at_rest, min_range
             As :meth:`EkfSlam.merge`, while the map is dense.
         """
         argument_checks.two_landmarks(kept, gone, self._slots)
+        with self._changing("merge"):
+            self._held.merge(kept, gone)
+
+    def _changing(self, call: str) -> changing:
+        """Return a block that edits the map; a dense filter refuses before it does."""
         held = self._held
         undo = None if isinstance(held, EkfSlam) else held.checkpoint()
-        with changing(self, "merge", undo):
-            held.merge(kept, gone)
+        return changing(self, call, undo)
 
     def belief(self, landmark_ids: LandmarkIds | None = None) -> Belief:
         """Return a snapshot of the belief, for the whole map or a part of it.
